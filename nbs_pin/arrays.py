@@ -1,0 +1,40 @@
+"""One code for numpy arrays and torch tensors: the array kind in is the array kind out."""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from array_api_compat import array_namespace, is_torch_array
+
+from nbs_pin.exceptions import ArgumentError
+
+Array: TypeAlias = Any
+"""A `numpy.ndarray` or a `torch.Tensor`; shapes are annotated with jaxtyping around it."""
+
+__all__ = ["Array", "array_namespace", "as_vectors", "is_torch_array", "matvec"]
+
+
+def matvec(matrix: Array, vector: Array) -> Array:
+    """Product of matrices (..., m, n) with vectors (..., n), shape (..., m)."""
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
+    """The given vectors as arrays of one kind and one batch shape (..., nv).
+
+    Lists and numbers become float64 numpy arrays; tensors stay tensors.
+    Raises ArgumentError when kinds are mixed, a last axis is not nv, or batches do not broadcast.
+    """
+    arrays = [x if is_torch_array(x) else np.asarray(x, dtype=float) for x in vectors.values()]
+    if len({is_torch_array(x) for x in arrays}) > 1:
+        kinds = ", ".join(f"{k} {type(x).__name__}" for k, x in vectors.items())
+        raise ArgumentError(f"numpy and torch were mixed ({kinds}); give all arguments in one kind.")
+    for name, x in zip(vectors, arrays, strict=True):
+        if x.ndim == 0 or x.shape[-1] != nv:
+            raise ArgumentError(f"{name} has shape {tuple(x.shape)}, expected (..., {nv}): one number per joint.")
+    if len({tuple(x.shape) for x in arrays}) == 1:
+        return tuple(arrays)
+    try:
+        return tuple(array_namespace(*arrays).broadcast_arrays(*arrays))
+    except (ValueError, RuntimeError) as error:
+        shapes = ", ".join(f"{k} {tuple(x.shape)}" for k, x in zip(vectors, arrays, strict=True))
+        raise ArgumentError(f"batch shapes do not broadcast ({shapes}); give equal leading axes.") from error

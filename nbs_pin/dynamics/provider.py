@@ -1,0 +1,64 @@
+"""The protocol of every dynamics model: four ingredients, from which every equation follows."""
+
+from abc import ABC, abstractmethod
+
+from jaxtyping import Float
+
+from nbs_pin.arrays import Array, array_namespace, matvec
+from nbs_pin.robot import Robot, configuration_difference
+
+
+class DynamicsProvider(ABC):
+    """M(q) v̇ + C(q, v) v + G(q) = τ with M ≻ 0, G = +∂V/∂q and C the Christoffel matrix of M (docs/theory.md §1).
+
+    Implementations give the abstract methods; arrays may have leading batch axes, and numpy in gives numpy out,
+    torch in gives differentiable torch out. `reference_torque` and `forward_dynamics` follow from them; an
+    implementation overrides one only when it has a faster route to the same numbers.
+    """
+
+    @property
+    @abstractmethod
+    def nv(self) -> int:
+        """Number of joints n = nq = nv."""
+
+    @property
+    def robot(self) -> Robot | None:
+        """The arm this model describes, or None for a model without a URDF."""
+        return None
+
+    @abstractmethod
+    def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """M(q) [kg·m²], symmetric positive definite."""
+
+    @abstractmethod
+    def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """Christoffel C(q, v) [N·m·s]: Ṁ − 2C is skew and C(q, v) w = C(q, w) v."""
+
+    @abstractmethod
+    def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """G(q) = ∂V/∂q [N·m]: the torque that holds the arm still."""
+
+    @abstractmethod
+    def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+        """V(q) [J], up to a constant."""
+
+    def difference(self, q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
+        return configuration_difference(q, q_ref, None if self.robot is None else self.robot.continuous)
+
+    def reference_torque(
+        self,
+        q: Float[Array, "*batch n"],
+        v: Float[Array, "*batch n"],
+        v_r: Float[Array, "*batch n"],
+        a_r: Float[Array, "*batch n"],
+    ) -> Float[Array, "*batch n"]:
+        """M(q) a_r + C(q, v) v_r + G(q) [N·m], the one quantity a passivity-based law needs (docs/theory.md §1)."""
+        return matvec(self.mass_matrix(q), a_r) + matvec(self.coriolis_matrix(q, v), v_r) + self.gravity(q)
+
+    def forward_dynamics(
+        self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
+    ) -> Float[Array, "*batch n"]:
+        """v̇ = M⁻¹(τ − C v − G) [rad/s²]."""
+        net = tau - matvec(self.coriolis_matrix(q, v), v) - self.gravity(q)
+        return array_namespace(net).linalg.solve(self.mass_matrix(q), net[..., None])[..., 0]
