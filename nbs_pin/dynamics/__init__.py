@@ -1,0 +1,1 @@
+"""Models of an arm: what the controller believes."""

@@ -1,0 +1,1 @@
+"""Neural networks with structure; torch only, and no knowledge of robots."""

@@ -1,0 +1,1 @@
+"""What a controller acts on: the truth of a simulation."""

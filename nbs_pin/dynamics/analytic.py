@@ -1,0 +1,72 @@
+"""The planar two-link arm in closed form: the paper's example, and an oracle for everything else."""
+
+from jaxtyping import Float
+
+from nbs_pin.arrays import Array, array_namespace
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.robot import Robot
+
+
+class AnalyticDynamics(DynamicsProvider):
+    """Two massless rods of lengths l₁, l₂ [m] with point masses m₁, m₂ [kg] at their ends, gravity g [m/s²].
+
+    With β = q: V = (m₁ + m₂) g l₁ sin β₁ + m₂ g l₂ sin(β₁ + β₂). Source: paper, section V-A (m = l = 1, g = 9.8),
+    with the sign G = +∂V/∂q and the Christoffel C (docs/theory.md §1).
+    Raises ArgumentError when a mass or length is not positive.
+    """
+
+    def __init__(
+        self,
+        masses: tuple[float, float] = (1.0, 1.0),
+        lengths: tuple[float, float] = (1.0, 1.0),
+        gravity: float = 9.8,
+        robot: Robot | None = None,
+    ) -> None:
+        if not min(*masses, *lengths) > 0.0:
+            raise ArgumentError(f"masses {masses} and lengths {lengths} must be positive; give kg and m above 0.")
+        (m1, m2), (l1, l2) = masses, lengths
+        self._robot = robot
+        self._shoulder = (m1 + m2) * l1 * l1  # inertia of both masses at the elbow about the shoulder
+        self._forearm = m2 * l2 * l2
+        self._coupling = m2 * l1 * l2
+        self._weights = (gravity * (m1 + m2) * l1, gravity * m2 * l2)
+
+    @property
+    def nv(self) -> int:
+        """Two joints."""
+        return 2
+
+    @property
+    def robot(self) -> Robot | None:
+        """The arm whose limits and drawings belong to these equations, if one was given."""
+        return self._robot
+
+    def mass_matrix(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2 2"]:
+        """M(q) [kg·m²]."""
+        xp = array_namespace(q)
+        coupling = self._coupling * xp.cos(q[..., 1])
+        forearm = self._forearm + xp.zeros_like(coupling)
+        corner = forearm + coupling
+        shoulder = self._shoulder + forearm + 2.0 * coupling
+        return xp.stack([xp.stack([shoulder, corner], axis=-1), xp.stack([corner, forearm], axis=-1)], axis=-2)
+
+    def coriolis_matrix(self, q: Float[Array, "*batch 2"], v: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2 2"]:
+        """C(q, v) [N·m·s], the Christoffel one."""
+        xp = array_namespace(q)
+        h = self._coupling * xp.sin(q[..., 1])
+        v1, v2 = v[..., 0], v[..., 1]
+        upper = xp.stack([-h * v2, -h * (v1 + v2)], axis=-1)
+        lower = xp.stack([h * v1, 0.0 * h * v1], axis=-1)
+        return xp.stack([upper, lower], axis=-2)
+
+    def gravity(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+        """G(q) [N·m]."""
+        xp = array_namespace(q)
+        elbow = self._weights[1] * xp.cos(q[..., 0] + q[..., 1])
+        return xp.stack([self._weights[0] * xp.cos(q[..., 0]) + elbow, elbow], axis=-1)
+
+    def potential_energy(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+        """V(q) [J], zero with the arm horizontal."""
+        xp = array_namespace(q)
+        return self._weights[0] * xp.sin(q[..., 0]) + self._weights[1] * xp.sin(q[..., 0] + q[..., 1])

@@ -1,0 +1,171 @@
+"""The dynamics of a URDF arm through Pinocchio: C++ speed in numpy, analytical first derivatives in torch."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float
+
+from nbs_pin.arrays import Array, is_torch_array
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.robot import Robot
+
+Row: TypeAlias = np.ndarray
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of one state (one batch row) and the products of its Jacobians with an output cotangent."""
+
+    value: Callable[..., Row]
+    """value(q, …) -> output."""
+    vjp: Callable[..., Sequence[Row]]
+    """vjp(cotangent, q, …) -> one gradient per argument."""
+
+
+class PinocchioDynamics(DynamicsProvider):
+    """M, C, G of `robot` by CRBA, Pinocchio's Christoffel Coriolis matrix and RNEA.
+
+    Joint friction of the URDF and rotor inertia are not part of it (`dynamics.friction` models the former).
+    Tensors are differentiated once, by Pinocchio's analytical derivatives; second derivatives raise.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._model = robot.model
+        self._data = self._model.createData()
+        self._weightless = self._model.copy()
+        self._weightless.gravity = pin.Motion.Zero()
+        self._unit = np.eye(robot.nv)
+        self._zero = np.zeros(robot.nv)
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self._robot.nv
+
+    @property
+    def robot(self) -> Robot:
+        """The arm."""
+        return self._robot
+
+    def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """M(q) [kg·m²] by the composite rigid body algorithm."""
+        return _evaluate(Quantity(self._mass_matrix, self._mass_matrix_vjp), q)
+
+    def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """C(q, v) [N·m·s], the Christoffel one."""
+        return _evaluate(Quantity(self._coriolis_matrix, self._coriolis_matrix_vjp), q, v)
+
+    def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """G(q) [N·m]."""
+        return _evaluate(Quantity(self._gravity, self._gravity_vjp), q)
+
+    def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+        """V(q) [J], zero where all masses lie at the height of the base."""
+        return _evaluate(Quantity(self._potential_energy, self._potential_energy_vjp), q)
+
+    def reference_torque(
+        self,
+        q: Float[Array, "*batch n"],
+        v: Float[Array, "*batch n"],
+        v_r: Float[Array, "*batch n"],
+        a_r: Float[Array, "*batch n"],
+    ) -> Float[Array, "*batch n"]:
+        """M a_r + C(q, v) v_r + G [N·m] by two RNEA and no matrix.
+
+        C(q, v) w is bilinear and symmetric in (v, w), so with h(x) = C(q, x) x:
+        C(q, v) v_r = h((v + v_r)/2) − h((v − v_r)/2) (docs/theory.md §1).
+        """
+        return _evaluate(Quantity(self._reference_torque, self._reference_torque_vjp), q, v, v_r, a_r)
+
+    def forward_dynamics(
+        self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
+    ) -> Float[Array, "*batch n"]:
+        """v̇ [rad/s²] by the articulated body algorithm."""
+        return _evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q, v, tau)
+
+    # One state at a time: values.
+
+    def _mass_matrix(self, q: Row) -> Row:
+        return pin.crba(self._model, self._data, q)
+
+    def _coriolis_matrix(self, q: Row, v: Row) -> Row:
+        return pin.computeCoriolisMatrix(self._model, self._data, q, v)
+
+    def _gravity(self, q: Row) -> Row:
+        return pin.computeGeneralizedGravity(self._model, self._data, q)
+
+    def _potential_energy(self, q: Row) -> Row:
+        return np.asarray(pin.computePotentialEnergy(self._model, self._data, q))
+
+    def _reference_torque(self, q: Row, v: Row, v_r: Row, a_r: Row) -> Row:
+        mean = pin.rnea(self._model, self._data, q, 0.5 * (v + v_r), a_r)
+        return mean - pin.rnea(self._weightless, self._data, q, 0.5 * (v - v_r), self._zero)
+
+    def _forward_dynamics(self, q: Row, v: Row, tau: Row) -> Row:
+        return pin.aba(self._model, self._data, q, v, tau)
+
+    # One state at a time: cotangent times Jacobians.
+
+    def _mass_matrix_vjp(self, cotangent: Row, q: Row) -> tuple[Row]:
+        # Column j of M is RNEA of the unit acceleration e_j without gravity.
+        columns = (self._rnea_derivatives(self._weightless, q, self._zero, e)[0] for e in self._unit)
+        return (sum((dq.T @ cotangent[:, j] for j, dq in enumerate(columns)), self._zero),)
+
+    def _coriolis_matrix_vjp(self, cotangent: Row, q: Row, v: Row) -> tuple[Row, Row]:
+        # Column j of C(q, v) is h((v + e_j)/2) − h((v − e_j)/2).
+        q_bar, v_bar = self._zero, self._zero
+        for j, e in enumerate(self._unit):
+            plus_q, plus_v, _ = self._rnea_derivatives(self._weightless, q, 0.5 * (v + e), self._zero)
+            minus_q, minus_v, _ = self._rnea_derivatives(self._weightless, q, 0.5 * (v - e), self._zero)
+            q_bar = q_bar + (plus_q - minus_q).T @ cotangent[:, j]
+            v_bar = v_bar + 0.5 * (plus_v - minus_v).T @ cotangent[:, j]
+        return q_bar, v_bar
+
+    def _gravity_vjp(self, cotangent: Row, q: Row) -> tuple[Row]:
+        return (pin.computeGeneralizedGravityDerivatives(self._model, self._data, q).T @ cotangent,)
+
+    def _potential_energy_vjp(self, cotangent: float, q: Row) -> tuple[Row]:
+        return (cotangent * self._gravity(q),)
+
+    def _reference_torque_vjp(self, cotangent: Row, q: Row, v: Row, v_r: Row, a_r: Row) -> tuple[Row, Row, Row, Row]:
+        mean_q, mean_v, mass = self._rnea_derivatives(self._model, q, 0.5 * (v + v_r), a_r)
+        half_q, half_v, _ = self._rnea_derivatives(self._weightless, q, 0.5 * (v - v_r), self._zero)
+        return (
+            (mean_q - half_q).T @ cotangent,
+            0.5 * (mean_v - half_v).T @ cotangent,
+            0.5 * (mean_v + half_v).T @ cotangent,
+            mass @ cotangent,
+        )
+
+    def _forward_dynamics_vjp(self, cotangent: Row, q: Row, v: Row, tau: Row) -> tuple[Row, Row, Row]:
+        jacobians = pin.computeABADerivatives(self._model, self._data, q, v, tau)
+        return tuple(jacobian.T @ cotangent for jacobian in jacobians)
+
+    def _rnea_derivatives(self, model: pin.Model, q: Row, v: Row, a: Row) -> tuple[Row, Row, Row]:
+        """∂τ/∂q, ∂τ/∂v and M at one state."""
+        live = pin.computeRNEADerivatives(model, self._data, q, v, a)  # views into data that the next call overwrites
+        dq, dv, mass = (np.array(x) for x in live)
+        return dq, dv, mass
+
+
+def _evaluate(quantity: Quantity, *arguments: Array) -> Array:
+    """The quantity over leading batch axes, in the kind of the arguments."""
+    if is_torch_array(arguments[0]):
+        from nbs_pin.dynamics.autograd import differentiable
+
+        return differentiable(quantity.value, quantity.vjp, *arguments)
+    if arguments[0].ndim == 1:
+        return quantity.value(*arguments)
+    return over_rows(quantity.value, *arguments)
+
+
+def over_rows(function: Callable[..., Row], *arguments: Row) -> Row:
+    """The function applied to every row of arrays with equal leading axes, stacked again."""
+    batch = arguments[0].shape[:-1]
+    rows = [x.reshape(-1, x.shape[-1]) for x in arguments]
+    values = np.stack([function(*row) for row in zip(*rows, strict=True)])
+    return values.reshape(*batch, *values.shape[1:])
