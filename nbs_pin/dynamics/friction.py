@@ -1,0 +1,52 @@
+"""Friction in the joints, for the plant that has it and the controller that feeds it forward."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.arrays import Array, array_namespace, is_torch_array
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class JointFriction:
+    """Friction torque viscous·v + coulomb·tanh(v / transition) [N·m], against the motion.
+
+    The tanh makes Coulomb friction smooth, so that it has a derivative and an explicit integrator can follow it:
+    near v = 0 it is a damper of coulomb / transition, and a step h is stable for h·coulomb / (transition·M) < 2.
+    """
+
+    viscous: Float[np.ndarray, " n"]
+    """Viscous coefficient per joint [N·m·s/rad]."""
+    coulomb: Float[np.ndarray, " n"]
+    """Coulomb torque per joint [N·m]."""
+    transition: float = 0.05
+    """Speed at which 76 % of the Coulomb torque is reached [rad/s]."""
+
+    def __post_init__(self) -> None:
+        for name, value in {"viscous": self.viscous, "coulomb": self.coulomb}.items():
+            if not (np.isfinite(value).all() and (value >= 0.0).all()):
+                raise ArgumentError(
+                    f"{name} friction is {value}, expected finite numbers ≥ 0; correct the coefficient."
+                )
+        if self.viscous.shape != self.coulomb.shape:
+            raise ArgumentError(
+                f"viscous has {self.viscous.size} joints and coulomb {self.coulomb.size}; give one number per joint."
+            )
+        if not 0.0 < self.transition < np.inf:
+            raise ArgumentError(f"transition is {self.transition} rad/s, expected a finite speed > 0; 0.05 is usual.")
+
+    @classmethod
+    def of(cls, robot: Robot, transition: float = 0.05) -> "JointFriction":
+        """The friction that the arm's URDF states (`<dynamics damping friction>`); zero where it states none."""
+        return cls(robot.damping, robot.friction, transition)
+
+    def torque(self, v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """Torque [N·m] that friction takes at the velocity v [rad/s]; numpy in numpy out, torch in torch out."""
+        if not is_torch_array(v):
+            return self.viscous * v + self.coulomb * np.tanh(v / self.transition)
+        xp = array_namespace(v)
+        viscous, coulomb = (xp.asarray(x, dtype=v.dtype, device=v.device) for x in (self.viscous, self.coulomb))
+        return viscous * v + coulomb * xp.tanh(v / self.transition)

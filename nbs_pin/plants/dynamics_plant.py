@@ -1,0 +1,72 @@
+"""A dynamics provider integrated in time is a plant."""
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.plants.integrators import INTEGRATORS, IntegratorName
+from nbs_pin.plants.plant import Plant
+from nbs_pin.robot import Robot
+
+
+class DynamicsPlant(Plant):
+    """M(q) v̇ + C(q, v) v + G(q) + friction(v) = τ for any provider, the torque held over each step.
+
+    dynamics: the truth; with `PinocchioDynamics` the Pinocchio plant, with a learned model the learned plant.
+    integrator: "rk4", "semi_implicit_euler" or "euler" (`integrators.py`).
+    friction: joint friction of the plant, or None for none.
+    Raises ArgumentError for an unknown integrator or friction of another number of joints.
+    """
+
+    def __init__(
+        self, dynamics: DynamicsProvider, integrator: IntegratorName = "rk4", friction: JointFriction | None = None
+    ) -> None:
+        if integrator not in INTEGRATORS:
+            raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(INTEGRATORS)}.")
+        if friction is not None and friction.viscous.shape != (dynamics.nv,):
+            raise ArgumentError(f"friction has {friction.viscous.size} joints, the dynamics {dynamics.nv}; match them.")
+        self.dynamics = dynamics
+        self.integrator = integrator
+        self.friction = friction
+        self._step = INTEGRATORS[integrator]
+
+    def __repr__(self) -> str:
+        return f"DynamicsPlant({type(self.dynamics).__name__}, {self.integrator})"
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self.dynamics.nv
+
+    @property
+    def robot(self) -> Robot | None:
+        """The arm of the provider, or None."""
+        return self.dynamics.robot
+
+    def step(
+        self,
+        q: Float[np.ndarray, "*batch n"],
+        v: Float[np.ndarray, "*batch n"],
+        tau: Float[np.ndarray, "*batch n"],
+        duration: float,
+    ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"]]:
+        """State (q, v) after one integration step of `duration` [s] with τ [N·m] held (zero-order hold).
+
+        Raises SimulationDiverged when the result is not finite.
+        """
+        dynamics, friction = self.dynamics, self.friction
+
+        def acceleration(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+            net = tau if friction is None else tau - friction.torque(v)
+            return dynamics.forward_dynamics(q, v, net)
+
+        with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below, with its cause
+            q, v = self._step(acceleration, q, v, duration)
+        if not (np.isfinite(q).all() and np.isfinite(v).all()):
+            raise SimulationDiverged(
+                f"{self!r} left the finite numbers in a step of {duration:g} s; "
+                "take a shorter plant step, or look for an unstable controller."
+            )
+        return q, v

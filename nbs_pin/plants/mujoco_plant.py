@@ -1,0 +1,186 @@
+"""MuJoCo as a plant, built from the same URDF bytes as the Pinocchio model (the only room that imports mujoco)."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.exceptions import ArgumentError, RobotError, SimulationDiverged
+from nbs_pin.plants.plant import Plant
+from nbs_pin.robot import Robot
+
+MujocoIntegrator: TypeAlias = Literal["rk4", "euler", "implicitfast"]
+JointFrictionChoice: TypeAlias = Literal["drop", "keep"]
+
+_INTEGRATORS = {
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+_OFF = mujoco.mjtDisableBit
+# Left on, autoreset silently puts a diverged arm back to its start, and a warm start makes a step depend on the last.
+_ALWAYS_OFF = _OFF.mjDSBL_AUTORESET | _OFF.mjDSBL_WARMSTART | _OFF.mjDSBL_ACTUATION
+_CONSTRAINTS_OFF = {
+    "drop": _OFF.mjDSBL_CONSTRAINT,
+    "keep": _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_CONTACT | _OFF.mjDSBL_EQUALITY,  # dry friction is a constraint
+}
+
+
+class MujocoPlant(Plant):
+    """The arm in MuJoCo: same inertias, joint axes and gravity; no contacts, position limits or effort clamps.
+
+    integrator: "rk4" (fourth order), "euler" (semi-implicit) or "implicitfast".
+    joint_friction: "drop" leaves out the URDF's damping and dry friction, as Pinocchio does; "keep" has MuJoCo apply
+    both, the dry friction as its soft constraint.
+    Effort limits belong to `simulate`. Each plant owns one scratch `mujoco.MjData`: use one plant per thread.
+    Raises ArgumentError for an unknown choice and RobotError for an arm that MuJoCo cannot build.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        integrator: MujocoIntegrator = "rk4",
+        joint_friction: JointFrictionChoice = "drop",
+    ) -> None:
+        if integrator not in _INTEGRATORS:
+            raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(_INTEGRATORS)}.")
+        if joint_friction not in _CONSTRAINTS_OFF:
+            raise ArgumentError(f"joint_friction '{joint_friction}' is unknown; give 'drop' or 'keep'.")
+        self._robot = robot
+        self.integrator = integrator
+        self.joint_friction = joint_friction
+        self.model = build_model(robot, integrator, joint_friction)
+        self._data = mujoco.MjData(self.model)
+        ids = [self.model.joint(name).id for name in robot.joint_names]
+        self._at_q = self.model.jnt_qposadr[ids]
+        self._at_v = self.model.jnt_dofadr[ids]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as the arguments it is rebuilt from: MuJoCo's scratch data is no part of its value."""
+        return MujocoPlant, (self._robot, self.integrator, self.joint_friction)
+
+    def __repr__(self) -> str:
+        return f"MujocoPlant({self._robot.name}, {self.integrator}, joint_friction={self.joint_friction})"
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return len(self._at_v)
+
+    @property
+    def robot(self) -> Robot:
+        """The arm."""
+        return self._robot
+
+    def step(
+        self,
+        q: Float[np.ndarray, "*batch n"],
+        v: Float[np.ndarray, "*batch n"],
+        tau: Float[np.ndarray, "*batch n"],
+        duration: float,
+    ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"]]:
+        """State (q, v) after one MuJoCo step of `duration` [s] with τ [N·m] held.
+
+        Raises SimulationDiverged when an input or the result is not finite or MuJoCo counts a warning.
+        """
+        self.model.opt.timestep = duration
+        result = _stack(self._step_row, q, v, tau)
+        return result[..., 0, :], result[..., 1, :]
+
+    def acceleration(
+        self,
+        q: Float[np.ndarray, "*batch n"],
+        v: Float[np.ndarray, "*batch n"],
+        tau: Float[np.ndarray, "*batch n"],
+    ) -> Float[np.ndarray, "*batch n"]:
+        """v̇ [rad/s²] that MuJoCo's forward dynamics gives the torque τ [N·m]."""
+        return _stack(lambda *row: self._forward(*row).qacc[self._at_v], q, v, tau)
+
+    def bias(self, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n"]:
+        """C(q, v) v + G(q) [N·m], without joint friction."""
+        return _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v], q, v, np.zeros_like(v))
+
+    def mass_matrix(self, q: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n n"]:
+        """M(q) [kg·m²]."""
+        return _stack(self._mass_matrix_row, q, np.zeros_like(q), np.zeros_like(q))
+
+    def _mass_matrix_row(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        full = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, self._forward(q, v, tau), full)
+        return full[np.ix_(self._at_v, self._at_v)]
+
+    def _forward(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> mujoco.MjData:
+        self._set(q, v, tau)
+        mujoco.mj_forward(self.model, self._data)
+        self._check_warnings()
+        return self._data
+
+    def _step_row(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        self._set(q, v, tau)
+        data = self._data
+        mujoco.mj_step(self.model, data)
+        self._check_warnings()
+        row = np.array((data.qpos[self._at_q], data.qvel[self._at_v]))
+        if not np.isfinite(row).all():
+            raise SimulationDiverged(
+                f"{self!r} left the finite numbers; take a shorter plant step, or look for an unstable controller."
+            )
+        return row
+
+    def _set(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
+        # MuJoCo reads a torque that is not a number as zero and goes on, so it must never see one.
+        if not np.isfinite((q, v, tau)).all():
+            raise SimulationDiverged(
+                f"{self!r} was given q = {q}, v = {v}, torque = {tau}, expected finite numbers; look for their source."
+            )
+        self._data.qpos[self._at_q] = q
+        self._data.qvel[self._at_v] = v
+        self._data.qfrc_applied[self._at_v] = tau
+
+    def _check_warnings(self) -> None:
+        counts = self._data.warning.number
+        if counts.any():
+            kind = int(np.flatnonzero(counts)[0])
+            cause = mujoco.mju_warningText(kind, int(self._data.warning.lastinfo[kind]))
+            mujoco.mj_resetData(self.model, self._data)
+            raise SimulationDiverged(
+                f"{self!r}: {cause} Take a shorter plant step, or look for an unstable controller."
+            )
+
+
+def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: JointFrictionChoice) -> mujoco.MjModel:
+    """MuJoCo's model of the arm, from `robot.urdf.xml` without its shapes; raises RobotError when it cannot be built.
+
+    It goes through `MjSpec` and never through MuJoCo's own XML, which prints six digits.
+    """
+    root = ET.fromstring(robot.urdf.xml)
+    for parent, tags in (("link", ("visual", "collision")), (None, ("mujoco",))):
+        for element in [root] if parent is None else root.iter(parent):
+            for child in [child for tag in tags for child in element.findall(tag)]:
+                element.remove(child)
+    try:
+        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+        for joint in spec.joints:
+            joint.limited = joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+            if joint_friction == "drop":
+                joint.damping, joint.frictionloss = np.zeros(3), 0.0
+        spec.option.gravity = robot.gravity_vector
+        spec.option.integrator = _INTEGRATORS[integrator]
+        spec.option.disableflags = _ALWAYS_OFF | _CONSTRAINTS_OFF[joint_friction]
+        return spec.compile()
+    except ValueError as error:
+        raise RobotError(
+            f"{robot.source}: MuJoCo cannot build this arm ({error}); correct that link or joint."
+        ) from error
+
+
+def _stack(function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
+    """`function` of each row of arrays of one batch shape, stacked with that shape."""
+    first = arrays[0]
+    if first.ndim == 1:
+        return function(*arrays)
+    rows = [function(*row) for row in zip(*(x.reshape(-1, x.shape[-1]) for x in arrays), strict=True)]
+    return np.array(rows).reshape(first.shape[:-1] + rows[0].shape)

@@ -1,0 +1,30 @@
+"""A progress bar for long work at a terminal, silence everywhere else."""
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
+
+_PATIENCE = 2.0
+_REFRESH = 0.1
+
+
+def tracked(items: Sequence[T], label: str, show: bool = True) -> Iterator[T]:
+    """The items one by one, with a progress bar on stderr once the work has taken 2 s and stderr is a terminal."""
+    if not (show and sys.stderr.isatty()):
+        yield from items
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    start = drawn = time.perf_counter()
+    with Progress(console=Console(stderr=True), auto_refresh=False, transient=True) as bar:
+        task = bar.add_task(label, total=len(items), visible=False)
+        for done, item in enumerate(items):
+            now = time.perf_counter()
+            if now - start > _PATIENCE and now - drawn > _REFRESH:
+                bar.update(task, completed=done, visible=True, refresh=True)
+                drawn = now
+            yield item

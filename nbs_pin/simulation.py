@@ -1,0 +1,217 @@
+"""The one time loop: a controller, a reference and a plant make a Run."""
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.plants.plant import Plant
+from nbs_pin.progress import tracked
+from nbs_pin.state import Reference, Run
+
+Disturbance: TypeAlias = Callable[[float, np.ndarray, np.ndarray], Any]
+"""τ_d(t, q, v) [N·m], shape (..., n)."""
+DesiredMotion: TypeAlias = Callable[[Any], Reference]
+"""ref(t) -> Reference, of a time [s] (shapes (n,)) or of an array of times (shapes (..., n))."""
+
+LONGEST_PLANT_STEP = 1e-3
+"""Plant step taken when none is given, or the nearest shorter one that divides the period [s]."""
+
+
+def simulate(
+    plant: Plant,
+    controller: Controller,
+    reference: DesiredMotion,
+    duration: float,
+    period: float,
+    *,
+    q0: Any = None,
+    v0: Any = None,
+    plant_step: float | None = None,
+    effort_limit: Any = None,
+    disturbance: Disturbance | None = None,
+    progress: bool = False,
+) -> Run:
+    """The motion of `plant` under `controller` following `reference` for `duration` [s].
+
+    Every `period` [s] the controller sees the state and the reference; its torque is clipped to the effort limits and
+    held until the next instant, while the plant takes steps of `plant_step` [s] under τ + τ_d.
+
+    duration: a whole number of periods. period: a whole number of plant steps; without `plant_step`, the longest step
+    of at most 1 ms that divides it.
+    q0, v0: start [rad], [rad/s]. Without q0 the start is the reference's (q and v); with q0 and no v0 it is at rest.
+    Leading axes of q0 simulate many starts at once.
+    effort_limit: largest |τ| [N·m], a number or one per joint; None takes the arm's (`plant.robot`), inf for none.
+    disturbance: τ_d(t, q, v) [N·m], evaluated at every plant step and held over it (`disturbances.py`, any callable).
+    progress: show a progress bar when it takes longer than 2 s at a terminal.
+
+    Raises ArgumentError for arguments that do not fit each other, and SimulationDiverged, naming the time, when the
+    controller's torque or the state is not finite or the engine warns.
+    """
+    if controller.nv != plant.nv:
+        raise ArgumentError(
+            f"the controller has {controller.nv} joints and the plant {plant.nv}; build both for one arm."
+        )
+    steps = whole(duration, period, "duration", "period")
+    substeps = _substeps(period, plant_step)
+    limit = _effort_limit(plant, effort_limit)
+    desired = _sampled(reference, period * np.arange(steps + 1.0), plant.nv)
+    run = _prepared(plant, desired, period, limit, *_start(desired, q0, v0))
+    run.info.update(controller=type(controller).__name__, plant=repr(plant), plant_step=period / substeps)
+    memory = controller.initial_memory(run.q[0])
+    for k in tracked(range(steps + 1), "simulating", progress):
+        t, q, v = float(run.t[k]), run.q[k], run.v[k]
+        desired = Reference(run.q_ref[k], run.v_ref[k], run.a_ref[k])
+        command, memory = controller.step(memory, q, v, desired, period)
+        # Finite before clipped: a clip can turn a torque that is not a number into full effort.
+        run.tau_command[k] = _checked(command, q.shape, controller, t)
+        tau = run.tau[k] = np.maximum(np.minimum(run.tau_command[k], limit), -limit)
+        run.disturbance[k] = _disturbance(disturbance, t, q, v)
+        if k < steps:
+            run.q[k + 1], run.v[k + 1] = _advance(plant, q, v, tau, disturbance, t, period, substeps)
+    return run
+
+
+def whole(total: float, part: float, total_name: str, part_name: str) -> int:
+    """How many parts make the total [both s]; raises ArgumentError unless that is a whole number ≥ 1."""
+    for name, value in ((total_name, total), (part_name, part)):
+        if not 0.0 < value < math.inf:
+            raise ArgumentError(f"{name} is {value} s, expected a finite time > 0; give seconds.")
+    ratio = total / part
+    if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-9):
+        raise ArgumentError(
+            f"{total_name} {total:g} s is {ratio:.6g} times the {part_name} {part:g} s, expected a whole number; "
+            f"take for instance {max(1, round(ratio)) * part:.9g} s."
+        )
+    return round(ratio)
+
+
+def _substeps(period: float, plant_step: float | None) -> int:
+    if plant_step is not None:
+        return whole(period, plant_step, "period", "plant_step")
+    whole(period, period, "period", "period")
+    return max(1, math.ceil(period / LONGEST_PLANT_STEP - 1e-9))
+
+
+def _sampled(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
+    sampled = reference(t)
+    for name, rows in zip(Reference._fields, sampled, strict=True):
+        if np.shape(rows) != (t.size, nv):
+            raise ArgumentError(
+                f"the reference at {t.size} times gave {name} of shape {np.shape(rows)}, expected ({t.size}, {nv}); "
+                f"give it one value for each of the {nv} joints and let it take arrays of times."
+            )
+        if not np.isfinite(rows).all():
+            k, joint = np.argwhere(~np.isfinite(rows))[0]
+            raise ArgumentError(f"the reference's {name} of joint {joint} at t = {t[k]:g} s is not finite; correct it.")
+    return sampled
+
+
+def _start(desired: Reference, q0: Any, v0: Any) -> list[np.ndarray]:
+    """Start (q, v) of one batch shape."""
+    rest = desired.v[0] if q0 is None else np.zeros_like(desired.v[0])
+    given = {"q0": desired.q[0] if q0 is None else q0, "v0": rest if v0 is None else v0}
+    start = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+    nv = rest.size
+    for name, x in start.items():
+        if x.ndim == 0 or x.shape[-1] != nv or 0 in x.shape:
+            raise ArgumentError(f"{name} has shape {x.shape}, expected (..., {nv}): one number per joint.")
+        if not np.isfinite(x).all():
+            raise ArgumentError(f"{name} is {x}, expected finite numbers; correct the start.")
+    try:
+        return list(np.broadcast_arrays(start["q0"], start["v0"]))
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {x.shape}" for name, x in start.items())
+        raise ArgumentError(f"the starts do not broadcast ({shapes}); give equal leading axes.") from error
+
+
+def _prepared(
+    plant: Plant, desired: Reference, period: float, limit: np.ndarray, q0: np.ndarray, v0: np.ndarray
+) -> Run:
+    """The run with its times, reference and start in place, and room for the rest."""
+    rows, n = desired.q.shape
+    shape = (rows, *q0.shape)
+    q_ref, v_ref, a_ref = (np.broadcast_to(x.reshape(rows, *(1,) * (q0.ndim - 1), n), shape) for x in desired)
+    robot = plant.robot
+    run = Run(
+        t=period * np.arange(float(rows)),
+        q=np.zeros(shape),
+        v=np.zeros(shape),
+        tau=np.zeros(shape),
+        tau_command=np.zeros(shape),
+        disturbance=np.zeros(shape),
+        q_ref=q_ref,
+        v_ref=v_ref,
+        a_ref=a_ref,
+        effort_limit=limit,
+        continuous=np.zeros(n, dtype=bool) if robot is None else robot.continuous,
+        joint_names=tuple(f"q{i + 1}" for i in range(n)) if robot is None else robot.joint_names,
+        period=period,
+        robot="" if robot is None else robot.source,
+        robot_sha256="" if robot is None else robot.sha256,
+    )
+    run.q[0], run.v[0] = q0, v0
+    return run
+
+
+def _effort_limit(plant: Plant, given: Any) -> np.ndarray:
+    if given is None:
+        given = np.inf if plant.robot is None else plant.robot.effort_limit
+    limit = np.asarray(given, dtype=float)
+    if limit.shape not in ((), (plant.nv,)) or not (limit > 0.0).all():
+        raise ArgumentError(
+            f"effort_limit is {given}, expected one number > 0 or {plant.nv} of them [N·m]; np.inf means no limit."
+        )
+    return np.full(plant.nv, limit)
+
+
+def _checked(command: Any, shape: tuple[int, ...], controller: Controller, t: float) -> np.ndarray:
+    command = np.asarray(command, dtype=float)
+    if command.shape != shape:
+        raise ArgumentError(
+            f"{type(controller).__name__} gave a torque of shape {command.shape} at t = {t:g} s, expected {shape}; "
+            "a controller returns one torque per joint for every start."
+        )
+    if not np.isfinite(command).all():
+        raise SimulationDiverged(
+            f"{type(controller).__name__} asked for the torque {command} at t = {t:g} s, expected finite numbers; "
+            "look for a division by zero or an unstable gain."
+        )
+    return command
+
+
+def _disturbance(disturbance: Disturbance | None, t: float, q: np.ndarray, v: np.ndarray) -> Any:
+    if disturbance is None:
+        return 0.0
+    torque = np.asarray(disturbance(t, q, v), dtype=float)
+    if torque.shape not in (q.shape, q.shape[-1:]):
+        raise ArgumentError(
+            f"the disturbance at t = {t:g} s has shape {torque.shape}, expected {q.shape}; return one torque per joint."
+        )
+    if not np.isfinite(torque).all():
+        raise SimulationDiverged(f"the disturbance at t = {t:g} s is {torque}, expected finite torques; correct it.")
+    return torque
+
+
+def _advance(
+    plant: Plant,
+    q: np.ndarray,
+    v: np.ndarray,
+    tau: np.ndarray,
+    disturbance: Disturbance | None,
+    t: float,
+    period: float,
+    substeps: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The state one period later."""
+    step = period / substeps
+    try:
+        for j in range(substeps):
+            total = tau if disturbance is None else tau + _disturbance(disturbance, t + j * step, q, v)
+            q, v = plant.step(q, v, total, step)
+    except SimulationDiverged as error:
+        raise SimulationDiverged(f"after t = {t:g} s: {error}") from error
+    return q, v
