@@ -1,10 +1,11 @@
 """The arms that `load_robot` knows by name."""
 
+import difflib
 import importlib.metadata
 from dataclasses import dataclass
 from pathlib import Path
 
-from nbs_pin.exceptions import RobotNotFound
+from nbs_pin.exceptions import RobotError, RobotNotFound
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ _EXAMPLES: dict[str, tuple[str, tuple[str, ...], str]] = {
     "talos_left_arm": ("talos_data/robots/talos_left_arm.urdf", (), "refuse"),
     "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", (), "unlimited"),
 }
+_SUFFIXES = (".urdf", ".xacro")
 ROBOT_NAMES: tuple[str, ...] = (*_BUNDLED, *_EXAMPLES)
 """Every name `load_robot` knows."""
 
@@ -44,7 +46,10 @@ def example_robot_share() -> Path:
 
 
 def find(name_or_path: str) -> Entry:
-    """The catalogue's entry for a name, or a plain entry for a path; raises RobotNotFound for neither."""
+    """The catalogue's entry for a name, or a plain entry for a path.
+
+    Raises RobotNotFound for neither, with the names that come close, and RobotError for a path that may not be read.
+    """
     if name_or_path in _BUNDLED:
         folder = Path(__file__).parent / "_urdf"
         folder = folder if folder.is_dir() else Path(__file__).parent.parent / "urdf"
@@ -53,6 +58,24 @@ def find(name_or_path: str) -> Entry:
         path, lock, zero_limits = _EXAMPLES[name_or_path]
         robots = example_robot_share() / "example-robot-data" / "robots"
         return Entry(name_or_path, robots / path, lock, zero_limits=zero_limits)
-    if Path(name_or_path).is_file():
-        return Entry("", Path(name_or_path).resolve())
-    raise RobotNotFound(f"no robot '{name_or_path}': give a file or one of {', '.join(ROBOT_NAMES)}.")
+    try:
+        return _entry_of_file(Path(name_or_path).expanduser())
+    except OSError as error:
+        if isinstance(error, RobotNotFound):
+            raise
+        raise RobotError(f"cannot read '{name_or_path:.200}': {error.strerror}; check the path.") from error
+
+
+def _entry_of_file(path: Path) -> Entry:
+    """A plain entry for a file; raises RobotNotFound, with what could have been meant, when there is none."""
+    if path.is_file():
+        return Entry("", path.resolve())
+    names = ", ".join(ROBOT_NAMES)
+    if path.is_dir():
+        inside = ", ".join(sorted(file.name for file in path.iterdir() if file.suffix in _SUFFIXES)[:10])
+        raise RobotNotFound(f"'{path}' is a directory; give one file in it ({inside or 'no .urdf lies here'}).")
+    if path.suffix in _SUFFIXES or len(path.parts) > 1:
+        raise RobotNotFound(f"no file '{path}' (seen from {Path.cwd()}); give a file or one of {names}.")
+    near = difflib.get_close_matches(path.name, ROBOT_NAMES)
+    hint = f" did you mean {' or '.join(near)}?" if near else ""
+    raise RobotNotFound(f"no robot '{path}':{hint} give a file or one of {names}.")

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,14 @@ from jaxtyping import Bool, Float
 
 from nbs_pin.arrays import Array, array_namespace
 from nbs_pin.catalogue import find
+from nbs_pin.exceptions import ArgumentError, RobotError
 from nbs_pin.urdf import JointData, Urdf, read_urdf
 
+_SINGULAR = 1e-10
+"""Smallest eigenvalue of M scaled to a unit diagonal that still counts as positive."""
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Robot:
     """A fixed-base arm with nq = nv = n joints.
 
@@ -35,7 +40,10 @@ class Robot:
         """Number of joints."""
         return int(self.model.nv)
 
-    @property
+    def __repr__(self) -> str:
+        return f"Robot({self.name!r}, {self.nv} joints)"
+
+    @cached_property
     def joints(self) -> tuple[JointData, ...]:
         """The moving joints, in Pinocchio's order."""
         by_name = {joint.name: joint for joint in self.urdf.joints}
@@ -83,8 +91,8 @@ class Robot:
 
     @property
     def sha256(self) -> str:
-        """Fingerprint of the description and gravity: equal when the dynamics are equal."""
-        return hashlib.sha256(self.urdf.xml + self.gravity_vector.tobytes()).hexdigest()
+        """Fingerprint of links, joints, limits and gravity: equal for equal dynamics, however they are drawn."""
+        return hashlib.sha256(self.urdf.without_geometry() + self.gravity_vector.tobytes()).hexdigest()
 
     def difference(self, q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
@@ -117,12 +125,66 @@ def load_robot(
     gravity: downward acceleration [m/s²] or a vector in the base frame; None takes the catalogue's, else 9.81.
     lock: joints to fix at zero; None takes the catalogue's list.
     Raises RobotNotFound for a name or path that leads nowhere, RobotError for a description that would give a wrong
-    model, and MissingExtra for a `.xacro` without the `xacro` extra.
+    model, ArgumentError for a gravity that is none, and MissingExtra for a `.xacro` without the `xacro` extra.
     """
     entry = find(str(name_or_path))
-    urdf = read_urdf(entry.path, lock=entry.lock if lock is None else tuple(lock), zero_limits=entry.zero_limits)
-    model = pin.buildModelFromXML(urdf.xml.decode())
-    vector = np.asarray(entry.gravity if gravity is None else gravity, dtype=float)
-    vector = np.array([0.0, 0.0, -float(vector)]) if vector.ndim == 0 else vector
+    if lock is None:
+        lock = entry.lock
+    locked = (lock,) if isinstance(lock, str) else tuple(lock)
+    urdf = read_urdf(entry.path, lock=locked, zero_limits=entry.zero_limits)
+    vector = _gravity_vector(entry.gravity if gravity is None else gravity)
+    model = _build_model(urdf)
     model.gravity.linear = vector
     return Robot(entry.name or urdf.name, str(name_or_path), urdf, model, vector)
+
+
+def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
+    """The gravity vector in the base frame [m/s²]; raises ArgumentError unless it is one or three finite numbers."""
+    message = f"gravity is {gravity!r}, expected one finite number (downward) or three; give e.g. 9.81."
+    try:
+        vector = np.array(list(gravity) if isinstance(gravity, Iterable) else gravity, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(message) from error
+    if vector.shape not in ((), (3,)) or not np.isfinite(vector).all():
+        raise ArgumentError(message)
+    return np.array([0.0, 0.0, -float(vector)]) if vector.ndim == 0 else vector
+
+
+def _build_model(urdf: Urdf) -> pin.Model:
+    """Pinocchio's model of the arm, with our limits; raises RobotError unless M(q) is finite and positive definite."""
+    try:
+        model = pin.buildModelFromXML(urdf.without_geometry().decode())
+    except (ValueError, RuntimeError) as error:
+        raise RobotError(f"{urdf.path}: Pinocchio cannot build it ({error}); simplify the file.") from error
+    by_name = {joint.name: joint for joint in urdf.joints}
+    joints = [by_name[name] for name in model.names[1:]]
+    effort, velocity = (np.array([getattr(joint, key) for joint in joints]) for key in ("effort", "velocity"))
+    model.lowerPositionLimit = np.array([joint.lower for joint in joints])
+    model.upperPositionLimit = np.array([joint.upper for joint in joints])
+    model.lowerEffortLimit, model.upperEffortLimit = -effort, effort
+    model.lowerVelocityLimit, model.upperVelocityLimit = -velocity, velocity
+    _check_mass_matrix(model, urdf.path)
+    return model
+
+
+def _check_mass_matrix(model: pin.Model, path: Path) -> None:
+    """Raise RobotError unless M(q) ≻ 0 at zero and at five seeded configurations within the limits.
+
+    The test is on M scaled to a unit diagonal, so that grams beside tonnes and metres beside radians do not matter.
+    """
+    data = model.createData()
+    low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
+    high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
+    for q in (np.clip(0.0, low, high), *np.random.default_rng(0).uniform(low, high, (5, model.nq))):
+        mass = pin.crba(model, data, q)
+        inertia = np.diag(mass)
+        weakest = int(np.argmin(inertia))
+        if np.isfinite(mass).all() and inertia[weakest] > 0.0:
+            values, vectors = np.linalg.eigh(mass / np.sqrt(inertia) / np.sqrt(inertia)[:, None])
+            if values[0] > _SINGULAR:
+                continue
+            weakest = int(np.argmax(np.abs(vectors[:, 0])))
+        raise RobotError(
+            f"{path}: joint '{model.names[1 + weakest]}': M(q) is not finite and positive definite at "
+            f"q = {np.round(q, 3).tolist()}; give the links behind it inertia about its axis."
+        )

@@ -5,6 +5,15 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
+from nbs_pin.exceptions import RobotError
+from nbs_pin.urdf_checks import Joint, Limits, check_axis, check_bodies, check_tree, read_friction, read_limits
+from nbs_pin.urdf_source import read_source
+
+_UNLIMITED = 1e9
+"""How an absent limit is written into the XML: no engine reads "inf"."""
+_DYNAMIC = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "dynamics")}
+_MESHES = (".stl", ".obj", ".dae")
+
 
 @dataclass(frozen=True)
 class JointData:
@@ -23,48 +32,78 @@ class JointData:
 
 @dataclass(frozen=True)
 class Urdf:
-    """A checked description: `xml` has locked joints fixed and continuous joints as unbounded revolute ones."""
+    """A checked description: `xml` has locked joints fixed and continuous joints as unbounded revolute ones.
+
+    Every number of the dynamics stands in `xml` in its shortest exact form, absent limits as ±1e9; drawings, materials
+    and transmissions are as the file has them, unchecked.
+    """
 
     name: str
     path: Path
     xml: bytes
     joints: tuple[JointData, ...]
 
+    def without_geometry(self) -> bytes:
+        """The dynamics alone: links with inertias and joints, no visual, collision, material or extension."""
+        source = ET.fromstring(self.xml)
+        robot = ET.Element("robot", {"name": self.name})
+        for part in source:
+            if part.tag in _DYNAMIC:
+                copy = ET.SubElement(robot, part.tag, part.attrib)
+                copy.extend(_bare(child) for child in part if child.tag in _DYNAMIC[part.tag])
+        return ET.tostring(robot)
+
 
 def read_urdf(path: Path, *, lock: tuple[str, ...] = (), zero_limits: str = "refuse") -> Urdf:
-    """The checked description in the file `path`, with the joints in `lock` fixed at zero."""
-    root = ET.fromstring(path.read_bytes())
-    joints = []
-    for element in root.findall("joint"):
-        kind = element.get("type")
-        if element.get("name") in set(lock):
-            element.set("type", "fixed")
-            for tag in ("mimic", "limit", "dynamics"):
-                for child in element.findall(tag):
-                    element.remove(child)
-        if element.get("type") == "fixed":
-            continue
-        limit = element.find("limit")
-        dynamics = element.find("dynamics")
-        limits = {} if limit is None else limit.attrib
-        stated = {key: float(limits.get(key, 0)) or math.inf for key in ("effort", "velocity")}
-        continuous = kind == "continuous"
-        if continuous:
-            element.set("type", "revolute")
-            limit = ET.SubElement(element, "limit") if limit is None else limit
-            for key, value in {"lower": -1e9, "upper": 1e9, "effort": 1e9, "velocity": 1e9}.items():
-                limit.set(key, limit.get(key, str(value)))
-        joints.append(
-            JointData(
-                name=element.get("name", ""),
-                continuous=continuous,
-                prismatic=kind == "prismatic",
-                lower=-math.inf if continuous else float(limits["lower"]),
-                upper=math.inf if continuous else float(limits["upper"]),
-                effort=stated["effort"],
-                velocity=stated["velocity"],
-                damping=0.0 if dynamics is None else float(dynamics.get("damping", 0)),
-                friction=0.0 if dynamics is None else float(dynamics.get("friction", 0)),
-            )
-        )
-    return Urdf(root.get("name", path.stem), path, ET.tostring(root), tuple(joints))
+    """The checked description in the `.urdf` or `.xacro` file `path`, with the joints in `lock` fixed at zero.
+
+    zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range, or read zeros as "unlimited".
+    Raises RobotError, naming file, line, element, value and remedy, for a description that would give a wrong model,
+    RobotNotFound for a path without a file, MissingExtra for a `.xacro` file without the `xacro` extra.
+    """
+    robot = read_source(path)
+    joints = check_tree(robot, lock)
+    check_bodies(robot, joints)
+    moving = tuple(_settle(joint, zero_limits) for joint in joints if joint.moves)
+    return Urdf(robot.element.get("name", path.stem), path, ET.tostring(robot.element), moving)
+
+
+def mesh_file(uri: str, roots: tuple[Path, ...]) -> Path:
+    """The file of a mesh that a URDF names, which must lie inside one of the `roots`.
+
+    `package://name/rest` is looked up as name/rest under each root, a relative path as itself. Raises RobotError for
+    any other scheme, an absolute path, a path that leaves the roots, another kind than .stl, .obj or .dae, or no file.
+    """
+    relative = uri.removeprefix("package://")
+    if "://" in relative or Path(relative).is_absolute():
+        raise RobotError(f"mesh '{uri}' is no path inside the model directory; use a relative or package:// path.")
+    if Path(relative).suffix.lower() not in _MESHES:
+        raise RobotError(f"mesh '{uri}' is of an unknown kind; use one of {', '.join(_MESHES)}.")
+    for root in roots:
+        file = (root / relative).resolve()
+        if not file.is_relative_to(root.resolve()):
+            raise RobotError(f"mesh '{uri}' leaves the model directory {root}; move it inside.")
+        if file.is_file():
+            return file
+    raise RobotError(f"mesh '{uri}' does not exist under {', '.join(map(str, roots))}; add it.")
+
+
+def _settle(joint: Joint, zero_limits: str) -> JointData:
+    """The data of a moving joint, written back into its element as a revolute or prismatic joint with all limits."""
+    check_axis(joint)
+    limits = read_limits(joint, zero_limits)
+    damping, friction = read_friction(joint)
+    element = joint.node.element
+    stated = element.find("limit")
+    stated = ET.SubElement(element, "limit") if stated is None else stated
+    for key, value in zip(Limits._fields, limits, strict=True):
+        stated.set(key, repr(value if math.isfinite(value) else math.copysign(_UNLIMITED, value)))
+    element.set("type", "prismatic" if joint.kind == "prismatic" else "revolute")
+    return JointData(joint.name, joint.kind == "continuous", joint.kind == "prismatic", *limits, damping, friction)
+
+
+def _bare(element: ET.Element) -> ET.Element:
+    """A copy without the file's spaces, so that equal dynamics give equal bytes."""
+    copy = ET.Element(element.tag, element.attrib)
+    copy.extend(_bare(child) for child in element)
+    return copy
