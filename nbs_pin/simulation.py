@@ -1,21 +1,18 @@
 """The one time loop: a controller, a reference and a plant make a Run."""
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
+from nbs_pin.checks import positive, whole
 from nbs_pin.controllers.controller import Controller
+from nbs_pin.disturbances import Disturbance
 from nbs_pin.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.plants.plant import Plant
 from nbs_pin.progress import tracked
+from nbs_pin.references import DesiredMotion
 from nbs_pin.state import Reference, Run
-
-Disturbance: TypeAlias = Callable[[float, np.ndarray, np.ndarray], Any]
-"""τ_d(t, q, v) [N·m], shape (..., n)."""
-DesiredMotion: TypeAlias = Callable[[Any], Reference]
-"""ref(t) -> Reference, of a time [s] (shapes (n,)) or of an array of times (shapes (..., n))."""
 
 LONGEST_PLANT_STEP = 1e-3
 """Plant step taken when none is given, or the nearest shorter one that divides the period [s]."""
@@ -75,33 +72,19 @@ def simulate(
     return run
 
 
-def whole(total: float, part: float, total_name: str, part_name: str) -> int:
-    """How many parts make the total [both s]; raises ArgumentError unless that is a whole number ≥ 1."""
-    for name, value in ((total_name, total), (part_name, part)):
-        if not 0.0 < value < math.inf:
-            raise ArgumentError(f"{name} is {value} s, expected a finite time > 0; give seconds.")
-    ratio = total / part
-    if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-9):
-        raise ArgumentError(
-            f"{total_name} {total:g} s is {ratio:.6g} times the {part_name} {part:g} s, expected a whole number; "
-            f"take for instance {max(1, round(ratio)) * part:.9g} s."
-        )
-    return round(ratio)
-
-
 def _substeps(period: float, plant_step: float | None) -> int:
     if plant_step is not None:
         return whole(period, plant_step, "period", "plant_step")
-    whole(period, period, "period", "period")
+    positive("period", period, "s")
     return max(1, math.ceil(period / LONGEST_PLANT_STEP - 1e-9))
 
 
 def _sampled(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
-    sampled = reference(t)
-    for name, rows in zip(Reference._fields, sampled, strict=True):
-        if np.shape(rows) != (t.size, nv):
+    sampled = Reference(*(np.asarray(x, dtype=float) for x in reference(t)))
+    for name, rows in sampled._asdict().items():
+        if rows.shape != (t.size, nv):
             raise ArgumentError(
-                f"the reference at {t.size} times gave {name} of shape {np.shape(rows)}, expected ({t.size}, {nv}); "
+                f"the reference at {t.size} times gave {name} of shape {rows.shape}, expected ({t.size}, {nv}); "
                 f"give it one value for each of the {nv} joints and let it take arrays of times."
             )
         if not np.isfinite(rows).all():

@@ -1,12 +1,22 @@
 """Small named records that every room passes around."""
 
+import dataclasses
+import json
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from nbs_pin.arrays import Array
+from nbs_pin.exceptions import ArgumentError, FileFormatError
+from nbs_pin.npz import read_npz, require, write_npz
+
+RUN_FORMAT = "nbs_pin run 1"
+"""What the `format` entry of a run file says."""
+_PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+_PER_JOINT = ("effort_limit", "continuous", "joint_names")
 
 
 class State(NamedTuple):
@@ -69,3 +79,63 @@ class Run:
     def nv(self) -> int:
         """Number of joints."""
         return int(self.q.shape[-1])
+
+    def save(self, path: str | Path) -> None:
+        """Write the run to an npz file; an older file of that name is replaced whole or left alone.
+
+        Raises ArgumentError when `info` holds something JSON cannot say.
+        """
+        try:
+            info = json.dumps(self.info, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ArgumentError(
+                f"run.info cannot be stored as JSON ({error}); keep numbers, text and lists."
+            ) from error
+        values = {entry.name: np.asarray(getattr(self, entry.name)) for entry in dataclasses.fields(self)}
+        write_npz(path, values | {"info": np.array(info), "format": np.array(RUN_FORMAT)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Run":
+        """The run in the npz file that `save` wrote.
+
+        Raises FileFormatError for a damaged file, a missing key, a wrong shape or a number that is not finite.
+        """
+        data = read_npz(path)
+        require(data, path, {"format": "U", "t": "f", **dict.fromkeys(_PER_ROW, "f"), "effort_limit": "f"})
+        require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", "info"), "U")})
+        require(data, path, {"period": "f"})
+        if str(data["format"]) != RUN_FORMAT:
+            raise FileFormatError(f"{path}: format '{data['format']}', expected '{RUN_FORMAT}'; record the run again.")
+        _check_shapes(path, data)
+        finite = [*(name for name in ("t", "period", *_PER_ROW) if not np.isfinite(data[name]).all())]
+        if finite:
+            raise FileFormatError(f"{path}: '{finite[0]}' has numbers that are not finite; record the run again.")
+        return cls(
+            **{name: data[name] for name in ("t", *_PER_ROW, "effort_limit", "continuous")},
+            joint_names=tuple(str(name) for name in data["joint_names"]),
+            period=float(data["period"]),
+            robot=str(data["robot"]),
+            robot_sha256=str(data["robot_sha256"]),
+            info=_parsed(path, str(data["info"])),
+        )
+
+
+def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
+    shape = data["q"].shape
+    expected = dict.fromkeys(_PER_ROW, shape) | dict.fromkeys(_PER_JOINT, shape[-1:]) | {"t": shape[:1], "period": ()}
+    for name, wanted in expected.items():
+        if len(shape) < 2 or data[name].shape != wanted:
+            raise FileFormatError(
+                f"{path}: '{name}' has shape {data[name].shape}, expected {wanted} beside q of shape {shape}, "
+                "(rows, ..., joints); record the run again."
+            )
+
+
+def _parsed(path: str | Path, text: str) -> dict[str, Any]:
+    try:
+        info = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise FileFormatError(f"{path}: 'info' is not JSON ({error}); record the run again.") from error
+    if not isinstance(info, dict):
+        raise FileFormatError(f"{path}: 'info' is a {type(info).__name__}, expected an object; record the run again.")
+    return info

@@ -1,0 +1,39 @@
+"""Checks of arguments that several rooms share; each raises ArgumentError saying what was given and expected."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from nbs_pin.exceptions import ArgumentError
+
+
+def per_joint(record: Any, *names: str) -> None:
+    """Turn the named fields of a frozen record into float arrays of shape () or (n,), finite."""
+    for name in names:
+        value = getattr(record, name)
+        array = np.asarray(value, dtype=float)
+        if array.ndim > 1 or array.size == 0 or not np.isfinite(array).all():
+            raise ArgumentError(
+                f"{type(record).__name__}'s {name} is {value}, expected one finite number or one per joint; correct it."
+            )
+        object.__setattr__(record, name, array)
+
+
+def positive(name: str, value: float, unit: str) -> None:
+    """Check 0 < value < inf."""
+    if not 0.0 < value < math.inf:
+        raise ArgumentError(f"{name} is {value} {unit}, expected a finite number > 0; correct it.")
+
+
+def whole(total: float, part: float, total_name: str, part_name: str) -> int:
+    """How many parts make the total [both s], a whole number ≥ 1 to nine digits."""
+    positive(total_name, total, "s")
+    positive(part_name, part, "s")
+    ratio = total / part
+    if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-9):
+        raise ArgumentError(
+            f"{total_name} {total:g} s is {ratio:.6g} times the {part_name} {part:g} s, expected a whole number; "
+            f"take for instance {max(1, round(ratio)) * part:.9g} s for the {total_name}."
+        )
+    return round(ratio)

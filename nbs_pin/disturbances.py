@@ -1,0 +1,100 @@
+"""Disturbance torques τ_d(t, q, v) [N·m] for `simulate`; any callable of that signature will do.
+
+Each record gives its torque to every start of a batch, except `TorqueNoise`, which draws one per start.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from nbs_pin.checks import per_joint, positive
+from nbs_pin.exceptions import ArgumentError
+
+Disturbance: TypeAlias = Callable[[float, np.ndarray, np.ndarray], Any]
+"""τ_d(t, q, v) [N·m], shape (..., n)."""
+PerJoint: TypeAlias = ArrayLike
+"""One number for all joints, or one per joint."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantTorque:
+    """τ_d = torque [N·m]."""
+
+    torque: PerJoint
+
+    def __post_init__(self) -> None:
+        per_joint(self, "torque")
+
+    def __call__(
+        self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
+    ) -> Float[np.ndarray, "*batch n"]:
+        """Torque at time t [s] in the state (q, v) [N·m]."""
+        return np.zeros(q.shape) + np.asarray(self.torque)
+
+
+@dataclass(frozen=True, eq=False)
+class SinusoidalTorque:
+    """τ_d = amplitude·sin(frequency·t + phase): amplitude [N·m], frequency [rad/s], phase [rad]."""
+
+    amplitude: PerJoint
+    frequency: PerJoint
+    phase: PerJoint = 0.0
+
+    def __post_init__(self) -> None:
+        per_joint(self, "amplitude", "frequency", "phase")
+
+    def __call__(
+        self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
+    ) -> Float[np.ndarray, "*batch n"]:
+        """Torque at time t [s] in the state (q, v) [N·m]."""
+        amplitude, frequency, phase = map(np.asarray, (self.amplitude, self.frequency, self.phase))
+        return np.zeros(q.shape) + amplitude * np.sin(frequency * t + phase)
+
+
+@dataclass(frozen=True, eq=False)
+class SquareWave:
+    """Bang-bang: ±amplitude [N·m] with the sign of sin(frequency·t + phase), frequency [rad/s], + at zero."""
+
+    amplitude: PerJoint
+    frequency: PerJoint
+    phase: PerJoint = 0.0
+
+    def __post_init__(self) -> None:
+        per_joint(self, "amplitude", "frequency", "phase")
+
+    def __call__(
+        self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
+    ) -> Float[np.ndarray, "*batch n"]:
+        """Torque at time t [s] in the state (q, v) [N·m]."""
+        amplitude, frequency, phase = map(np.asarray, (self.amplitude, self.frequency, self.phase))
+        return np.zeros(q.shape) + amplitude * np.where(np.sin(frequency * t + phase) >= 0.0, 1.0, -1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueNoise:
+    """White noise of standard deviation std [N·m], constant over each `period` [s].
+
+    A pure function of time: the same seed gives the same torque at the same t, in whatever order it is asked.
+    """
+
+    std: PerJoint
+    period: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        per_joint(self, "std")
+        positive("period", self.period, "s")
+        if self.seed < 0:
+            raise ArgumentError(f"seed is {self.seed}, expected an integer ≥ 0; give another seed.")
+
+    def __call__(
+        self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
+    ) -> Float[np.ndarray, "*batch n"]:
+        """Torque at time t [s] in the state (q, v) [N·m]."""
+        interval = math.floor(t / self.period + 1e-9)  # t = k·period may round to just below its interval
+        return np.asarray(self.std) * np.random.default_rng((self.seed, interval)).standard_normal(q.shape)
