@@ -180,12 +180,12 @@ def _check_text(data: bytes, label: str) -> None:
     """Raise RobotError unless the bytes are UTF-8 text of a bounded size."""
     if len(data) > MAX_BYTES:
         raise RobotError(f"{label}: too large: {len(data)} bytes (limit {MAX_BYTES}); keep meshes in their own files.")
-    if b"\0" in data:
-        raise RobotError(f"{label}: not UTF-8 text: NUL at byte {data.index(0)}; save the file as UTF-8.")
     try:
         data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise RobotError(f"{label}: not UTF-8 at byte {error.start}; save the file as UTF-8.") from error
+    if b"\0" in data:
+        raise RobotError(f"{label}: not UTF-8 text: NUL at byte {data.index(0)}; save the file as UTF-8.")
 
 
 def _read_bytes(path: Path) -> bytes:

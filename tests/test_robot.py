@@ -1,0 +1,184 @@
+"""Every arm by name is a sound model with n = nq = nv, and errors of configuration wrap where joints turn freely."""
+
+import pickle
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+
+from nbs_pin.catalogue import ROBOT_NAMES, find
+from nbs_pin.exceptions import ArgumentError, RobotError, RobotNotFound
+from nbs_pin.robot import configuration_difference, load_robot
+
+
+@pytest.fixture(params=ROBOT_NAMES)
+def robot(request):
+    return load_robot(request.param)
+
+
+def random_configurations(robot, count=10, seed=0):
+    low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
+    high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
+    return np.random.default_rng(seed).uniform(low, high, (count, robot.nv))
+
+
+def test_one_number_per_joint(robot):
+    model = robot.model
+    assert model.nq == model.nv == robot.nv == len(robot.joint_names) == len(robot.joints)
+    assert tuple(joint.name for joint in robot.joints) == robot.joint_names == tuple(model.names)[1:]
+    for limit in (robot.effort_limit, robot.velocity_limit):
+        assert (limit > 0).all()
+    assert (robot.lower < robot.upper).all()
+    assert np.isfinite(robot.lower).all() == (not robot.continuous.any() and robot.name != "double_pendulum")
+    assert (robot.damping >= 0).all()
+    assert (robot.friction >= 0).all()
+
+
+def test_pinocchio_carries_our_limits(robot):
+    model = robot.model
+    np.testing.assert_array_equal(model.lowerPositionLimit, robot.lower)
+    np.testing.assert_array_equal(model.upperPositionLimit, robot.upper)
+    np.testing.assert_array_equal(model.upperEffortLimit, robot.effort_limit)
+    np.testing.assert_array_equal(model.lowerEffortLimit, -robot.effort_limit)
+    np.testing.assert_array_equal(model.upperVelocityLimit, robot.velocity_limit)
+    np.testing.assert_array_equal(model.lowerVelocityLimit, -robot.velocity_limit)
+
+
+def test_the_dynamics_are_those_of_the_file(robot):
+    """Rewriting the URDF changes no number: M, bias and gravity as Pinocchio reads the untouched file.
+
+    Locked joints are removed by Pinocchio's own reduction; a continuous joint is (cos q, sin q) there.
+    """
+    model = pin.buildModelFromUrdf(str(robot.urdf.path))
+    locked = [model.getJointId(name) for name in find(robot.source).lock]
+    if locked:
+        model = pin.buildReducedModel(model, locked, pin.neutral(model))
+    model.gravity.linear = robot.gravity_vector
+    data, own = model.createData(), robot.model.createData()
+    for q in random_configurations(robot):
+        v = np.cos(q)
+        nqs = [joint.nq for joint in list(model.joints)[1:]]
+        raw = np.concatenate([[x] if nq == 1 else [np.cos(x), np.sin(x)] for x, nq in zip(q, nqs, strict=True)])
+        mass = pin.crba(robot.model, own, q)
+        np.testing.assert_allclose(mass, pin.crba(model, data, raw), atol=1e-13)
+        np.testing.assert_allclose(pin.nle(robot.model, own, q, v), pin.nle(model, data, raw, v), atol=1e-11)
+        assert np.linalg.eigvalsh(mass)[0] > 0
+
+
+def test_a_robot_pickles(robot):
+    copy = pickle.loads(pickle.dumps(robot))
+    q = random_configurations(robot, 1)[0]
+    np.testing.assert_array_equal(
+        pin.crba(copy.model, copy.model.createData(), q), pin.crba(robot.model, robot.model.createData(), q)
+    )
+    assert copy.sha256 == robot.sha256
+    assert copy.joints == robot.joints
+    assert copy.model == robot.model
+
+
+def test_known_arms():
+    panda = load_robot("panda")
+    assert panda.joint_names == tuple(f"panda_joint{i}" for i in range(1, 8))
+    np.testing.assert_array_equal(panda.effort_limit, [87, 87, 87, 87, 12, 12, 12])
+    assert load_robot("kinova").continuous.tolist() == [True, False, False, True, False, True]
+    pendulum = load_robot("double_pendulum")
+    assert np.isinf(pendulum.effort_limit).all()
+    assert np.isinf(pendulum.upper).all()
+    np.testing.assert_array_equal(pendulum.damping, [0.05, 0.05])
+    assert repr(panda) == "Robot('panda', 7 joints)"
+
+
+def test_the_papers_arm_has_the_papers_mass_matrix():
+    robot = load_robot("two_link")
+    q = np.array([0.4, -1.1])
+    c = np.cos(q[1])
+    mass = pin.crba(robot.model, robot.model.createData(), q)
+    np.testing.assert_allclose(mass, [[3 + 2 * c, 1 + c], [1 + c, 1]], atol=1e-11)
+    np.testing.assert_array_equal(robot.gravity_vector, [0, 0, -9.8])
+
+
+def test_locking():
+    panda = load_robot("panda", lock=["panda_finger_joint1", "panda_finger_joint2", "panda_joint7"])
+    assert panda.nv == 6
+    assert load_robot("ur5", lock="wrist_3_joint").nv == 5
+    with pytest.raises(RobotError, match=r"mimic joints.*lock=\['panda_finger_joint2'\]"):
+        load_robot("panda", lock=[])
+    with pytest.raises(RobotError, match=r"ur5_robot\.urdf.*no joint 'wrist_4_joint' to lock.*wrist_3_joint"):
+        load_robot("ur5", lock=["wrist_4_joint"])
+
+
+def test_gravity_is_a_number_or_a_vector():
+    np.testing.assert_array_equal(load_robot("ur5", gravity=1.62).gravity_vector, [0, 0, -1.62])
+    tilted = load_robot("ur5", gravity=[0.0, 1.0, -9.0])
+    np.testing.assert_array_equal(tilted.model.gravity.linear, [0, 1, -9])
+    np.testing.assert_array_equal(load_robot("ur5", gravity=0.0).gravity_vector, np.zeros(3))
+
+
+@pytest.mark.parametrize("gravity", [np.nan, np.inf, [0.0, 0.0], [0.0, 0.0, np.nan], [1.0, 2.0, 3.0, 4.0]])
+def test_gravity_that_is_none_is_refused(gravity):
+    with pytest.raises(ArgumentError, match=r"gravity is .* expected one finite number"):
+        load_robot("two_link", gravity=gravity)
+
+
+def test_the_fingerprint_follows_the_dynamics_alone(tmp_path):
+    robot = load_robot("three_link")
+    text = robot.urdf.path.read_text()
+    redrawn, heavier = tmp_path / "redrawn.urdf", tmp_path / "heavier.urdf"
+    redrawn.write_text(text.replace("0.35 0.45 0.60 1", "1 0 0 1").replace('xyz="0.5 0 0"', 'xyz="5e-1  0 0"'))
+    heavier.write_text(text.replace('<mass value="1"/>', '<mass value="1.001"/>', 1))
+    assert load_robot("three_link").sha256 == load_robot(redrawn).sha256 == robot.sha256
+    others = [load_robot(heavier), load_robot("three_link", gravity=9.8), load_robot("three_link", lock=["joint3"])]
+    assert len({robot.sha256, *(other.sha256 for other in others)}) == 4
+
+
+def test_what_is_not_found_says_what_exists(tmp_path):
+    with pytest.raises(RobotNotFound, match="no robot 'pandas': did you mean panda") as caught:
+        load_robot("pandas")
+    assert all(name in str(caught.value) for name in ROBOT_NAMES)
+    assert isinstance(caught.value, FileNotFoundError)
+    with pytest.raises(RobotNotFound, match=r"no file '.*gone\.urdf'"):
+        load_robot(tmp_path / "gone.urdf")
+    with pytest.raises(RobotNotFound, match=r"is a directory; give one file in it \(no \.urdf lies here\)"):
+        load_robot(tmp_path)
+    (tmp_path / "arm.urdf").write_text("<robot/>")
+    with pytest.raises(RobotNotFound, match=r"give one file in it \(arm\.urdf\)"):
+        load_robot(tmp_path)
+    with pytest.raises(RobotError, match=r"cannot read 'xxx.*File name too long"):
+        load_robot("x" * 5000)
+    with pytest.raises(RobotNotFound, match="is a directory"):
+        load_robot("")
+
+
+CONTINUOUS = np.array([True, False])
+
+
+def test_the_difference_wraps_on_continuous_joints_alone():
+    rng = np.random.default_rng(0)
+    q, q_ref = rng.uniform(-50, 50, (2, 200, 2))
+    z1 = configuration_difference(q, q_ref, CONTINUOUS)
+    plain = q - q_ref
+    np.testing.assert_allclose(z1[:, 0], np.arctan2(np.sin(plain[:, 0]), np.cos(plain[:, 0])), atol=1e-12)
+    np.testing.assert_array_equal(z1[:, 1], plain[:, 1])
+    np.testing.assert_array_equal(configuration_difference(q, q_ref, None), plain)
+    same = configuration_difference(torch.from_numpy(q), torch.from_numpy(q_ref), CONTINUOUS)
+    np.testing.assert_allclose(same.numpy(), z1, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+@pytest.mark.parametrize(
+    ("z", "wrapped"), [(np.pi, np.pi), (-np.pi, np.pi), (0.0, 0.0), (2 * np.pi, 0.0), (-3.0, -3.0)]
+)
+def test_the_interval_is_open_below_and_closed_above(kind, z, wrapped):
+    zero = kind([0.0, 0.0], dtype=kind([1.0]).dtype)
+    z1 = configuration_difference(
+        kind([z, z], dtype=torch.float64 if kind is torch.tensor else float), zero, CONTINUOUS
+    )
+    np.testing.assert_allclose(np.asarray(z1), [wrapped, z], atol=1e-6 if z1.dtype == torch.float32 else 0)
+
+
+def test_the_difference_has_unit_gradient():
+    q = torch.tensor([[4.0, 4.0], [-9.0, 0.1]], dtype=torch.float64, requires_grad=True)
+    z1 = configuration_difference(q, torch.zeros_like(q), CONTINUOUS)
+    assert z1[0, 0] < 0
+    torch.testing.assert_close(torch.autograd.grad(z1.sum(), q)[0], torch.ones_like(q), rtol=0, atol=0)

@@ -1,0 +1,458 @@
+"""Whatever the validator accepts is a sound arm; whatever it refuses names file, line, element, value and remedy."""
+
+import re
+import sys
+import warnings
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from nbs_pin.catalogue import ROBOT_NAMES, find
+from nbs_pin.exceptions import MissingExtra, RobotError, RobotNotFound
+from nbs_pin.robot import load_robot
+from nbs_pin.urdf import mesh_file, read_urdf
+from nbs_pin.urdf_source import MAX_BYTES
+
+ARM = """<?xml version="1.0"?>
+<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <link name="base"/>
+  <link name="l1"><inertial><origin xyz="0.5 0 0"/><mass value="1.5"/>
+    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.2"/></inertial></link>
+  <link name="l2"><inertial><mass value="2.5"/>
+    <inertia ixx="0.3" ixy="0" ixz="0" iyy="0.3" iyz="0" izz="0.3"/></inertial></link>
+  <link name="tool"/>
+  <joint name="j1" type="revolute"><parent link="base"/><child link="l1"/><origin xyz="0 0 0.1" rpy="0 0 0"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="2" effort="10" velocity="3"/></joint>
+  <joint name="j2" type="prismatic"><parent link="l1"/><child link="l2"/><origin xyz="1 0 0"/>
+    <axis xyz="1 0 0"/><limit lower="-0.5" upper="0.5" effort="20" velocity="4"/></joint>
+  <joint name="flange" type="fixed"><parent link="l2"/><child link="tool"/></joint>
+</robot>
+"""
+LIMIT1 = '<limit lower="-1" upper="2" effort="10" velocity="3"/>'
+INERTIA2 = 'ixx="0.3" ixy="0" ixz="0" iyy="0.3" iyz="0" izz="0.3"'
+BODY2 = re.search(r'<link name="l2">.*?</link>', ARM, re.S).group()
+
+
+def write(folder, text, name="arm.urdf"):
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def mutated(old, new):
+    assert ARM.count(old) >= 1
+    return ARM.replace(old, new, 1)
+
+
+def refusal(path, **options):
+    with pytest.raises(RobotError) as caught:
+        read_urdf(path, **options)
+    message = str(caught.value)
+    assert path.name in message
+    assert ";" in message, "a remedy follows the problem"
+    return message
+
+
+# what is replaced, by what, the line the message names, and words it must contain (U4 to U20, U24)
+REFUSED = {
+    "U4 nan": ('"1.5"', '"nan"', 4, ["link 'l1'", "mass", "'nan'", "fix <mass value=…>"]),
+    "U4 inf": ('"1.5"', '"inf"', 4, ["link 'l1'", "'inf'"]),
+    "U4 negative": ('"1.5"', '"-1"', 4, ["link 'l1'", "'-1.0'", ">= 0"]),
+    "U4 text": ('"1.5"', '"heavy"', 4, ["'heavy'"]),
+    "U4 comma": ('"1.5"', '"1,5"', 4, ["'1,5'"]),
+    "U4 unit": ('"1.5"', '"1kg"', 4, ["'1kg'"]),
+    "U4 python": ('"1.5"', '"1_0"', 4, ["'1_0'"]),
+    "U4 other digits": ('"1.5"', '"٣"', 4, ["'٣'"]),
+    "U4 overflow": ('"1.5"', '"1e999"', 4, ["'1e999'"]),
+    "U4 empty": ('"1.5"', '""', 4, ["''"]),
+    "U4 no value": ('<mass value="1.5"/>', "<mass/>", 4, ["<mass> states no value"]),
+    "U4 no mass": ('<mass value="1.5"/>', "", 4, ["<inertial> has no <mass>"]),
+    "U4 no inertia": (f"<inertia {INERTIA2}/>", "", 6, ["link 'l2'", "<inertial> has no <inertia>"]),
+    "U4 two masses": ('<mass value="1.5"/>', '<mass value="1"/><mass value="2"/>', 4, ["<mass> is stated twice"]),
+    "U4 inertia text": ('ixx="0.1"', 'ixx="0.1m"', 5, ["inertia ixx '0.1m'"]),
+    "U4 inertia missing": ('ixy="0" ', "", 5, ["<inertia> states no ixy"]),
+    "U5 no inertial": (BODY2, '<link name="l2"/>', 10, ["joint 'j2'", "link 'l2'", "no mass"]),
+    "U5 mass 0": (
+        BODY2,
+        '<link name="l2"><inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'
+        "</inertial></link>",
+        10,
+        ["joint 'j2'", "no mass"],
+    ),
+    "U5 mass 0, inertia": ('"2.5"', '"0"', 6, ["link 'l2'", "mass value '0'"]),
+    "U6 negative": (INERTIA2, INERTIA2.replace('ixx="0.3"', 'ixx="-0.3"'), 7, ["not positive definite", "-0.3"]),
+    "U6 indefinite": (INERTIA2, INERTIA2.replace('ixy="0"', 'ixy="0.4"'), 7, ["not positive definite", "-0.1"]),
+    "U7": (INERTIA2, INERTIA2.replace('ixx="0.3"', 'ixx="0.7"'), 7, ["a + b < c", "0.3, 0.3, 0.7"]),
+    "U8 zero": ('"0 0 1"', '"0 0 0"', 10, ["joint 'j1'", "axis", "zero length"]),
+    "U8 nan": ('"0 0 1"', '"0 0 nan"', 10, ["axis xyz '0 0 nan' is not 3 finite numbers"]),
+    "U8 two": ('"0 0 1"', '"0 1"', 10, ["axis xyz '0 1' is not 3 finite numbers"]),
+    "U8 no xyz": ('xyz="0 0 1"', "", 10, ["<axis> states no xyz"]),
+    "U8 origin": ('rpy="0 0 0"', 'rpy="0 0 inf"', 9, ["joint 'j1'", "origin rpy '0 0 inf'"]),
+    "U8 inertial origin": ('"0.5 0 0"', '"0.5 0"', 4, ["link 'l1'", "origin xyz '0.5 0'"]),
+    "U10 swapped": ('lower="-1"', 'lower="3"', 10, ["joint 'j1'", "limit lower 3 > upper 2"]),
+    "U10 empty range": ('lower="-1"', 'lower="2"', 10, ["limit lower 2 = upper 2"]),
+    "U10 nan": ('lower="-1"', 'lower="nan"', 10, ["limit lower 'nan'"]),
+    "U10 none": (LIMIT1, "", 9, ["joint 'j1'", "revolute joint without <limit>"]),
+    "U10 no lower": ('lower="-1" ', "", 10, ["<limit> states no lower"]),
+    "U10 no effort": ('effort="10" ', "", 10, ["<limit> states no effort"]),
+    "U10 no velocity": (' velocity="3"', "", 10, ["<limit> states no velocity"]),
+    "U10 twice": (LIMIT1, LIMIT1 + LIMIT1, 10, ["<limit> is stated twice"]),
+    "U11 zero": ('effort="10"', 'effort="0"', 10, ["limit effort '0' is not > 0"]),
+    "U11 negative": ('effort="10"', 'effort="-10"', 10, ["limit effort '-10' is not > 0"]),
+    "U11 velocity": ('velocity="3"', 'velocity="0"', 10, ["limit velocity '0' is not > 0"]),
+    "damping": (LIMIT1, LIMIT1 + '<dynamics damping="-1"/>', 10, ["dynamics damping '-1.0'", ">= 0"]),
+    "U12 joint": ('name="j2"', 'name="j1"', 11, ["the name 'j1' is used twice (lines 9 and 11)"]),
+    "U12 link": ('name="tool"', 'name="l1"', 8, ["the name 'l1' is used twice (lines 4 and 8)"]),
+    "U13 parent": ('parent link="l1"', 'parent link="nope"', 11, ["joint 'j2'", "parent link 'nope' is not defined"]),
+    "U13 child": ('child link="tool"', 'child link="nope"', 13, ["child link 'nope' is not defined"]),
+    "U13 no parent": ('<parent link="base"/>', "", 9, ["<joint> has no <parent>"]),
+    "U14 orphan": (
+        '<link name="tool"/>',
+        '<link name="tool"/><link name="lost"/>',
+        8,
+        ["not a tree", "'base', 'lost'"],
+    ),
+    "U14 cycle": ('parent link="base"', 'parent link="tool"', 9, ["not a tree", "'j1', 'j2', 'flange'", "cycle"]),
+    "U14 self": ('parent link="l2"', 'parent link="tool"', 13, ["not a tree", "'flange'", "cycle"]),
+    "U14 two parents": ('child link="tool"', 'child link="l1"', 13, ["not a tree", "also the child of joint 'j1'"]),
+    "U15 floating": ('"prismatic"', '"floating"', 11, ["type 'floating' is not supported", "lock=['j2']"]),
+    "U15 planar": ('"prismatic"', '"planar"', 11, ["type 'planar'"]),
+    "U15 unknown": ('"prismatic"', '"hinge"', 11, ["type 'hinge'"]),
+    "U15 none": (' type="prismatic"', "", 11, ["<joint> states no type"]),
+    "U17": (LIMIT1, LIMIT1 + '<mimic joint="j2"/>', 10, ["mimic", "lock=['j1']"]),
+    "U18 xacro": (
+        '<link name="tool"/>',
+        '<xacro:macro name="m"/>',
+        8,
+        ["<xacro:macro> is not expanded", "xacro first"],
+    ),
+    "U18 property": ('"1.5"', '"${m}"', 4, ["'${m}'", "xacro"]),
+    "U18 undeclared": ('<link name="tool"/>', "<nope:macro/>", 8, ["not well-formed XML"]),
+    "U20 XInclude": (
+        '<link name="tool"/>',
+        '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>',
+        8,
+        ["<xinclude:include>"],
+    ),
+    "U24 long": ('name="tool"', f'name="{"x" * 129}"', 8, ["longer than 128", "rename the link"]),
+    "U24 bidi": ('name="tool"', 'name="a\u202eb"', 8, ["unprintable", "a\N{REPLACEMENT CHARACTER}b"]),
+    "U24 empty": ('name="tool"', 'name=""', 8, ["empty"]),
+    "U24 robot": ('name="arm"', f'name="{"x" * 10**6}"', 2, ["longer than 128", "rename the robot"]),
+    "reserved": ('name="j1"', 'name="universe"', 9, ["reserved"]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusal_names_file_line_element_value_and_remedy(case, tmp_path):
+    old, new, line, words = REFUSED[case]
+    message = refusal(write(tmp_path, mutated(old, new)))
+    assert f"arm.urdf:{line}: " in message
+    assert [word for word in words if word not in message] == []
+    assert len(message) < 600
+
+
+def test_the_unmutated_arm_is_accepted_as_stated(tmp_path):
+    urdf = read_urdf(write(tmp_path, ARM))
+    j1, j2 = urdf.joints
+    assert (j1.name, j1.prismatic, j1.continuous) == ("j1", False, False)
+    assert (j1.lower, j1.upper, j1.effort, j1.velocity, j1.damping, j1.friction) == (-1, 2, 10, 3, 0, 0)
+    assert (j2.name, j2.prismatic, j2.effort) == ("j2", True, 20)
+
+
+def test_u1_what_is_no_file(tmp_path, monkeypatch):
+    with pytest.raises(RobotNotFound, match="no such file"):
+        read_urdf(tmp_path / "arm.urdf")
+    with pytest.raises(RobotNotFound, match="it is a directory"):
+        read_urdf(tmp_path)
+    path = write(tmp_path, ARM)
+
+    def closed(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", closed)
+    assert "Permission denied" in refusal(path)
+
+
+@pytest.mark.parametrize("text", ["", "{}", "\x01\x02", ARM[:400], "robot", "<robot><link></robot>"])
+def test_u2_what_is_no_xml(text, tmp_path):
+    assert re.search(r"arm\.urdf:\d+: not well-formed XML: .*line \d+, column \d+", refusal(write(tmp_path, text)))
+
+
+@pytest.mark.parametrize("root", ["sdf", "mujoco"])
+def test_u3_another_format(root, tmp_path):
+    message = refusal(write(tmp_path, f"<{root}/>"))
+    assert f"root element is <{root}>" in message
+    assert "<robot> is needed" in message
+
+
+def test_u9_a_long_axis_is_normalised_with_a_warning(tmp_path):
+    with pytest.warns(UserWarning, match=r"arm\.urdf:10: joint 'j1': axis xyz '0.0 3.0 4.0' is no unit vector"):
+        urdf = read_urdf(write(tmp_path, mutated('"0 0 1"', '"0 3 4"')))
+    assert b'xyz="0.0 0.6 0.8"' in urdf.without_geometry()
+    read_urdf(write(tmp_path, mutated('"0 0 1"', '"0 0 0.99999999"')))  # rounding is silent
+
+
+def test_u11_zero_limits_read_as_unlimited(tmp_path):
+    text = mutated(LIMIT1, '<limit lower="0" upper="0" effort="0" velocity="0"/>')
+    joint = read_urdf(write(tmp_path, text), zero_limits="unlimited").joints[0]
+    assert (joint.lower, joint.upper, joint.effort, joint.velocity) == (-np.inf, np.inf, np.inf, np.inf)
+    negative = write(tmp_path, mutated('effort="10"', 'effort="-1"'))
+    assert "limit effort '-1'" in refusal(negative, zero_limits="unlimited")
+
+
+@pytest.mark.parametrize("limit", ["", '<limit effort="7" velocity="5"/>', LIMIT1])
+def test_u16_a_continuous_joint_is_an_unbounded_revolute_one(limit, tmp_path):
+    robot = load_robot(write(tmp_path, mutated(LIMIT1, limit).replace("revolute", "continuous")))
+    assert robot.continuous.tolist() == [True, False]
+    assert robot.model.nq == robot.model.nv == 2
+    assert (robot.lower[0], robot.upper[0]) == (-np.inf, np.inf)
+    assert robot.effort_limit[0] == {"": np.inf, LIMIT1: 10}.get(limit, 7)
+    z1 = robot.difference(np.array([3.0, 0.4]), np.array([-3.0, 0.1]))
+    np.testing.assert_allclose(z1, [6.0 - 2 * np.pi, 0.3], atol=1e-15)
+
+
+def test_u15_u17_locked_joints_are_fixed_whatever_they_were(tmp_path):
+    text = mutated('"prismatic"', '"floating"').replace('<axis xyz="1 0 0"/>', '<axis xyz="0 0 0"/><mimic joint="j1"/>')
+    path = write(tmp_path, text)
+    urdf = read_urdf(path, lock=("j2",))
+    assert [joint.name for joint in urdf.joints] == ["j1"]
+    assert b"mimic" not in urdf.xml
+    message = refusal(path, lock=("j3",))
+    assert "no joint 'j3' to lock" in message
+    assert "j1, j2, flange" in message
+
+
+def test_u18_nothing_moves(tmp_path):
+    assert "0 movable joints" in refusal(write(tmp_path, '<robot name="r"><link name="a"/></robot>'))
+    assert "0 movable joints" in refusal(write(tmp_path, ARM), lock=("j1", "j2"))
+
+
+def chain(count, kind):
+    links = "".join(
+        f'<link name="l{i}"/><joint name="j{i}" type="{kind}"><parent link="l{i + 1}"/><child link="l{i}"/></joint>'
+        for i in range(count)
+    )
+    return f'<robot name="chain">{links}<link name="l{count}"/></robot>'
+
+
+def test_u19_too_large(tmp_path):
+    assert "65 moving joints (limit 64)" in refusal(write(tmp_path, chain(65, "continuous")))
+    fixed = chain(1000, "fixed").replace('"fixed"', '"continuous"', 1)
+    assert "1001 links (limit 1000)" in refusal(write(tmp_path, fixed))
+    assert "too large" in refusal(write(tmp_path, b" " * (MAX_BYTES + 1)))
+    assert "too deep" in refusal(write(tmp_path, "<robot>" + "<a>" * 100_000))
+
+
+@pytest.mark.parametrize(
+    "doctype",
+    [
+        "<!DOCTYPE robot>",
+        '<!DOCTYPE robot SYSTEM "http://example.com/robot.dtd">',
+        '<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]>',
+        '<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;">]>',
+    ],
+)
+def test_u20_no_dtd_no_entities(doctype, tmp_path):
+    message = refusal(write(tmp_path, mutated('<robot name="arm"', f'{doctype}\n<robot name="arm"')))
+    assert "arm.urdf:2: DTD and entities are not allowed" in message
+
+
+def test_u21_only_utf8(tmp_path):
+    assert "not UTF-8 at byte 0" in refusal(write(tmp_path, ARM.encode("utf-16")))
+    assert "NUL at byte 1" in refusal(write(tmp_path, ARM.encode("utf-16-le")))
+    assert "NUL at byte 30" in refusal(write(tmp_path, ARM.encode()[:30] + b"\0" + ARM.encode()[30:]))
+    assert "not UTF-8 at byte 5" in refusal(write(tmp_path, b"<?xml\xff"))
+    relabelled = ARM.replace('version="1.0"', 'version="1.0" encoding="latin-1"').replace("tool", "Ärm")
+    assert "Ärm" in read_urdf(write(tmp_path, relabelled)).xml.decode().replace("&#196;", "Ä")
+
+
+def test_u22_meshes_stay_inside_their_roots(tmp_path):
+    (tmp_path / "pkg").mkdir()
+    (tmp_path / "outside.stl").touch()
+    mesh = write(tmp_path / "pkg", b"", "a.STL")
+    assert mesh_file("package://pkg/a.STL", (tmp_path / "none", tmp_path)) == mesh.resolve()
+    assert mesh_file("a.STL", (tmp_path / "pkg",)) == mesh.resolve()
+    (tmp_path / "pkg" / "link.stl").symlink_to(tmp_path / "outside.stl")
+    for uri in ["../outside.stl", "package://../outside.stl", "link.stl"]:
+        with pytest.raises(RobotError, match="leaves the model directory"):
+            mesh_file(uri, (tmp_path / "pkg",))
+    for uri in [f"{tmp_path}/outside.stl", "file:///etc/a.stl", "http://x/a.stl", "package://file:///etc/a.stl"]:
+        with pytest.raises(RobotError, match="no path inside"):
+            mesh_file(uri, (tmp_path,))
+    for uri, words in {"a.exe": "unknown kind", "gone.stl": "does not exist"}.items():
+        with pytest.raises(RobotError, match=words):
+            mesh_file(uri, (tmp_path,))
+
+
+def test_what_engines_read_is_what_was_checked(tmp_path):
+    """Pinocchio silently drops the body of a mass ' 1.5 '; the checked bytes state 1.5."""
+    text = mutated('"1.5"', '" +1.5 "').replace('"0.5 0 0"', '" 5e-1   0\t0 "')
+    inertia = load_robot(write(tmp_path, text)).model.inertias[1]
+    assert inertia.mass == 1.5
+    np.testing.assert_array_equal(inertia.lever, [0.5, 0, 0])
+
+
+def test_links_without_inertia_are_part_of_the_body_they_are_fixed_to(tmp_path):
+    """A massless flange that a joint moves is fine when a massive tool is fixed to it."""
+    body = BODY2.replace('name="l2"', 'name="tool"')
+    text = ARM.replace(BODY2, '<link name="l2"/>').replace('<link name="tool"/>', body)
+    assert load_robot(write(tmp_path, text)).model.inertias[2].mass == 2.5
+
+
+def test_point_masses_and_rods_are_bodies_as_long_as_the_arm_has_inertia(tmp_path):
+    zero = re.sub(r'\b(i[xyz]{2})="[\d.]+"', r'\1="0"', ARM)
+    load_robot(write(tmp_path, zero))  # two point masses off the first axis
+    rod = re.sub(r'ixx="0.3"', 'ixx="0"', ARM)
+    load_robot(write(tmp_path, rod))
+    on_axis = zero.replace('"0.5 0 0"', '"0 0 0.5"').replace('<origin xyz="1 0 0"/>', "").replace('"1 0 0"', '"0 0 1"')
+    with pytest.raises(RobotError, match=r"arm\.urdf: joint 'j1': M\(q\) is not finite and positive definite"):
+        load_robot(write(tmp_path, on_axis))
+
+
+def test_two_joints_on_one_axis_leave_a_singular_arm(tmp_path):
+    massless = 'ixx="1e-30" ixy="0" ixz="0" iyy="1e-30" iyz="0" izz="1e-30"'
+    text = ARM.replace('"1 0 0"', '"0 0 1"').replace("prismatic", "revolute").replace('"0.5 0 0"', '"0 0 0"')
+    text = re.sub(r'ixx="0.1".*?izz="0.2"', massless, text)
+    with pytest.raises(RobotError, match=r"joint 'j\d': M\(q\)"):
+        load_robot(write(tmp_path, text))
+
+
+def test_without_geometry_is_the_dynamics_alone(tmp_path):
+    drawn = mutated('<link name="tool"/>', '<link name="tool"><visual><nonsense/></visual><collision/></link>')
+    drawn = drawn.replace("<link", '<material name="m"/>\n<!-- a comment --><link', 1)
+    urdf, plain = read_urdf(write(tmp_path, drawn)), read_urdf(write(tmp_path, ARM))
+    assert b"nonsense" in urdf.xml
+    assert urdf.without_geometry() == plain.without_geometry()
+    load_robot(write(tmp_path, drawn))  # a broken drawing does not stop the dynamics
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_mujoco_reads_the_same_arm_from_the_same_bytes(name):
+    robot = load_robot(name)
+    model = mujoco.MjModel.from_xml_string(robot.urdf.without_geometry().decode())
+    assert model.nv == model.nq == robot.nv
+    masses = [model.body_mass[model.jnt_bodyid[model.joint(joint).id]] for joint in robot.joint_names]
+    np.testing.assert_allclose(masses, [inertia.mass for inertia in robot.model.inertias[1:]], rtol=1e-12)
+
+
+XACRO = """<?xml version="1.0"?>
+<robot name="xarm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:include filename="link.xacro"/>
+  <link name="base"/>
+  <xacro:body mass="${1 + 1}"/>
+  <joint name="j" type="continuous"><parent link="base"/><child link="body"/></joint>
+</robot>
+"""
+INCLUDED = """<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:macro name="body" params="mass">
+  <link name="body"><inertial><mass value="${mass}"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+</xacro:macro></robot>
+"""
+
+
+def test_xacro_is_expanded_and_checked(tmp_path):
+    write(tmp_path, INCLUDED, "link.xacro")
+    robot = load_robot(write(tmp_path, XACRO, "arm & hand.urdf.xacro"))
+    assert robot.name == "xarm"
+    assert robot.model.inertias[1].mass == 2.0
+    bad = write(tmp_path, XACRO.replace("${1 + 1}", "${-1}"), "bad.xacro")
+    message = refusal(bad)
+    assert "(expanded)" in message
+    assert "link 'body': mass value '-1.0'" in message
+    assert "xacro cannot expand it" in refusal(write(tmp_path, XACRO.replace("${1 + 1}", "${nope}"), "bad.xacro"))
+    assert "DTD" in refusal(write(tmp_path, XACRO.replace("<robot", "<!DOCTYPE robot><robot"), "dtd.xacro"))
+
+
+def test_xacro_without_its_extra_names_the_command(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xacrodoc", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'nbs-pin\[xacro\]'"):
+        read_urdf(write(tmp_path, XACRO, "arm.xacro"))
+
+
+NASTY = [
+    "nan",
+    "inf",
+    "-1",
+    "0",
+    "-0.0",
+    "1e-320",
+    "1e-12",
+    "1e-6",
+    "1e6",
+    "1e20",
+    "1e200",
+    "1e400",
+    "1_0",
+    "0x10",
+    "1,5",
+    "٣",
+    "2",
+    "3.5",
+    "-7",
+    "''",
+    "x",
+    "9e-1",
+]
+
+
+def sound(robot, rng):
+    """M(q) finite and positive definite at fresh configurations within the limits."""
+    low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
+    high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
+    data = robot.model.createData()
+    for q in rng.uniform(low, high, (8, robot.nv)):
+        mass = pin.crba(robot.model, data, q)
+        scale = np.sqrt(np.diag(mass))
+        if not np.isfinite(mass).all() or not np.linalg.eigvalsh(mass / scale / scale[:, None])[0] > 0:
+            return False
+    return True
+
+
+@pytest.mark.parametrize("name", ["two_link", "three_link", "ur5"])
+def test_whatever_mutated_numbers_are_accepted_give_a_sound_arm(name, tmp_path):
+    """Of such files Pinocchio alone accepts a fifth with a singular, indefinite or non-finite M."""
+    text = find(name).path.read_text()
+    numbers = list(re.finditer(r'(?<==")[-+\d.e ]+(?=")', text))
+    rng = np.random.default_rng(1)
+    accepted = 0
+    for trial in range(250):
+        spot = numbers[rng.integers(len(numbers))]
+        words = spot.group().split()
+        words[rng.integers(len(words))] = NASTY[rng.integers(len(NASTY))]
+        path = write(tmp_path, text[: spot.start()] + " ".join(words) + text[spot.end() :])
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                robot = load_robot(path)
+        except RobotError:
+            continue
+        accepted += 1
+        assert sound(robot, rng), (trial, spot.group(), words)
+    assert 25 < accepted < 225
+
+
+@settings(
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    where=st.integers(0, len(ARM.encode())),
+    cut=st.integers(0, 40),
+    insert=st.one_of(
+        st.binary(max_size=8), st.sampled_from([b"<", b">", b'"', b"<link/>", b"<joint/>", b"&x;", b"<!--"])
+    ),
+)
+def test_broken_bytes_are_refused_by_our_own_errors_alone(where, cut, insert, tmp_path):
+    data = ARM.encode()
+    path = write(tmp_path, data[:where] + insert + data[where + cut :])
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            robot = load_robot(path)
+    except RobotError:
+        return
+    assert sound(robot, np.random.default_rng(0))
