@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+from array_api_compat import device
 from jaxtyping import Bool, Float
 
 from nbs_pin.arrays import Array, array_namespace
@@ -111,7 +112,7 @@ def configuration_difference(
         return z1
     xp = array_namespace(z1)
     turns = xp.ceil((z1 - np.pi) / (2.0 * np.pi))
-    return z1 - 2.0 * np.pi * turns * xp.asarray(continuous.astype(float), dtype=z1.dtype)
+    return z1 - 2.0 * np.pi * turns * xp.asarray(continuous.astype(float), dtype=z1.dtype, device=device(z1))
 
 
 def load_robot(

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nbs_pin.exceptions import RobotError
 from nbs_pin.urdf_source import Node, shorten
 
 MAX_JOINTS = 64
@@ -27,6 +26,8 @@ MOVING = ("revolute", "continuous", "prismatic")
 _UNSUPPORTED = ("floating", "planar")
 _ROUNDING = 1e-6
 """Relative slack for numbers that were rounded when the file was written."""
+_POINT = 1e-9
+"""Radius of gyration below which a body is a point [m]."""
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -64,6 +65,10 @@ def check_tree(robot: Node, lock: tuple[str, ...]) -> list[Joint]:
     if unknown:
         raise robot.refuse(f"no joint '{unknown[0]}' to lock", f"the joints are {', '.join(nodes)}")
     joints = [_joint(node, name, name in lock) for name, node in nodes.items()]
+    mimics = [joint for joint in joints if joint.moves and joint.node.element.find("mimic") is not None]
+    if mimics:
+        remedy = f"lock them (lock={[joint.name for joint in mimics]}) or remove <mimic>"
+        raise mimics[0].node.need("mimic").refuse("mimic joints are not supported", remedy)
     _check_connected(links, joints)
     moving = sum(joint.moves for joint in joints)
     if moving == 0:
@@ -186,9 +191,6 @@ def _joint(node: Node, name: str, locked: bool) -> Joint:
         for child in list(node.element):
             if child.tag not in ("parent", "child", "origin"):
                 node.element.remove(child)
-    mimic = node.child("mimic")
-    if mimic is not None:
-        raise mimic.refuse("mimic joints are not supported", f"lock it (lock=['{name}']) or remove <mimic>")
     check_origin(node)
     return Joint(node, name, kind, node.need("parent").text("link"), node.need("child").text("link"))
 
@@ -235,22 +237,18 @@ def _mass(link: Node) -> float:
     node = inertial.need("inertia")
     xx, xy, xz, yy, yz, zz = (node.number(key) for key in _INERTIA)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    scale = float(np.abs(inertia).max())
-    if scale == 0.0:
-        return mass
-    if mass == 0.0:
+    if mass == 0.0 and inertia.any():
         raise inertial.need("mass").refuse("mass value '0' is not > 0 though inertia is stated", "fix <mass value=…>")
-    small, middle, large = np.linalg.eigvalsh(inertia / scale)
-    if small < -_ROUNDING * large:
-        raise _unphysical(node, scale * np.array([small, middle, large]), "inertia is not positive definite")
-    if small + middle < large * (1.0 - _ROUNDING):
-        raise _unphysical(node, scale * np.array([small, middle, large]), "not a physical body, moments a + b < c")
+    small, middle, large = moments = np.linalg.eigvalsh(inertia)
+    slack = _ROUNDING * large + _POINT**2 * mass
+    for wrong, problem in (
+        (small < -slack, "inertia is not positive definite"),
+        (small + middle < large - slack, "not a physical body, principal moments a + b < c"),
+    ):
+        if wrong:
+            stated = ", ".join(f"{moment:.4g}" for moment in moments)
+            raise node.refuse(f"{problem} ({stated} kg·m²)", "fix <inertia …>")
     return mass
-
-
-def _unphysical(node: Node, moments: np.ndarray, problem: str) -> RobotError:
-    values = ", ".join(f"{moment:.4g}" for moment in moments)
-    return node.refuse(f"{problem} (principal moments {values} kg·m²)", "fix <inertia …>")
 
 
 def _strength(limit: Node, key: str, kind: str, zero_limits: str) -> float:

@@ -135,6 +135,7 @@ def parse(data: bytes, label: str, *, expanded: bool = True) -> Node:
     except DefusedXmlException as error:
         line = parser.parser.CurrentLineNumber
         raise RobotError(f"{label}:{line}: DTD and entities are not allowed; remove <!DOCTYPE …>.") from error
+    _drop_default_namespace(root)
     node = Node(label, builder.lines, root, f"robot '{shorten(root.get('name', ''))}'")
     if root.tag != "robot":
         raise node.refuse(f"the root element is <{shorten(root.tag)}>", "a URDF <robot> is needed")
@@ -166,6 +167,13 @@ class _Builder(ET.TreeBuilder):
     def end(self, tag: Any, /) -> ET.Element:
         self.depth -= 1
         return super().end(tag)
+
+
+def _drop_default_namespace(root: ET.Element) -> None:
+    """Name the elements of <robot xmlns="…"> as every URDF reader does, by their bare tags."""
+    namespace = root.tag.removesuffix("robot")
+    for element in root.iter() if namespace.endswith("}") else ():
+        element.tag = element.tag.removeprefix(namespace)
 
 
 def _refuse_foreign(node: Node) -> None:

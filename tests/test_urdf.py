@@ -124,6 +124,14 @@ REFUSED = {
     "U15 planar": ('"prismatic"', '"planar"', 11, ["type 'planar'"]),
     "U15 unknown": ('"prismatic"', '"hinge"', 11, ["type 'hinge'"]),
     "U15 none": (' type="prismatic"', "", 11, ["<joint> states no type"]),
+    "U17 all": (
+        "</robot>",
+        '<link name="l3"/><joint name="j3" type="continuous"><parent link="tool"/><child link="l3"/><mimic joint="j1"/>'
+        '</joint><link name="l4"/><joint name="j4" type="continuous"><parent link="l3"/><child link="l4"/>'
+        '<mimic joint="j1"/></joint></robot>',
+        14,
+        ["joint 'j3'", "lock=['j3', 'j4']"],
+    ),
     "U17": (LIMIT1, LIMIT1 + '<mimic joint="j2"/>', 10, ["mimic", "lock=['j1']"]),
     "U18 xacro": (
         '<link name="tool"/>',
@@ -271,6 +279,11 @@ def test_u21_only_utf8(tmp_path):
     assert "Ärm" in read_urdf(write(tmp_path, relabelled)).xml.decode().replace("&#196;", "Ä")
 
 
+def test_a_default_namespace_is_no_obstacle(tmp_path):
+    spaced = read_urdf(write(tmp_path, mutated('<robot name="arm"', '<robot xmlns="http://example.com" name="arm"')))
+    assert spaced.without_geometry() == read_urdf(write(tmp_path, ARM)).without_geometry()
+
+
 def test_u22_meshes_stay_inside_their_roots(tmp_path):
     (tmp_path / "pkg").mkdir()
     (tmp_path / "outside.stl").touch()
@@ -307,6 +320,7 @@ def test_links_without_inertia_are_part_of_the_body_they_are_fixed_to(tmp_path):
 def test_point_masses_and_rods_are_bodies_as_long_as_the_arm_has_inertia(tmp_path):
     zero = re.sub(r'\b(i[xyz]{2})="[\d.]+"', r'\1="0"', ARM)
     load_robot(write(tmp_path, zero))  # two point masses off the first axis
+    load_robot(write(tmp_path, zero.replace('ixy="0"', 'ixy="1e-35"')))  # a rounding error of a point mass
     rod = re.sub(r'ixx="0.3"', 'ixx="0"', ARM)
     load_robot(write(tmp_path, rod))
     on_axis = zero.replace('"0.5 0 0"', '"0 0 0.5"').replace('<origin xyz="1 0 0"/>', "").replace('"1 0 0"', '"0 0 1"')
