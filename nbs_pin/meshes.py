@@ -73,7 +73,7 @@ def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
     if path.stat().st_size > MAX_BYTES:
         raise MeshError(f"mesh {path} has {path.stat().st_size} bytes, at most {MAX_BYTES} are drawn: simplify it.")
     try:
-        scene = trimesh.load_scene(path, resolver=_Beside(path))
+        scene = trimesh.load_scene(path, resolver=_Beside(str(path)))
     except Exception as error:  # parsers of foreign files raise whatever they trip over
         raise MeshError(f"mesh {path} cannot be read ({type(error).__name__}: {error}): export it anew.") from error
     meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-import umsgpack
+import umsgpack  # type: ignore[import-untyped]
 from jaxtyping import Float, Int
 from meshcat.commands import SetObject, SetTransform
 from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry
@@ -130,7 +130,7 @@ def _body_node(body: int) -> tuple[str, str]:
 
 
 def _commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]:
-    """meshcat's commands that build the arm: a node per body, under it a node per shape."""
+    """The commands for meshcat that build the arm: a node per body, under it a node per shape."""
     commands = [SetTransform(np.eye(4), ScenePath(_body_node(body))) for body in range(robot.model.njoints)]
     for index, visual in enumerate(visuals):
         frame = robot.model.frames[robot.model.getFrameId(visual.link, pin.FrameType.BODY)]
@@ -169,7 +169,9 @@ def _view(robot: Robot, visuals: tuple[Visual, ...], poses: Float[np.ndarray, "f
     flat = spread[0] < 0.1 * spread[1]
     direction = np.array([*(across if flat else (0.65, -0.76)), 0.3])
     cell = min((10.0**k * digit for k in range(-4, 4) for digit in (1.0, 2.0, 5.0)), key=lambda c: abs(c - radius / 5))
+    outward = np.random.default_rng(0).normal(size=(160, 3))
     return {
+        "cloud": cloud[np.unique((cloud @ outward.T).argmax(axis=0))].tolist(),
         "target": target.tolist(),
         "radius": radius,
         "direction": (direction / np.linalg.norm(direction)).tolist(),

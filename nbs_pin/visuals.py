@@ -201,5 +201,6 @@ def _capsule(end: Float[np.ndarray, "3"], radius: float) -> trimesh.Trimesh:
     """A capsule from the origin to `end`."""
     length = float(np.linalg.norm(end))
     capsule = trimesh.creation.capsule(height=length, radius=radius, count=[32, 32])
-    capsule.apply_transform(trimesh.geometry.align_vectors(np.array([0.0, 0.0, 1.0]), end / length))
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), end).matrix()
+    capsule.apply_transform(pin.SE3(turn, 0.5 * end).homogeneous)
     return capsule

@@ -6,14 +6,22 @@ import os
 import select
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
 
-FLAGS = (
-    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync --hide-scrollbars --enable-unsafe-swiftshader --remote-debugging-pipe"
-).split()
+FLAGS = """
+--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking
+--disable-component-update --disable-sync --hide-scrollbars --enable-unsafe-swiftshader --remote-debugging-pipe
+""".split()  # noqa: SIM905
+
+LAUNCH = """
+import fcntl, os, sys
+read, write = (fcntl.fcntl(int(number), fcntl.F_DUPFD, 10) for number in sys.argv[1:3])
+os.dup2(read, 3), os.dup2(write, 4)  # where Chromium expects its end of the pipe
+os.execv(sys.argv[3], sys.argv[3:])
+"""
 
 
 def find_chromium():
@@ -34,16 +42,21 @@ class Browser:
         read_in, self._out = os.pipe()
         self._in, write_out = os.pipe()
         flags = [*FLAGS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}", "about:blank"]
-        # the protocol's pipe is file descriptors 3 and 4
-        command = f'exec "$@" 3<&{read_in} 4>&{write_out}'
         self._process = subprocess.Popen(
-            ["/bin/sh", "-c", command, "sh", find_chromium(), *flags],
+            [sys.executable, "-I", "-S", "-c", LAUNCH, str(read_in), str(write_out), find_chromium(), *flags],
             pass_fds=(read_in, write_out),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
         os.close(read_in)
         os.close(write_out)
+        try:
+            self._attach()
+        except BaseException:
+            self.close()
+            raise
+
+    def _attach(self):
         targets = self.call("Target.getTargets")["targetInfos"]
         page = next(target["targetId"] for target in targets if target["type"] == "page")
         self._session = self.call("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
@@ -54,6 +67,10 @@ class Browser:
         return self
 
     def __exit__(self, *_):
+        self.close()
+
+    def close(self):
+        """Ends the browser and forgets its profile."""
         self._process.terminate()
         self._process.wait(20)
         os.close(self._in)
