@@ -10,14 +10,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from nbs_pin.checks import per_joint, positive
 from nbs_pin.exceptions import ArgumentError
 
 Disturbance: TypeAlias = Callable[[float, np.ndarray, np.ndarray], Any]
 """τ_d(t, q, v) [N·m], shape (..., n)."""
-PerJoint: TypeAlias = ArrayLike
+PerJoint: TypeAlias = Any
 """One number for all joints, or one per joint."""
 
 
@@ -34,7 +33,7 @@ class ConstantTorque:
         self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
-        return np.zeros(q.shape) + np.asarray(self.torque)
+        return np.zeros(q.shape) + self.torque
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +51,7 @@ class SinusoidalTorque:
         self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
-        amplitude, frequency, phase = map(np.asarray, (self.amplitude, self.frequency, self.phase))
-        return np.zeros(q.shape) + amplitude * np.sin(frequency * t + phase)
+        return np.zeros(q.shape) + self.amplitude * np.sin(self.frequency * t + self.phase)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +69,7 @@ class SquareWave:
         self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
-        amplitude, frequency, phase = map(np.asarray, (self.amplitude, self.frequency, self.phase))
-        return np.zeros(q.shape) + amplitude * np.where(np.sin(frequency * t + phase) >= 0.0, 1.0, -1.0)
+        return np.zeros(q.shape) + self.amplitude * np.where(np.sin(self.frequency * t + self.phase) >= 0.0, 1.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,4 +94,4 @@ class TorqueNoise:
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
         interval = math.floor(t / self.period + 1e-9)  # t = k·period may round to just below its interval
-        return np.asarray(self.std) * np.random.default_rng((self.seed, interval)).standard_normal(q.shape)
+        return self.std * np.random.default_rng((self.seed, interval)).standard_normal(q.shape)

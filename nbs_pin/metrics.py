@@ -5,7 +5,7 @@ Torque statistics leave out the last row, whose torque was computed but never ap
 """
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +14,8 @@ from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import configuration_difference
 from nbs_pin.state import Run
 
-Numbers = Float[np.ndarray, "*batch"]
+Numbers: TypeAlias = Float[np.ndarray, "*batch"] | np.float64
+"""One number per start: an array for a batch, a number for a single start."""
 PAPER_THRESHOLD = 0.01
 """‖z1‖² below which the paper calls an arm converged [rad²]."""
 

@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from nbs_pin.checks import per_joint, positive
 from nbs_pin.exceptions import ArgumentError
@@ -19,7 +18,7 @@ from nbs_pin.state import Reference
 
 DesiredMotion: TypeAlias = Callable[[Any], Reference]
 """ref(t) -> Reference, of a time [s] (shapes (n,)) or of an array of times (shapes (..., n))."""
-Numbers: TypeAlias = ArrayLike
+Numbers: TypeAlias = Any
 """A number, or one number per joint."""
 
 
@@ -48,10 +47,10 @@ class Sinusoid:
 
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
-        amplitude, w, phase, offset = map(np.asarray, (self.amplitude, self.frequency, self.phase, self.offset))
-        angle = w * np.asarray(t, dtype=float)[..., None] + phase
+        A, w = self.amplitude, self.frequency
+        angle = w * np.asarray(t, dtype=float)[..., None] + self.phase
         sine, cosine = np.sin(angle), np.cos(angle)
-        return Reference(offset + amplitude * sine, amplitude * w * cosine, -amplitude * w**2 * sine)
+        return Reference(self.offset + A * sine, A * w * cosine, -A * w**2 * sine)
 
 
 def paper_reference(n: int) -> Sinusoid:
@@ -72,7 +71,7 @@ class Hold:
 
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
-        q = np.atleast_1d(np.asarray(self.q))
+        q = np.atleast_1d(self.q)
         zero = np.zeros((*np.shape(t), q.size))
         return Reference(zero + q, zero, zero.copy())
 

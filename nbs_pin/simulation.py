@@ -58,18 +58,28 @@ def simulate(
     desired = _sampled(reference, period * np.arange(steps + 1.0), plant.nv)
     run = _prepared(plant, desired, period, limit, *_start(desired, q0, v0))
     run.info.update(controller=type(controller).__name__, plant=repr(plant), plant_step=period / substeps)
+    # Overflow needs no warning here: every torque and every state is checked, and reported with its time.
+    with np.errstate(over="ignore", invalid="ignore"):
+        _run_loop(run, plant, controller, disturbance, substeps, progress)
+    return run
+
+
+def _run_loop(
+    run: Run, plant: Plant, controller: Controller, disturbance: Disturbance | None, substeps: int, progress: bool
+) -> None:
+    """Fill the rows of the run from its first state on."""
+    limit = run.effort_limit
     memory = controller.initial_memory(run.q[0])
-    for k in tracked(range(steps + 1), "simulating", progress):
+    for k in tracked(range(len(run.t)), "simulating", progress):
         t, q, v = float(run.t[k]), run.q[k], run.v[k]
         desired = Reference(run.q_ref[k], run.v_ref[k], run.a_ref[k])
-        command, memory = controller.step(memory, q, v, desired, period)
+        command, memory = controller.step(memory, q, v, desired, run.period)
         # Finite before clipped: a clip can turn a torque that is not a number into full effort.
         run.tau_command[k] = _checked(command, q.shape, controller, t)
         tau = run.tau[k] = np.maximum(np.minimum(run.tau_command[k], limit), -limit)
         run.disturbance[k] = _disturbance(disturbance, t, q, v)
-        if k < steps:
-            run.q[k + 1], run.v[k + 1] = _advance(plant, q, v, tau, disturbance, t, period, substeps)
-    return run
+        if k + 1 < len(run.t):
+            run.q[k + 1], run.v[k + 1] = _advance(plant, q, v, tau, disturbance, t, run.period, substeps)
 
 
 def _substeps(period: float, plant_step: float | None) -> int:

@@ -107,9 +107,7 @@ class Run:
         if str(data["format"]) != RUN_FORMAT:
             raise FileFormatError(f"{path}: format '{data['format']}', expected '{RUN_FORMAT}'; record the run again.")
         _check_shapes(path, data)
-        finite = [*(name for name in ("t", "period", *_PER_ROW) if not np.isfinite(data[name]).all())]
-        if finite:
-            raise FileFormatError(f"{path}: '{finite[0]}' has numbers that are not finite; record the run again.")
+        _check_numbers(path, data)
         return cls(
             **{name: data[name] for name in ("t", *_PER_ROW, "effort_limit", "continuous")},
             joint_names=tuple(str(name) for name in data["joint_names"]),
@@ -129,6 +127,18 @@ def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
                 f"{path}: '{name}' has shape {data[name].shape}, expected {wanted} beside q of shape {shape}, "
                 "(rows, ..., joints); record the run again."
             )
+
+
+def _check_numbers(path: str | Path, data: dict[str, np.ndarray]) -> None:
+    faults = {name: "numbers that are not finite" for name in ("t", *_PER_ROW) if not np.isfinite(data[name]).all()}
+    if not (data["effort_limit"] > 0.0).all():
+        faults["effort_limit"] = "limits that are not > 0"
+    if not 0.0 < data["period"] < np.inf:
+        faults["period"] = "no finite time > 0"
+    if not (np.diff(data["t"]) > 0.0).all():
+        faults.setdefault("t", "times that do not increase")
+    for name, fault in faults.items():
+        raise FileFormatError(f"{path}: '{name}' has {fault}; record the run again.")
 
 
 def _parsed(path: str | Path, text: str) -> dict[str, Any]:

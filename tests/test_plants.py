@@ -1,0 +1,284 @@
+"""Two engines on one arm, published data, conservation of energy, and the ways a simulation can break."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+from nbs_pin.catalogue import ROBOT_NAMES
+from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.dynamics.equations import bias, energy, forward_dynamics
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.exceptions import ArgumentError, RobotError, SimulationDiverged
+from nbs_pin.plants.dynamics_plant import DynamicsPlant
+from nbs_pin.plants.integrators import INTEGRATORS
+from nbs_pin.plants.mujoco_plant import MujocoPlant
+from nbs_pin.references import Sinusoid
+from nbs_pin.robot import load_robot
+from nbs_pin.simulation import simulate
+
+PUBLISHED = {  # docs/theory.md §8: row k is the state after k − 1 steps of 1 ms
+    2: (-6.2168733e-06, 7.9008678e-06, -2.2411318e-06),
+    100: (-0.06075149, 0.07693954, -0.0214924),
+    1000: (-1.8019171, -0.5408098, -0.14177133),
+    5000: (-3.257532, 0.5981221, 2.3077562),
+    10012: (-1.9568236, -2.260467, -20.141457),
+}
+
+
+class GravityPlus(MemorylessController):
+    """τ = G(q) + a_ref, so that a reference's acceleration is a torque of time."""
+
+    def __init__(self, dynamics, gravity=1.0):
+        self.dynamics, self.gravity = dynamics, gravity
+
+    @property
+    def nv(self):
+        return self.dynamics.nv
+
+    def torque(self, q, v, q_ref, v_ref, a_ref):
+        return self.gravity * self.dynamics.gravity(q) + a_ref
+
+
+@pytest.fixture(scope="module")
+def panda():
+    return load_robot("panda")
+
+
+@pytest.fixture(autouse=True)
+def _log_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo appends its warnings to a file in the working directory
+
+
+def middle(robot):
+    inside = np.isfinite(robot.lower) & np.isfinite(robot.upper)
+    return np.where(inside, 0.5 * (np.where(inside, robot.lower, 0.0) + np.where(inside, robot.upper, 0.0)), 0.3)
+
+
+def smooth_torque(robot, dynamics, seed=0):
+    """Some newton metres on each joint, in proportion to the inertia it moves, at 2 to 5 rad/s."""
+    rng = np.random.default_rng(seed)
+    inertia = np.diagonal(dynamics.mass_matrix(middle(robot)))
+    return Sinusoid(
+        rng.uniform(1.0, 3.0, robot.nv) * inertia, rng.uniform(2.0, 5.0, robot.nv), rng.uniform(-3, 3, robot.nv)
+    )
+
+
+class AccelerationOnly:
+    """A reference whose a is the q of another: a torque of time for `GravityPlus`."""
+
+    def __init__(self, torque):
+        self.torque = torque
+
+    def __call__(self, t):
+        values = self.torque(t)
+        return type(values)(0.0 * values.q, 0.0 * values.q, values.q)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_mujoco_and_pinocchio_move_every_arm_alike(name):
+    robot = load_robot(name)
+    dynamics = PinocchioDynamics(robot)
+    reference = AccelerationOnly(smooth_torque(robot, dynamics))
+    runs = [
+        simulate(plant, GravityPlus(dynamics), reference, 1.0, 0.001, q0=middle(robot), effort_limit=np.inf)
+        for plant in (MujocoPlant(robot), DynamicsPlant(dynamics))
+    ]
+    assert np.abs(runs[0].q[-1] - runs[0].q[0]).max() > 0.05
+    np.testing.assert_allclose(runs[0].q, runs[1].q, rtol=0, atol=1e-10, equal_nan=False)
+    np.testing.assert_allclose(runs[0].v, runs[1].v, rtol=0, atol=1e-10, equal_nan=False)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_mujoco_and_pinocchio_agree_on_mass_bias_and_acceleration(name):
+    robot = load_robot(name)
+    mujoco, dynamics = MujocoPlant(robot), PinocchioDynamics(robot)
+    q, v, tau = np.random.default_rng(1).normal(size=(3, 5, robot.nv))
+    tau = bias(dynamics, q, v) + np.einsum("bij,bj->bi", dynamics.mass_matrix(q), tau)
+    np.testing.assert_allclose(mujoco.mass_matrix(q), dynamics.mass_matrix(q), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(mujoco.bias(q, v), bias(dynamics, q, v), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(
+        mujoco.acceleration(q, v, tau), forward_dynamics(dynamics, q, v, tau), rtol=1e-10, atol=1e-10
+    )
+
+
+def test_semi_implicit_euler_is_mujocos_euler(panda):
+    dynamics = PinocchioDynamics(panda)
+    reference = AccelerationOnly(smooth_torque(panda, dynamics))
+    plants = (
+        MujocoPlant(panda, "euler"),
+        MujocoPlant(panda, "implicitfast"),
+        DynamicsPlant(dynamics, "semi_implicit_euler"),
+    )
+    runs = [simulate(p, GravityPlus(dynamics), reference, 0.3, 0.001, q0=middle(panda)) for p in plants]
+    np.testing.assert_allclose(runs[0].q, runs[2].q, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(runs[1].q, runs[2].q, rtol=0, atol=1e-10)
+
+
+def test_three_link_passes_through_the_published_rows():
+    plant = MujocoPlant(load_robot("three_link"))
+    q = v = zero = np.zeros(3)
+    for steps in range(1, max(PUBLISHED)):
+        q, v = plant.step(q, v, zero, 0.001)
+        if steps + 1 in PUBLISHED:
+            np.testing.assert_allclose(q, PUBLISHED[steps + 1], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [lambda r: MujocoPlant(r), lambda r: DynamicsPlant(PinocchioDynamics(r))])
+def test_rk4_conserves_energy_to_fourth_order(make):
+    robot = load_robot("three_link")
+    dynamics, plant, zero = PinocchioDynamics(robot), make(robot), np.zeros(3)
+    drift = []
+    for step in (0.002, 0.001):
+        states = [(zero, zero)]
+        for _ in range(round(0.8 / step)):
+            states.append(plant.step(*states[-1], zero, step))
+        total = energy(dynamics, *np.swapaxes(states, 0, 1))
+        drift.append(np.abs(total - total[0]).max())
+    assert drift[0] < 1e-7
+    assert drift[0] > 15.0 * drift[1]
+
+
+@pytest.mark.parametrize(("name", "order"), [("rk4", 4), ("semi_implicit_euler", 1), ("euler", 1)])
+def test_integrators_have_their_order_on_an_oscillator(name, order):
+    def error(h):
+        q, v = np.array([1.0]), np.array([0.0])
+        for _ in range(round(1.0 / h)):
+            q, v = INTEGRATORS[name](lambda q, v: -q, q, v, h)
+        return abs(q[0] - np.cos(1.0)) + abs(v[0] + np.sin(1.0))
+
+    assert np.log2(error(0.05) / error(0.025)) == pytest.approx(order, abs=0.15)
+
+
+def test_a_step_of_a_batch_is_the_stack_of_its_rows(panda):
+    q, v, tau = np.random.default_rng(2).normal(size=(3, 2, 3, 7))
+    for plant in (MujocoPlant(panda), DynamicsPlant(PinocchioDynamics(panda), friction=JointFriction.of(panda))):
+        q1, v1 = plant.step(q, v, tau, 0.001)
+        alone = plant.step(q[1, 2], v[1, 2], tau[1, 2], 0.001)
+        np.testing.assert_array_equal((q1[1, 2], v1[1, 2]), alone)
+
+
+@pytest.mark.parametrize("joint_friction", ["drop", "keep"])
+def test_a_mujoco_step_depends_on_its_arguments_alone(joint_friction):
+    plant = MujocoPlant(load_robot("z1"), joint_friction=joint_friction)
+    first, other = np.random.default_rng(3).normal(size=(2, 3, plant.nv))
+    before = plant.step(*first, 0.001)
+    plant.step(*other, 0.002)
+    with pytest.raises(SimulationDiverged):
+        plant.step(first[0], first[1] + 1e12, first[2], 0.001)
+    np.testing.assert_array_equal(plant.step(*first, 0.001), before)
+    for twin in (pickle.loads(pickle.dumps(plant)), copy.deepcopy(plant)):
+        np.testing.assert_array_equal(twin.step(*first, 0.001), before)
+
+
+def test_kept_damping_is_the_urdfs():
+    robot = load_robot("double_pendulum")
+    assert robot.damping.min() > 0.0
+    assert robot.friction.max() == 0.0
+    friction = JointFriction.of(robot)
+    v, zero = np.array([1.0, -2.0]), np.zeros(2)
+    kept = MujocoPlant(robot, joint_friction="keep").acceleration(zero, v, zero)
+    np.testing.assert_allclose(kept, MujocoPlant(robot).acceleration(zero, v, -friction.torque(v)), rtol=1e-12)
+    plant = DynamicsPlant(PinocchioDynamics(robot), friction=friction)
+    np.testing.assert_allclose(
+        plant.step(zero, v, zero, 1e-3), MujocoPlant(robot, joint_friction="keep").step(zero, v, zero, 1e-3), atol=1e-12
+    )
+
+
+def test_kept_dry_friction_holds_an_arm_that_otherwise_falls():
+    robot = load_robot("z1")
+    q, zero = middle(robot), np.zeros(robot.nv)
+    tau = PinocchioDynamics(robot).gravity(q) + 0.5 * robot.friction
+    assert (robot.friction > 0.0).all()
+    held = MujocoPlant(robot, joint_friction="keep").acceleration(q, zero, tau)
+    free = MujocoPlant(robot).acceleration(q, zero, tau)
+    assert np.abs(held).max() < 0.2 * np.abs(free).max()  # soft: about a tenth leaks
+
+
+def test_friction_takes_energy_and_comes_in_both_array_kinds():
+    torch = pytest.importorskip("torch")
+    friction = JointFriction(np.array([0.5, 0.0]), np.array([1.0, 2.0]), 0.1)
+    v = np.linspace(-2.0, 2.0, 41)[:, None] * np.ones(2)
+    torque = friction.torque(v)
+    assert (torque * v).sum(axis=-1).min() == 0.0
+    np.testing.assert_allclose(torque[-1], [2.0, 2.0], rtol=1e-12)
+    tensor = torch.tensor(v, requires_grad=True)
+    np.testing.assert_allclose(friction.torque(tensor).detach(), torque, rtol=0, atol=1e-15)
+    friction.torque(tensor).sum().backward()
+    np.testing.assert_allclose(tensor.grad[20], [0.5 + 10.0, 20.0], rtol=1e-12)
+
+
+def test_gravity_is_the_robots():
+    robot = load_robot("panda", gravity=[1.0, -2.0, 3.0])
+    q = middle(robot)
+    np.testing.assert_allclose(
+        MujocoPlant(robot).bias(q, 0.0 * q), PinocchioDynamics(robot).gravity(q), rtol=0, atol=1e-12
+    )
+
+
+def test_effort_limits_do_not_clamp_inside_mujoco(panda):
+    q, zero = middle(panda), np.zeros(7)
+    tau = 20.0 * panda.effort_limit
+    expected = forward_dynamics(PinocchioDynamics(panda), q, zero, tau)
+    np.testing.assert_allclose(MujocoPlant(panda).acceleration(q, zero, tau), expected, rtol=1e-9)
+
+
+def test_position_limits_do_not_stop_an_arm(panda):
+    q = panda.upper + 0.5
+    expected = forward_dynamics(PinocchioDynamics(panda), q, 0 * q, 0 * q)
+    for choice in ("drop", "keep"):
+        plant = MujocoPlant(panda, joint_friction=choice)
+        np.testing.assert_allclose(plant.acceleration(q, 0 * q, 0 * q), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("argument", [0, 1, 2])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_mujoco_never_sees_a_number_that_is_not_finite(panda, argument, value):
+    arguments = [np.zeros(7), np.zeros(7), np.zeros(7)]
+    arguments[argument][3] = value
+    with pytest.raises(SimulationDiverged, match="expected finite"):
+        MujocoPlant(panda).step(*arguments, 0.001)
+
+
+@pytest.mark.parametrize(("argument", "cause"), [(0, "QPOS"), (1, "QVEL"), (2, "QACC")])
+def test_mujoco_warnings_raise_with_their_cause(panda, argument, cause):
+    arguments = [np.zeros(7), np.zeros(7), np.zeros(7)]
+    arguments[argument] += 1e15
+    with pytest.raises(SimulationDiverged, match=cause):
+        MujocoPlant(panda).step(*arguments, 0.001)
+
+
+def test_a_provider_that_leaves_the_finite_numbers_raises(panda):
+    with pytest.raises(SimulationDiverged, match="PinocchioDynamics, euler"):
+        DynamicsPlant(PinocchioDynamics(panda), "euler").step(np.zeros(7), np.full(7, 1e200), np.zeros(7), 0.001)
+
+
+def test_unknown_choices_are_refused(panda):
+    dynamics = PinocchioDynamics(panda)
+    with pytest.raises(ArgumentError, match="2 joints, the dynamics 7"):
+        DynamicsPlant(dynamics, friction=JointFriction(np.ones(2), np.ones(2)))
+    # The annotations are executed in tests, and refuse first what the constructor refuses for a user.
+    for make in (MujocoPlant, lambda *a: DynamicsPlant(dynamics, *a[1:])):
+        with pytest.raises((ArgumentError, TypeError), match="rk5"):
+            make(panda, "rk5")
+    with pytest.raises((ArgumentError, TypeError), match="some"):
+        MujocoPlant(panda, joint_friction="some")
+
+
+@pytest.mark.parametrize(
+    ("viscous", "coulomb", "transition"),
+    [([-1.0], [0.0], 0.1), ([1.0], [np.nan], 0.1), ([1.0], [0.0, 1.0], 0.1), ([1.0], [1.0], 0.0)],
+)
+def test_impossible_friction_is_refused(viscous, coulomb, transition):
+    with pytest.raises((ArgumentError, TypeError)):
+        JointFriction(np.array(viscous), np.array(coulomb), transition)
+
+
+def test_an_arm_that_mujoco_cannot_build_is_refused_by_name(panda):
+    broken = panda.urdf.xml.replace(b"<mass value=", b"<mass value='0' was=")
+    robot = copy.copy(panda)
+    object.__setattr__(robot, "urdf", type(panda.urdf)(**{**vars(panda.urdf), "xml": broken}))
+    with pytest.raises(RobotError, match="MuJoCo cannot build"):
+        MujocoPlant(robot)

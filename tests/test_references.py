@@ -1,0 +1,232 @@
+"""Desired motions: v and a are the derivatives of q, files are read whole or refused with the place of the fault."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nbs_pin.exceptions import ArgumentError, FileFormatError
+from nbs_pin.npz import write_npz
+from nbs_pin.reference_files import Sampled, load_reference
+from nbs_pin.references import Hold, MinimumJerk, Sinusoid, check_reference, paper_reference
+from nbs_pin.robot import load_robot
+
+T = np.linspace(0.0, 2.0, 21)
+JOINTS = ("shoulder", "elbow")
+numbers = st.floats(-3.0, 3.0)
+
+
+def wave(t):
+    return np.stack((np.sin(t), np.cos(2.0 * t)), axis=-1)
+
+
+REFERENCES = {
+    "sinusoid": Sinusoid([0.5, -1.0], [2.0, 3.0], [0.1, 0.2], 0.3),
+    "paper": paper_reference(2),
+    "hold": Hold([0.4, -0.2]),
+    "minimum_jerk": MinimumJerk([[0.0, 1.0], [1.0, -1.0], [0.5, 0.0]], [0.0, 1.2, 2.0]),
+    "sampled": Sampled(T, wave(T)),
+}
+
+
+def assert_derivatives(reference, times, h=1e-4, atol=1e-6):
+    """Five-point central differences of q and v against v and a."""
+    for t in times:
+        for low, high in (("q", "v"), ("v", "a")):
+            near = [getattr(reference(t + k * h), low) for k in (-2, -1, 1, 2)]
+            slope = (near[0] - 8.0 * near[1] + 8.0 * near[2] - near[3]) / (12.0 * h)
+            np.testing.assert_allclose(slope, getattr(reference(t), high), rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_v_and_a_are_the_derivatives_of_q(name):
+    assert_derivatives(REFERENCES[name], np.random.default_rng(0).uniform(0.01, 1.99, 12))
+
+
+@settings(max_examples=30, deadline=None)
+@given(numbers, numbers, numbers, numbers, st.floats(0.0, 10.0))
+def test_every_sinusoid_has_its_derivatives(amplitude, frequency, phase, offset, t):
+    reference = Sinusoid(amplitude, [frequency, 1.0], phase, offset)
+    assert_derivatives(reference, [t])
+    assert reference(0.0).q[0] == pytest.approx(offset + amplitude * np.sin(phase))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(st.tuples(numbers, numbers), min_size=2, max_size=5),
+    st.lists(st.floats(0.3, 2.0), min_size=5, max_size=5),
+    st.floats(0.0, 1.0),
+)
+def test_minimum_jerk_rests_at_every_waypoint(waypoints, gaps, fraction):
+    times = np.cumsum(gaps[: len(waypoints)])
+    reference = MinimumJerk(waypoints, times)
+    at = reference(times)
+    np.testing.assert_allclose(at.q, waypoints, atol=1e-12)
+    np.testing.assert_allclose((at.v, at.a), 0.0, atol=1e-9)
+    t = times[0] + fraction * (times[1] - times[0])
+    assert_derivatives(reference, [np.clip(t, times[0] + 1e-3, times[1] - 1e-3)], atol=1e-5)
+    speed = np.abs(np.subtract(waypoints[1], waypoints[0])) / gaps[1]
+    assert (np.abs(reference(t).v) <= 1.875 * speed + 1e-12).all()
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_an_array_of_times_gives_the_stack_of_single_times(name):
+    reference = REFERENCES[name]
+    grid = np.linspace(-0.5, 2.5, 6).reshape(2, 3)
+    stacked = reference(grid)
+    for part, alone in zip(stacked, reference(float(grid[1, 2])), strict=True):
+        assert part.shape == (2, 3, 2)
+        assert alone.shape == (2,)
+        np.testing.assert_allclose(part[1, 2], alone, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["hold", "minimum_jerk", "sampled"])
+@pytest.mark.parametrize(("outside", "end"), [(-1.0, 0.0), (400.0, 2.0)])
+def test_beyond_its_ends_a_motion_is_held(name, outside, end):
+    reference = REFERENCES[name]
+    q, v, a = reference(outside)
+    np.testing.assert_array_equal(q, reference(end).q)
+    np.testing.assert_array_equal((v, a), 0.0)
+
+
+def test_the_papers_reference_alternates_sine_and_cosine():
+    q, v, _ = paper_reference(3)(5.0)
+    np.testing.assert_allclose(q, [np.sin(0.5), np.cos(0.5), np.sin(0.5)], rtol=1e-12)
+    np.testing.assert_allclose(v, [0.1 * np.cos(0.5), -0.1 * np.sin(0.5), 0.1 * np.cos(0.5)], rtol=1e-12)
+
+
+def test_the_spline_passes_through_its_samples_and_follows_between_to_fourth_order():
+    def worst(step):
+        t = np.arange(0.0, 2.0 + 0.5 * step, step)
+        reference, between = Sampled(t, wave(t)), np.linspace(0.5, 1.5, 97)
+        np.testing.assert_allclose(reference(t).q, wave(t), rtol=0, atol=1e-14)
+        return np.abs(reference(between).q - wave(between)).max()
+
+    assert np.log2(worst(0.1) / worst(0.05)) > 3.5
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Sinusoid([1.0, 2.0], [1.0, 2.0, 3.0]),
+        lambda: Sinusoid(np.nan, 1.0),
+        lambda: Sinusoid([[1.0]], 1.0),
+        lambda: Hold([np.inf]),
+        lambda: Hold([]),
+        lambda: paper_reference(0),
+        lambda: MinimumJerk([[0.0], [1.0]], [0.0, 0.0]),
+        lambda: MinimumJerk([[0.0], [1.0]], [0.0, 1.0, 2.0]),
+        lambda: MinimumJerk([[0.0], [np.nan]], [0.0, 1.0]),
+        lambda: MinimumJerk([[0.0]], [0.0]),
+        lambda: Sampled(T[:3], wave(T[:3])),
+        lambda: Sampled(T[::-1].copy(), wave(T)),
+    ],
+)
+def test_motions_that_make_no_sense_are_refused(make):
+    with pytest.raises(ArgumentError):
+        make()
+
+
+def write_csv(path, header, rows):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def table(t=T):
+    return [list(row) for row in np.column_stack((t, wave(t)))]
+
+
+def test_csv_and_npz_give_the_motion_in_the_arms_order(tmp_path):
+    expected = REFERENCES["sampled"](0.77)
+    csv = write_csv(tmp_path / "a.csv", "t,elbow,shoulder", [[t, b, a] for t, a, b in table()])
+    plain = write_csv(tmp_path / "b.csv", "t, q1, q2", table())
+    write_npz(tmp_path / "c.npz", {"t": T, "q": wave(T)[:, ::-1], "joint_names": np.array(["elbow", "shoulder"])})
+    write_npz(tmp_path / "d.npz", {"t": T, "q": wave(T)})
+    for path in (csv, plain, tmp_path / "c.npz", tmp_path / "d.npz"):
+        np.testing.assert_allclose(load_reference(path, JOINTS)(0.77), expected, rtol=0, atol=1e-15)
+
+
+def changed(row, column, value):
+    rows = table()
+    rows[row][column] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "reason"),
+    [
+        ("t,q1,q2", changed(16, 2, "nan"), "row 17, column elbow: nan"),
+        ("t,q1,q2", changed(16, 2, "inf"), "row 17, column elbow: inf"),
+        ("t,q1,q2", changed(4, 1, "abc"), "row 5, column q1: 'abc'"),
+        ("t,q1,q2", changed(4, 1, "1_0"), "row 5, column q1: '1_0'"),
+        ("t,q1,q2", changed(4, 1, "٣"), "row 5, column q1"),
+        ("t,q1,q2", changed(4, 1, ""), "row 5, column q1"),
+        ("t,q1,q2", changed(4, 1, "1,5"), "row 5 has 4 values, expected 3"),
+        ("t,q1,q2", [*table(), [3.0]], "row 22 has 1 values, expected 3"),
+        ("t,q1,q2", changed(8, 0, 0.1), "row 9"),
+        ("t,q1,q2", changed(8, 0, T[7]), "time must increase"),
+        ("t,q1,q2", table()[:3], "at least 4"),
+        ("t,q1,q2", [], "at least 4"),
+        ("t,q1", [row[:2] for row in table()], "1 joints .* expected 2"),
+        ("t,shoulder,wrist", table(), "no joint is named wrist"),
+        ("t,q1,q1", table(), "header"),
+        ("time,q1,q2", table(), "header"),
+        ("0.0,0.1,0.2", table(), "header"),
+    ],
+)
+def test_faults_in_a_csv_are_refused_with_their_place(tmp_path, header, rows, reason):
+    path = write_csv(tmp_path / "motion.csv", header, rows)
+    with pytest.raises(FileFormatError, match=f"motion.csv: .*{reason}"):
+        load_reference(path, JOINTS)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00\xff\xfe", b'{"t": 1}', b't,"q1\n'])
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".txt"])
+def test_other_files_are_refused(tmp_path, content, suffix):
+    path = tmp_path / f"motion{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match="motion"):
+        load_reference(path, JOINTS)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "reason"),
+    [
+        ({"t": T}, "no 'q'"),
+        ({"t": T, "q": T}, r"shape \(21,\)"),
+        ({"t": T[1:], "q": wave(T)}, "one time per row"),
+        ({"t": T, "q": wave(T).astype(int)}, "expected real numbers"),
+        ({"t": T, "q": wave(T), "joint_names": np.array(["a"])}, "1 joint_names for 2"),
+        ({"t": T, "q": wave(T), "joint_names": np.array(["a", "b"])}, "no joint is named a, b"),
+        ({"t": T, "q": np.where(wave(T) > 0.9, np.nan, wave(T))}, "not a finite number"),
+    ],
+)
+def test_faults_in_an_npz_are_refused(tmp_path, arrays, reason):
+    write_npz(tmp_path / "motion.npz", arrays)
+    with pytest.raises(FileFormatError, match=reason):
+        load_reference(tmp_path / "motion.npz", JOINTS)
+
+
+def test_a_missing_file_is_not_found(tmp_path):
+    for suffix in ("csv", "npz"):
+        with pytest.raises(FileNotFoundError):
+            load_reference(tmp_path / f"none.{suffix}", JOINTS)
+
+
+def test_a_motion_beyond_the_arms_limits_is_refused_with_joint_and_time():
+    robot = load_robot("panda")
+    q = 0.5 * (robot.lower + robot.upper)
+    check_reference(Sinusoid(0.1 * np.ones(7), 1.0, 0.0, q), robot, 3.0)
+    with pytest.raises(ArgumentError, match=r"position 2\.89817 rad of joint 'panda_joint3' at t = .* outside \[-2.89"):
+        check_reference(Sinusoid([0, 0, 3.0, 0, 0, 0, 0], 1.0, 0.0, q), robot, 3.0)
+    with pytest.raises(ArgumentError, match=r"velocity .* 'panda_joint1' at t = 0 s.* slow it down"):
+        check_reference(Sinusoid([0.1, 0, 0, 0, 0, 0, 0], 100.0, 0.0, q), robot, 3.0)
+    with pytest.raises(ArgumentError, match=r"torque .* N·m of joint 'panda_joint"):
+        check_reference(Sinusoid([0.05, 0, 0, 0, 0, 0, 0], 43.0, 0.0, q), robot, 3.0)
+    check_reference(Sinusoid([0.05, 0, 0, 0, 0, 0, 0], 43.0, 0.0, q), robot, 3.0, torque=False)
+    with pytest.raises(ArgumentError, match="are these degrees"):
+        check_reference(Hold(np.full(7, 45.0)), robot, 3.0)
+    with pytest.raises(ArgumentError, match="2 joints, panda has 7"):
+        check_reference(paper_reference(2), robot, 3.0)
+    with pytest.raises(ArgumentError, match="duration"):
+        check_reference(Hold(q), robot, -1.0)

@@ -1,0 +1,327 @@
+"""The time loop: what acts when, what is recorded, and what stops it."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+
+from nbs_pin.controllers.controller import Controller, MemorylessController
+from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.plants.dynamics_plant import DynamicsPlant
+from nbs_pin.plants.mujoco_plant import MujocoPlant
+from nbs_pin.progress import tracked
+from nbs_pin.references import Hold, Sinusoid
+from nbs_pin.robot import load_robot
+from nbs_pin.simulation import simulate
+from nbs_pin.state import Reference, Run
+
+N = 2
+
+
+class Masses(DynamicsProvider):
+    """Unit masses without gravity: v̇ = τ, so that every run has a closed form."""
+
+    nv = N
+
+    def mass_matrix(self, q):
+        return np.broadcast_to(np.eye(N), (*q.shape, N)).copy()
+
+    def coriolis_matrix(self, q, v):
+        return np.zeros((*q.shape, N))
+
+    def gravity(self, q):
+        return np.zeros(q.shape)
+
+    def potential_energy(self, q):
+        return np.zeros(q.shape[:-1])
+
+    def forward_dynamics(self, q, v, tau):
+        return tau
+
+
+class Law(MemorylessController):
+    """A torque written as a function of (q, v, reference)."""
+
+    nv = N
+
+    def __init__(self, law, nv=N):
+        self.law, self.size = law, nv
+
+    nv = property(lambda self: self.size)
+
+    def torque(self, q, v, q_ref, v_ref, a_ref):
+        return self.law(q, v, Reference(q_ref, v_ref, a_ref))
+
+
+class Counter(Controller):
+    """τ = number of the call; remembers nothing but that number, which the loop keeps for it."""
+
+    nv = N
+
+    def initial_memory(self, q):
+        return 0
+
+    def step(self, memory, q, v, reference, period):
+        return np.full(q.shape, float(memory)), memory + 1
+
+
+PLANT = DynamicsPlant(Masses())
+STILL = Hold([0.0, 0.0])
+SILENT = Law(lambda q, v, ref: 0.0 * q)
+PD = Law(lambda q, v, ref: ref.a - 20.0 * (v - ref.v) - 100.0 * (q - ref.q))
+
+
+def test_the_torque_of_row_k_acts_from_t_k_to_t_k_plus_1():
+    run = simulate(PLANT, Counter(), STILL, 0.4, 0.1)
+    assert run.t.tolist() == [0.0, 0.1, 0.2, 0.30000000000000004, 0.4]
+    np.testing.assert_array_equal(run.tau[:, 0], [0, 1, 2, 3, 4])
+    np.testing.assert_allclose(np.diff(run.v[:, 0]), 0.1 * run.tau[:-1, 0], rtol=1e-12)
+    np.testing.assert_allclose(np.diff(run.q[:, 0]), 0.1 * run.v[:-1, 0] + 0.005 * run.tau[:-1, 0], rtol=1e-12)
+
+
+def test_times_do_not_drift():
+    run = simulate(PLANT, SILENT, STILL, 1.0, 0.001)
+    assert run.t.shape == (1001,)
+    np.testing.assert_array_equal(run.t, np.arange(1001) * 0.001)
+
+
+def test_the_controller_sees_the_state_and_reference_of_its_own_instant():
+    reference = Sinusoid([1.0, 0.5], [2.0, 3.0])
+    seen = []
+    law = Law(lambda q, v, ref: seen.append((q.copy(), v.copy(), *ref)) or -q)
+    run = simulate(PLANT, law, reference, 0.5, 0.01)
+    recorded = zip(run.q, run.v, run.q_ref, run.v_ref, run.a_ref, strict=True)
+    np.testing.assert_array_equal(seen, list(recorded))
+    np.testing.assert_array_equal((run.q_ref, run.v_ref, run.a_ref), reference(run.t))
+
+
+def test_a_plant_follows_with_feed_forward_and_without_it_lags():
+    reference = Sinusoid([1.0, 0.5], [2.0, 3.0])
+    run = simulate(PLANT, PD, reference, 0.6, 0.002)
+    assert np.abs(run.q - run.q_ref).max() < 1e-3
+    lagging = simulate(PLANT, Law(lambda q, v, ref: -20.0 * v - 100.0 * (q - ref.q)), reference, 0.6, 0.002)
+    assert np.abs(lagging.q - lagging.q_ref).max() > 0.1
+
+
+def test_the_start_is_the_references_or_the_one_given_at_rest():
+    reference = Sinusoid([1.0, 0.5], [2.0, 3.0], 0.3)
+    start = reference(0.0)
+    for options, q, v in (
+        ({}, start.q, start.v),
+        ({"q0": [0.1, 0.2]}, [0.1, 0.2], [0.0, 0.0]),
+        ({"q0": [0.1, 0.2], "v0": [1.0, 2.0]}, [0.1, 0.2], [1.0, 2.0]),
+        ({"v0": [1.0, 2.0]}, start.q, [1.0, 2.0]),
+    ):
+        run = simulate(PLANT, SILENT, reference, 0.01, 0.01, **options)
+        np.testing.assert_array_equal((run.q[0], run.v[0]), (q, v))
+
+
+def test_many_starts_at_once_are_the_stack_of_single_starts():
+    robot = load_robot("three_link")
+    dynamics = PinocchioDynamics(robot)
+    law = Law(lambda q, v, ref: dynamics.reference_torque(q, v, v, ref.a - 9.0 * (q - ref.q) - 6.0 * (v - ref.v)), 3)
+    reference, q0 = Sinusoid(np.ones(3), 1.0), np.random.default_rng(0).normal(size=(2, 3, 3))
+    for plant in (MujocoPlant(robot), DynamicsPlant(dynamics)):
+        disturbance = SquareWave(1.0, 30.0)
+        batch = simulate(plant, law, reference, 0.05, 0.01, q0=q0, disturbance=disturbance, effort_limit=50.0)
+        alone = simulate(plant, law, reference, 0.05, 0.01, q0=q0[1, 2], disturbance=disturbance, effort_limit=50.0)
+        assert batch.q.shape == (6, 2, 3, 3)
+        for name in ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref"):
+            np.testing.assert_allclose(getattr(batch, name)[:, 1, 2], getattr(alone, name), rtol=0, atol=1e-12)
+
+
+def test_effort_limits_clip_what_is_applied_and_keep_what_was_asked():
+    law = Law(lambda q, v, ref: np.array([10.0, -10.0]))
+    run = simulate(PLANT, law, STILL, 0.1, 0.1, effort_limit=[3.0, np.inf])
+    np.testing.assert_array_equal(run.tau, [[3.0, -10.0]] * 2)
+    np.testing.assert_array_equal(run.tau_command, [[10.0, -10.0]] * 2)
+    np.testing.assert_allclose(run.v[1], [0.3, -1.0], rtol=1e-12)
+    np.testing.assert_array_equal(run.effort_limit, [3.0, np.inf])
+
+
+def test_effort_limits_are_the_arms_unless_others_are_given():
+    robot = load_robot("panda")
+    law = Law(lambda q, v, ref: np.full(q.shape, 1e3), 7)
+    hold = Hold(0.5 * (robot.lower + robot.upper))
+    run = simulate(MujocoPlant(robot), law, hold, 0.002, 0.001)
+    np.testing.assert_array_equal(run.tau[0], robot.effort_limit)
+    assert (run.robot, run.robot_sha256, run.joint_names) == ("panda", robot.sha256, robot.joint_names)
+    free = simulate(MujocoPlant(robot), law, hold, 0.002, 0.001, effort_limit=np.inf)
+    np.testing.assert_array_equal(free.tau[0], 1e3)
+
+
+def test_a_finer_plant_step_converges_to_the_closed_form_whatever_the_period():
+    """Held torque on an oscillating disturbance: q(T) = T − sin T for v̇ = sin t from rest."""
+    errors = []
+    for plant_step in (0.01, 0.005):
+        options = {"plant_step": plant_step, "disturbance": lambda t, q, v: np.full(q.shape, np.sin(t))}
+        run = simulate(PLANT, SILENT, STILL, 1.0, 0.1, **options)
+        errors.append(abs(run.q[-1, 0] - (1.0 - np.sin(1.0))))
+        np.testing.assert_allclose(run.disturbance[:, 1], np.sin(run.t), rtol=1e-12)
+    assert errors[0] == pytest.approx(2.0 * errors[1], rel=0.05)
+    assert errors[1] < 2e-3
+
+
+def test_the_default_plant_step_is_the_longest_within_a_millisecond():
+    for period, step in ((0.01, 0.001), (0.001, 0.001), (0.0025, 0.0025 / 3), (2e-4, 2e-4), (1 / 240, 1 / 1200)):
+        run = simulate(PLANT, SILENT, STILL, period, period)
+        assert run.info["plant_step"] == pytest.approx(step, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"duration": -1.0}, "duration is -1.0"),
+        ({"duration": 0.0}, "duration is 0.0"),
+        ({"duration": np.nan}, "duration is nan"),
+        ({"duration": np.inf}, "duration is inf"),
+        ({"duration": 0.105}, "10.5 times the period"),
+        ({"duration": 0.001}, "0.1 times the period"),
+        ({"period": 0.0}, "period is 0.0"),
+        ({"period": np.nan}, "period is nan"),
+        ({"plant_step": 0.003}, "times the plant_step"),
+        ({"plant_step": 0.02}, "times the plant_step"),
+        ({"plant_step": -0.001}, "plant_step is"),
+        ({"q0": [1.0, 2.0, 3.0]}, "q0 has shape"),
+        ({"q0": 1.0}, "q0 has shape"),
+        ({"q0": np.zeros((0, 2))}, "q0 has shape"),
+        ({"q0": [np.nan, 0.0]}, "q0 is"),
+        ({"v0": [np.inf, 0.0]}, "v0 is"),
+        ({"q0": np.zeros((2, 2)), "v0": np.zeros((3, 2))}, "do not broadcast"),
+        ({"effort_limit": -1.0}, "effort_limit"),
+        ({"effort_limit": [1.0, np.nan]}, "effort_limit"),
+        ({"effort_limit": [1.0, 1.0, 1.0]}, "effort_limit"),
+        ({"reference": Hold([0.0])}, "one value for each of the 2 joints"),
+        ({"reference": lambda t: Reference(np.zeros(2), np.zeros(2), np.zeros(2))}, "arrays of times"),
+        ({"reference": lambda t: Reference(*np.full((3, *t.shape, 2), np.nan))}, "not finite"),
+        ({"controller": Law(lambda q, v, ref: q, nv=3)}, "3 joints and the plant 2"),
+        ({"disturbance": lambda t, q, v: np.zeros(3)}, "the disturbance at t = 0 s has shape"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(options, reason):
+    arguments = {"controller": SILENT, "reference": STILL, "duration": 0.1, "period": 0.01} | options
+    with pytest.raises(ArgumentError, match=reason):
+        simulate(PLANT, **arguments)
+
+
+class Raw(Counter):
+    """A controller from outside the package, whose torque nobody has checked."""
+
+    def __init__(self, torque):
+        self.torque = torque
+
+    def step(self, memory, q, v, reference, period):
+        return (0.0 * q if memory < 3 else self.torque), memory + 1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_torque_that_is_not_finite_stops_the_run_before_any_clip(value):
+    with pytest.raises(SimulationDiverged, match=r"Raw asked for the torque .* at t = 0\.03 s"):
+        simulate(PLANT, Raw([0.0, value]), STILL, 0.1, 0.01, effort_limit=1.0)
+
+
+@pytest.mark.parametrize("torque", [[1.0], 1.0, [[1.0, 1.0]], [1.0, 2.0, 3.0]])
+def test_a_torque_of_another_shape_stops_the_run(torque):
+    with pytest.raises(ArgumentError, match=r"Raw gave a torque of shape .* at t = 0\.03 s, expected \(2,\)"):
+        simulate(PLANT, Raw(torque), STILL, 0.1, 0.01)
+
+
+def test_a_disturbance_that_is_not_finite_stops_the_run():
+    with pytest.raises(SimulationDiverged, match=r"after t = 0\.01 s: the disturbance at t = 0\.016 s"):
+        simulate(PLANT, SILENT, STILL, 0.1, 0.01, disturbance=lambda t, q, v: np.full(N, np.nan if t > 0.015 else 0.0))
+
+
+def test_an_unstable_loop_is_reported_with_its_time_and_no_warnings():
+    wild = Law(lambda q, v, ref: 1e4 * q**3)
+    plant = DynamicsPlant(Masses(), "euler")
+    with pytest.raises(SimulationDiverged, match=r"Law asked for the torque .*inf.* at t = 0\.\d+ s"):
+        simulate(plant, wild, STILL, 1.0, 0.01, q0=[1.0, 1.0], plant_step=0.01)
+
+
+def test_a_diverging_mujoco_arm_is_reported_and_not_put_back_to_its_start(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot = load_robot("three_link")
+    wild = Law(lambda q, v, ref: 1e5 * (v + 1.0), 3)
+    with pytest.raises(SimulationDiverged, match=r"after t = .* s: MujocoPlant\(three_link"):
+        simulate(MujocoPlant(robot), wild, Hold(np.zeros(3)), 1.0, 0.01, effort_limit=np.inf)
+
+
+def test_errors_and_ctrl_c_of_a_controller_come_through():
+    def interrupt(q, v, ref):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(PLANT, Law(interrupt), STILL, 0.1, 0.01)
+    with pytest.raises(ZeroDivisionError):
+        simulate(PLANT, Law(lambda q, v, ref: q / (1 // 0)), STILL, 0.1, 0.01)
+
+
+def test_a_simulated_run_comes_back_from_its_file(tmp_path):
+    run = simulate(PLANT, PD, Sinusoid([1.0, 0.5], 2.0), 0.1, 0.01, q0=np.ones((3, 2)))
+    run.save(tmp_path / "run.npz")
+    again = Run.load(tmp_path / "run.npz")
+    np.testing.assert_array_equal(again.q, run.q)
+    np.testing.assert_array_equal(again.q_ref, run.q_ref)
+    assert again.info == run.info == {"controller": "Law", "plant": "DynamicsPlant(Masses, rk4)", "plant_step": 0.001}
+
+
+Q = np.zeros((4, 2))
+
+
+def test_disturbances_are_what_they_say():
+    np.testing.assert_array_equal(ConstantTorque([1.0, 2.0])(3.0, Q, Q), np.tile([1.0, 2.0], (4, 1)))
+    np.testing.assert_allclose(SinusoidalTorque(2.0, [1.0, 3.0], 0.5)(0.7, Q, Q)[0], 2.0 * np.sin([1.2, 2.6]))
+    wave = SquareWave([1.0, 2.0], np.pi)
+    assert [wave(t, Q[0], Q[0]).tolist() for t in (0.0, 0.5, 1.5, 2.5)] == [[1, 2], [1, 2], [-1, -2], [1, 2]]
+
+
+def test_noise_is_white_reproducible_and_constant_over_its_period():
+    noise = TorqueNoise([0.5, 2.0], 0.01, seed=3)
+    samples = np.array([noise(0.01 * k, Q, Q) for k in range(2000)]).reshape(-1, 4, 2)
+    np.testing.assert_allclose(samples.std(axis=(0, 1)), [0.5, 2.0], rtol=0.05)
+    assert np.abs(samples.mean(axis=(0, 1)) / [0.5, 2.0]).max() < 0.05
+    assert abs(np.corrcoef(samples[:-1, 0, 0], samples[1:, 0, 0])[0, 1]) < 0.08
+    np.testing.assert_array_equal(noise(0.57, Q, Q), samples[57])
+    np.testing.assert_array_equal(noise(0.5799, Q, Q), samples[57])
+    np.testing.assert_array_equal(TorqueNoise([0.5, 2.0], 0.01, seed=3)(0.57, Q, Q), samples[57])
+    assert not np.allclose(TorqueNoise([0.5, 2.0], 0.01, seed=4)(0.57, Q, Q), samples[57])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ConstantTorque(np.nan),
+        lambda: SinusoidalTorque(1.0, np.inf),
+        lambda: SquareWave([[1.0]], 1.0),
+        lambda: TorqueNoise(1.0, 0.0),
+        lambda: TorqueNoise(1.0, 0.01, -1),
+    ],
+)
+def test_disturbances_that_make_no_sense_are_refused(make):
+    with pytest.raises(ArgumentError):
+        make()
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_shows_only_at_a_terminal_and_only_for_long_work(monkeypatch):
+    clock = iter(range(1000))
+    monkeypatch.setattr("nbs_pin.progress.time.perf_counter", lambda: 1e-4 * next(clock))
+    monkeypatch.setattr(sys, "stderr", quick := Terminal())
+    assert list(tracked(range(5), "working")) == [0, 1, 2, 3, 4]
+    assert "working" not in quick.getvalue()
+    monkeypatch.setattr("nbs_pin.progress.time.perf_counter", lambda: float(next(clock)))
+    assert list(tracked(range(5), "working", show=False)) == [0, 1, 2, 3, 4]
+    assert quick.getvalue().count("working") == 0
+    assert list(tracked(range(5), "working")) == [0, 1, 2, 3, 4]
+    assert "working" in quick.getvalue()
+    monkeypatch.setattr(sys, "stderr", pipe := io.StringIO())
+    assert list(tracked(range(5), "working")) == [0, 1, 2, 3, 4]
+    assert pipe.getvalue() == ""
