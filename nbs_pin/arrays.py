@@ -10,7 +10,7 @@ from nbs_pin.exceptions import ArgumentError
 Array: TypeAlias = Any
 """A `numpy.ndarray` or a `torch.Tensor`; shapes are annotated with jaxtyping around it."""
 
-__all__ = ["Array", "array_namespace", "as_vectors", "is_torch_array", "matvec"]
+__all__ = ["Array", "array_namespace", "as_vectors", "constant_like", "is_torch_array", "matvec"]
 
 
 def matvec(matrix: Array, vector: Array) -> Array:
@@ -38,3 +38,10 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
     except (ValueError, RuntimeError) as error:
         shapes = ", ".join(f"{k} {tuple(x.shape)}" for k, x in zip(vectors, arrays, strict=True))
         raise ArgumentError(f"batch shapes do not broadcast ({shapes}); give equal leading axes.") from error
+
+
+def constant_like(x: Array, constant: np.ndarray) -> Array:
+    """The numpy constant in the kind, precision and place of x."""
+    if not is_torch_array(x):
+        return constant
+    return array_namespace(x).asarray(constant, dtype=x.dtype, device=x.device)

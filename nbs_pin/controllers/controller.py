@@ -32,15 +32,8 @@ class MemorylessController(Controller):
     """A law whose torque depends on the present state and reference alone."""
 
     @abstractmethod
-    def torque(
-        self,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        q_ref: Float[Array, "*batch n"],
-        v_ref: Float[Array, "*batch n"],
-        a_ref: Float[Array, "*batch n"],
-    ) -> Float[Array, "*batch n"]:
-        """Torque τ [N·m] for the state (q, v) and the reference (q_ref, v_ref, a_ref)."""
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+        """Torque τ [N·m] for the state (q, v) and the reference (q_ref, v_ref, a_ref), all of shape (..., nv)."""
 
     def initial_memory(self, q: Float[Array, "*batch n"]) -> None:
         """None: nothing is remembered."""

@@ -1,0 +1,100 @@
+"""Gains for an arm that nobody tuned, from its inertia and its effort limits."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.robot import Robot
+
+
+@dataclass(frozen=True)
+class Gains:
+    """K, Λ and D₀ of the potential Φ = ½zᵀKz + ψ(z) and the damping D = ωM + D₀ + TᵀT, with ΛK = ωI."""
+
+    bandwidth: float
+    """ω [rad/s]."""
+    stiffness: Float[np.ndarray, " n"]
+    """Diagonal of K [N·m/rad]."""
+    damping: Float[np.ndarray, " n"]
+    """Diagonal of D₀ [N·m·s/rad]."""
+
+    @property
+    def rate(self) -> Float[np.ndarray, " n"]:
+        """Diagonal of Λ = ωK⁻¹ [rad/s per N·m]."""
+        return self.bandwidth / self.stiffness
+
+
+def gains_for_robot(
+    robot: Robot,
+    dynamics: DynamicsProvider,
+    *,
+    bandwidth: float,
+    period: float,
+    stiffness_per_sample: float = 0.1,
+    damping_ratio: float = 0.7,
+    start_error: float = 0.3,
+) -> Gains:
+    """K = k M_e, D₀ = 2ζ√(K M_e), with √k·h = `stiffness_per_sample` and K_i·`start_error` within the effort limit.
+
+    M_e: `effective_inertia`. bandwidth: ω [rad/s]. period: control period h [s]. √k·h = 0.03 is soft, 0.1 a good
+    default, 0.4 still stable without delay (docs/theory.md §2). damping_ratio: ζ. start_error: the error [rad] up to
+    which the stiffness alone saturates no joint.
+    Raises ArgumentError when ω or h is out of range.
+    """
+    check_sampling(bandwidth, period)
+    inertia = effective_inertia(robot, dynamics)
+    stiffness = np.minimum((stiffness_per_sample / period) ** 2 * inertia, robot.effort_limit / start_error)
+    return Gains(bandwidth, stiffness, 2.0 * damping_ratio * np.sqrt(stiffness * inertia))
+
+
+def pd_gains(
+    robot: Robot, dynamics: DynamicsProvider, *, bandwidth: float, period: float
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """K_p [N·m/rad], that of `gains_for_robot`, and K_d [N·m·s/rad], critical for the largest inertia each joint moves.
+
+    K_d stays below ½M_e/h, where a sampled derivative begins to chatter (docs/theory.md §5).
+    Raises ArgumentError when ω or h is out of range.
+    """
+    kp = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period).stiffness
+    q = sample_configurations(robot)
+    largest = np.diagonal(dynamics.mass_matrix(q), axis1=-2, axis2=-1).max(axis=0)
+    return kp, np.minimum(2.0 * np.sqrt(kp * largest), 0.5 * effective_inertia(robot, dynamics) / period)
+
+
+def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndarray, " n"]:
+    """M_e,i = min_q 1/(M(q)⁻¹)_ii [kg·m²] over sampled configurations: the least inertia a torque at joint i moves.
+
+    The other joints are free to give way, which is what a light direction of M feels (docs/theory.md §2).
+    """
+    inverse = np.linalg.inv(dynamics.mass_matrix(sample_configurations(robot)))
+    return (1.0 / np.diagonal(inverse, axis1=-2, axis2=-1)).min(axis=0)
+
+
+def sample_configurations(robot: Robot, count: int = 1000, seed: int = 0) -> Float[np.ndarray, "count n"]:
+    """Uniform configurations within the position limits, a full turn where there are none [rad]."""
+    lower, upper = np.clip(robot.lower, -np.pi, np.pi), np.clip(robot.upper, -np.pi, np.pi)
+    return np.random.default_rng(seed).uniform(lower, upper, (count, robot.nv))
+
+
+def check_sampling(bandwidth: float, period: float) -> None:
+    """Raises ArgumentError unless ω [rad/s] and h [s] are positive and ωh ≤ ½."""
+    if not (0.0 < bandwidth < np.inf and 0.0 < period < np.inf):
+        raise ArgumentError(f"bandwidth {bandwidth} rad/s and period {period} s must be positive and finite.")
+    if bandwidth * period > 0.5:
+        raise ArgumentError(
+            f"bandwidth {bandwidth} rad/s at a period of {period} s leaves {1 / (bandwidth * period):.2g} samples per"
+            f" time constant; give a bandwidth of at most {0.5 / period:.4g} rad/s or a shorter period."
+        )
+
+
+def positive_gains(nv: int, **gains: Any) -> tuple[Float[np.ndarray, " n"], ...]:
+    """The gains as float arrays (nv,), a number for all joints broadcast; raises ArgumentError unless positive."""
+    arrays = {name: np.asarray(gain, dtype=float) for name, gain in gains.items()}
+    for name, gain in arrays.items():
+        if gain.shape not in ((), (nv,)) or not (gain > 0.0).all():
+            raise ArgumentError(f"{name} is {gain.tolist()}; give one positive number, or {nv}, one per joint.")
+    return tuple(np.broadcast_to(gain, (nv,)) for gain in arrays.values())

@@ -1,0 +1,174 @@
+"""The neural backstepping (NBS) law: tracking that is stable for every value of its network weights."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from nbs_pin.arrays import Array, array_namespace, as_vectors, is_torch_array, matvec
+from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.controllers.gains import Gains, gains_for_robot
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.networks.damping import Damping
+from nbs_pin.networks.potential import Potential
+from nbs_pin.robot import Robot
+
+DAMPINGS = ("inertial", "bounded", "paper")
+
+
+class Errors(NamedTuple):
+    """The signals of one backstepping step, each of shape (..., nv) but the value."""
+
+    z1: Array
+    """q ⊖ q_d [rad]."""
+    z2: Array
+    """v − v_r [rad/s]."""
+    v_r: Array
+    """Reference velocity φ = v_d − Λ∇Φ(z1) [rad/s]."""
+    a_r: Array
+    """Reference acceleration φ̇ = a_d − Λ∇²Φ(z1)(v − v_d) [rad/s²]."""
+    gradient: Array
+    """∇Φ(z1) [N·m]."""
+    value: Array
+    """Φ(z1) [J], shape (...)."""
+
+
+class NeuralBackstepping(MemorylessController, nn.Module):
+    """τ = M(φ̇ − ωz2) + C(q, v)φ + G − ∇Φ(z1) − D(z2)z2 with φ = v_d − Λ∇Φ(z1), z1 = q ⊖ q_d, z2 = v − φ.
+
+    With V = Φ + ½z2ᵀM z2:  V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ(ωM + D)z2 + z2ᵀτ_d for every weight of Φ and D (docs/theory.md §2).
+    Λ = I, ω = 0 with the `paper` networks is the paper's law (its eq. (9)); the paper's Λ = I has the wrong units.
+
+    dynamics: what the law believes of the arm. potential: Φ. damping: D without its ωM part.
+    rate: Λ [rad/s per N·m], (nv,), positive, diagonal. inertial_rate: ω ≥ 0 [1/s].
+    friction: joint friction to feed forward at φ, or None; it is monotone in v, so it only adds dissipation.
+    Raises ArgumentError when sizes disagree or Λ, ω are out of range.
+    """
+
+    rate: torch.Tensor
+
+    def __init__(
+        self,
+        dynamics: DynamicsProvider,
+        potential: Potential,
+        damping: Damping,
+        *,
+        rate: Float[Array, " n"] | None = None,
+        inertial_rate: float = 0.0,
+        friction: JointFriction | None = None,
+    ) -> None:
+        super().__init__()
+        nv = dynamics.nv
+        if not nv == potential.nv == damping.nv:
+            raise ArgumentError(
+                f"dynamics, potential and damping have {nv}, {potential.nv} and {damping.nv} joints; make them equal."
+            )
+        rates = torch.ones(nv, dtype=torch.float64) if rate is None else torch.as_tensor(rate, dtype=torch.float64)
+        if rates.shape != (nv,) or not bool(((rates > 0.0) & torch.isfinite(rates)).all()):
+            raise ArgumentError(f"the rate Λ is {rates.tolist()}; give {nv} positive numbers [rad/s per N·m].")
+        if not 0.0 <= inertial_rate < np.inf:
+            raise ArgumentError(f"the inertial rate ω is {inertial_rate}; give a number ≥ 0 [1/s].")
+        self.dynamics, self.friction = dynamics, friction
+        self.potential, self.damping = potential, damping
+        self.inertial_rate = inertial_rate
+        self.register_buffer("rate", rates.clone())
+
+    @classmethod
+    def for_robot(
+        cls,
+        robot: Robot,
+        dynamics: DynamicsProvider | None = None,
+        *,
+        bandwidth: float = 8.0,
+        period: float = 0.001,
+        potential: str = "smooth",
+        damping: str = "inertial",
+        friction: JointFriction | None = None,
+        gains: Gains | None = None,
+        seed: int = 0,
+    ) -> "NeuralBackstepping":
+        """A controller for an arm that nobody tuned, from its inertia, effort limits and control period.
+
+        bandwidth: ω [rad/s], the rate at which errors decay. period: control period h [s].
+        potential: "smooth" or "paper". damping: "inertial" (ωM + D₀ + TᵀT), "bounded" (D₀ + TᵀT) or "paper" (TᵀT).
+        dynamics: None takes Pinocchio's model of `robot`. gains: None computes them (`gains_for_robot`).
+        The paper's networks with S = I, Λ = I are built by hand: see `paper_controller`.
+        Raises ArgumentError for unknown names or numbers out of range.
+        """
+        from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+
+        if damping not in DAMPINGS:
+            raise ArgumentError(f"damping '{damping}' is unknown; choose one of {', '.join(DAMPINGS)}.")
+        dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
+        chosen = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period) if gains is None else gains
+        root = np.sqrt(chosen.stiffness)
+        phi = Potential(np.diag(0.5 * chosen.stiffness), form=potential, scale=root, seed=seed)
+        if damping == "paper":
+            d = Damping(robot.nv, form="paper", scale=np.sqrt(chosen.damping), seed=seed + 1)
+        else:
+            d = Damping(robot.nv, floor=np.diag(chosen.damping), scale=np.sqrt(chosen.damping), seed=seed + 1)
+        omega = chosen.bandwidth if damping == "inertial" else 0.0
+        return cls(dynamics, phi, d, rate=chosen.rate, inertial_rate=omega, friction=friction)
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self.dynamics.nv
+
+    def errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
+        """The backstepping signals for the state (q, v) and the reference, all of shape (..., nv).
+
+        Raises ArgumentError when shapes or array kinds do not fit.
+        """
+        return self._errors(*as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref))
+
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+        """τ [N·m]; the ωM part of the damping joins the reference acceleration and costs nothing.
+
+        Raises ArgumentError when shapes or array kinds do not fit.
+        """
+        q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
+        e = self._errors(q, v, q_ref, v_ref, a_ref)
+        feedforward = self.dynamics.reference_torque(q, v, e.v_r, e.a_r - self.inertial_rate * e.z2)
+        tau = feedforward - e.gradient - self.damping.force(e.z2)
+        return tau if self.friction is None else tau + self.friction.torque(e.v_r)
+
+    def storage(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
+        """V = Φ(z1) + ½z2ᵀM(q)z2 [J], the Lyapunov function of the closed loop."""
+        q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
+        e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
+        return e.value + 0.5 * _dot(e.z2, matvec(self.dynamics.mass_matrix(q), e.z2))
+
+    def dissipation(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
+        """∇ΦᵀΛ∇Φ + z2ᵀ(ωM + D)z2 [W]: the rate at which V falls without disturbance and friction."""
+        q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
+        e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
+        force = self.inertial_rate * matvec(self.dynamics.mass_matrix(q), e.z2) + self.damping.force(e.z2)
+        return _dot(e.gradient, self._rate_like(e.gradient) * e.gradient) + _dot(e.z2, force)
+
+    def _errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
+        rate = self._rate_like(q)
+        z1 = self.dynamics.difference(q, q_ref)
+        value, gradient, gradient_rate = self.potential.terms(z1, v - v_ref)
+        v_r = v_ref - rate * gradient
+        return Errors(z1, v - v_r, v_r, a_ref - rate * gradient_rate, gradient, value)
+
+    def _rate_like(self, x: Array) -> Array:
+        return self.rate if is_torch_array(x) else self.rate.numpy()
+
+
+def _dot(x: Array, y: Array) -> Array:
+    return array_namespace(x).sum(x * y, axis=-1)
+
+
+def paper_controller(dynamics: DynamicsProvider, *, m: float = 0.001, seed: int = 0) -> NeuralBackstepping:
+    """The paper's controller as its section V-A sets it up: S = I, Λ = I, ψ three 32-wide layers, D = TᵀT.
+
+    Source: paper eqs. (9), (10); initial weights U(−0.1, 0.2) and U(−0.2, 0.2) as in docs/theory.md §8.
+    """
+    potential = Potential(np.eye(dynamics.nv), form="paper", seed=seed)
+    return NeuralBackstepping(dynamics, potential, Damping(dynamics.nv, form="paper", m=m, seed=seed + 1))

@@ -1,0 +1,62 @@
+"""The passivity-based law of Slotine and Li with a known model."""
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.arrays import Array, as_vectors, constant_like
+from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.controllers.gains import effective_inertia, gains_for_robot, positive_gains
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.robot import Robot
+
+
+class SlotineLi(MemorylessController):
+    """τ = M a_r + C(q, v) v_r + G − K s,  v_r = v_d − λ z1,  a_r = a_d − λ ż1,  s = v − v_r.
+
+    rate: λ [1/s], (n,). gain: K [N·m·s/rad], (n,). friction: fed forward at v_r, or None.
+    Source: Slotine and Li 1987, "On the adaptive control of robot manipulators", without adaptation.
+    Raises ArgumentError unless all gains are positive.
+    """
+
+    def __init__(
+        self,
+        dynamics: DynamicsProvider,
+        *,
+        rate: Float[np.ndarray, " n"],
+        gain: Float[np.ndarray, " n"],
+        friction: JointFriction | None = None,
+    ) -> None:
+        self.dynamics, self.friction = dynamics, friction
+        self.rate, self.gain = positive_gains(dynamics.nv, rate=rate, gain=gain)
+
+    @classmethod
+    def for_robot(
+        cls,
+        robot: Robot,
+        dynamics: DynamicsProvider | None = None,
+        *,
+        bandwidth: float = 8.0,
+        period: float = 0.001,
+        friction: JointFriction | None = None,
+    ) -> "SlotineLi":
+        """λ = ω, and K such that a static error meets the stiffness λK of `gains_for_robot`, short of chatter."""
+        dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
+        gains = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period)
+        gain = np.minimum(gains.stiffness / bandwidth, 0.5 * effective_inertia(robot, dynamics) / period)
+        return cls(dynamics, rate=np.full(robot.nv, bandwidth), gain=gain, friction=friction)
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self.dynamics.nv
+
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+        """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
+        q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
+        rate, gain = constant_like(q, self.rate), constant_like(q, self.gain)
+        v_r = v_ref - rate * self.dynamics.difference(q, q_ref)
+        a_r = a_ref - rate * (v - v_ref)
+        tau = self.dynamics.reference_torque(q, v, v_r, a_r) - gain * (v - v_r)
+        return tau if self.friction is None else tau + self.friction.torque(v_r)

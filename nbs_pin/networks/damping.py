@@ -1,0 +1,113 @@
+"""The damping matrix D(z2): positive definite for every parameter value."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from nbs_pin.arrays import Array, array_namespace, is_torch_array, matvec
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.networks.potential import positive_definite, positive_scale
+
+DAMPINGS = ("bounded", "paper")
+
+
+class Damping(nn.Module):
+    """D(z) = D₀ + R T(Rz)ᵀT(Rz) R [N·m·s/rad], T lower triangular from two tanh networks (docs/theory.md §4).
+
+    form "bounded": D ⪰ D₀ for every parameter value.
+    form "paper": D = TᵀT with diagonal relu(·) + m, and no D₀. Positive definite, but not ⪰ m²I: T = [[1, 0], [1, 1]]
+    has m = 1 and λ_min(TᵀT) = 0.382.
+
+    floor: D₀ (n, n) symmetric positive definite, for "bounded" only. m: for "paper" only. R: diagonal scale (n,).
+    Raises ArgumentError for an unknown form, a floor that is missing, superfluous or not positive definite, or m ≤ 0.
+    """
+
+    scale: torch.Tensor
+    floor: torch.Tensor
+
+    def __init__(
+        self,
+        nv: int,
+        *,
+        form: str = "bounded",
+        floor: Float[Array, "n n"] | None = None,
+        m: float = 0.001,
+        widths: tuple[int, ...] = (32, 32),
+        scale: Float[Array, " n"] | None = None,
+        gain: float = 0.2,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if form not in DAMPINGS:
+            raise ArgumentError(f"damping '{form}' is unknown; choose one of {', '.join(DAMPINGS)}.")
+        if (form == "bounded") != (floor is not None):
+            raise ArgumentError(
+                f"damping '{form}' was given the floor D₀ = {floor}; 'bounded' needs one, 'paper' has none."
+            )
+        if not m > 0.0:
+            raise ArgumentError(f"m is {m}; give a positive number, the smallest diagonal entry of T.")
+        self.form, self.m = form, m
+        d0 = torch.zeros(nv, nv, dtype=torch.float64) if floor is None else positive_definite("the floor D₀", floor)
+        self.register_buffer("floor", d0)
+        self.register_buffer("scale", positive_scale("the scale R", scale, nv))
+        self._diagonal_index = np.arange(nv)
+        self._lower_index = np.tril_indices(nv, -1)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.diagonal = _FCNN(nv, widths, nv, gain)
+            self.lower = _FCNN(nv, widths, nv * (nv - 1) // 2, gain)
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return len(self.scale)
+
+    def factor(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """T at the scaled error x = Rz, lower triangular."""
+        xp = array_namespace(x)
+        diagonal = self.diagonal.output(x)
+        if self.form == "paper":
+            diagonal = xp.clip(diagonal, 0.0, math.inf) + self.m
+        t = xp.zeros((*x.shape, self.nv), dtype=x.dtype)
+        t[..., self._diagonal_index, self._diagonal_index] = diagonal
+        t[..., *self._lower_index] = self.lower.output(x)
+        return t
+
+    def matrix(self, z: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """D(z)."""
+        xp = array_namespace(z)
+        d0, r = (self.floor, self.scale) if is_torch_array(z) else (self.floor.numpy(), self.scale.numpy())
+        t = self.factor(r * z) * r
+        return d0 + xp.matrix_transpose(t) @ t
+
+    def force(self, z: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """D(z) z [N·m]."""
+        d0, r = (self.floor, self.scale) if is_torch_array(z) else (self.floor.numpy(), self.scale.numpy())
+        t = self.factor(r * z)
+        return matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
+
+
+class _FCNN(nn.Module):
+    """Tanh hidden layers, linear output, weights U(−gain, gain), biases zero (paper eq. (3))."""
+
+    def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, gain: float) -> None:
+        super().__init__()
+        sizes = (inputs, *widths, outputs)
+        self.depth = len(sizes) - 1
+        for i, (size, out) in enumerate(pairwise(sizes)):
+            weight = torch.empty(out, size, dtype=torch.float64).uniform_(-gain, gain)
+            self.register_parameter(f"w{i}", nn.Parameter(weight))
+            self.register_parameter(f"b{i}", nn.Parameter(torch.zeros(out, dtype=torch.float64)))
+
+    def output(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
+        xp = array_namespace(x)
+        numpy = not is_torch_array(x)
+        named = {k: p.detach().numpy() if numpy else p for k, p in self._parameters.items() if p is not None}
+        for i in range(self.depth):
+            x = x @ named[f"w{i}"].T + named[f"b{i}"]
+            x = xp.tanh(x) if i < self.depth - 1 else x
+        return x
