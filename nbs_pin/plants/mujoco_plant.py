@@ -163,10 +163,8 @@ def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: Join
                 element.remove(child)
     try:
         spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
-        for joint in spec.joints:
-            joint.limited = joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-            if joint_friction == "drop":
-                joint.damping, joint.frictionloss = np.zeros(3), 0.0
+        for joint in spec.joints if joint_friction == "drop" else ():
+            joint.damping, joint.frictionloss = np.zeros(3), 0.0
         spec.option.gravity = robot.gravity_vector
         spec.option.integrator = _INTEGRATORS[integrator]
         spec.option.disableflags = _ALWAYS_OFF | _CONSTRAINTS_OFF[joint_friction]
