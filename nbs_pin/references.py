@@ -45,12 +45,40 @@ class Sinusoid:
         for name, value in zip(names, fields, strict=True):
             object.__setattr__(self, name, value)
 
+    @classmethod
+    def for_robot(cls, robot: Robot, frequency: float = 1.0, amplitude: float = 0.5) -> "Sinusoid":
+        """A motion the arm can follow: neighbouring joints a quarter period apart, about a posture it can hold.
+
+        frequency [rad/s]. amplitude: at most this [rad], a quarter of the joint's range, and half its velocity limit.
+        Raises ArgumentError when a number is not positive.
+        """
+        positive("frequency", frequency, "rad/s")
+        positive("amplitude", amplitude, "rad")
+        span = np.minimum(robot.upper - robot.lower, 2.0 * np.pi)
+        reach = np.minimum.reduce([np.full(robot.nv, amplitude), 0.25 * span, 0.5 * robot.velocity_limit / frequency])
+        return cls(reach, frequency, 0.5 * np.pi * (np.arange(robot.nv) % 2), resting_posture(robot))
+
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
         A, w = self.amplitude, self.frequency
         angle = w * np.asarray(t, dtype=float)[..., None] + self.phase
         sine, cosine = np.sin(angle), np.cos(angle)
         return Reference(self.offset + A * sine, A * w * cosine, -A * w**2 * sine)
+
+
+def resting_posture(robot: Robot) -> np.ndarray:
+    """The middle of the joint ranges [rad], or the posture nearest to it that needs at most half the effort limits.
+
+    Among postures within a quarter of each range of the middle; where none is so light, the lightest.
+    """
+    lower, upper = np.clip(robot.lower, -np.pi, np.pi), np.clip(robot.upper, -np.pi, np.pi)
+    middle, data = 0.5 * (lower + upper), robot.model.createData()
+    inner = np.random.default_rng(0).uniform(-0.25, 0.25, (2000, robot.nv)) * (upper - lower)
+    postures = middle + inner[np.argsort(np.linalg.norm(inner, axis=-1))]
+    postures = np.concatenate([middle[None], postures])
+    effort = [np.abs(pin.computeGeneralizedGravity(robot.model, data, q)) / robot.effort_limit for q in postures]
+    load = np.max(effort, axis=-1)
+    return postures[np.argmax(load <= max(0.5, load.min()))]
 
 
 def paper_reference(n: int) -> Sinusoid:

@@ -30,6 +30,7 @@ def simulate(
     plant_step: float | None = None,
     effort_limit: Any = None,
     disturbance: Disturbance | None = None,
+    lookahead: float | None = None,
     progress: bool = False,
 ) -> Run:
     """The motion of `plant` under `controller` following `reference` for `duration` [s].
@@ -43,6 +44,9 @@ def simulate(
     Leading axes of q0 simulate many starts at once.
     effort_limit: largest |τ| [N·m], a number or one per joint; None takes the arm's (`plant.robot`), inf for none.
     disturbance: τ_d(t, q, v) [N·m], evaluated at every plant step and held over it (`disturbances.py`, any callable).
+    lookahead: how far [s] ahead the controller is evaluated, on the reference of that time and the state predicted with
+    the reference's acceleration. A held torque acts half a period late on average, so None takes half a period, which
+    removes that lag (the tracking error of a panda at 1 kHz falls tenfold); 0 is the plain sampled law.
     progress: show a progress bar when it takes longer than 2 s at a terminal.
 
     Raises ArgumentError for arguments that do not fit each other, and SimulationDiverged, naming the time, when the
@@ -55,25 +59,37 @@ def simulate(
     steps = whole(duration, period, "duration", "period")
     substeps = _substeps(period, plant_step)
     limit = _effort_limit(plant, effort_limit)
-    desired = _sampled(reference, period * np.arange(steps + 1.0), plant.nv)
+    lead = _lead(lookahead, period)
+    times = period * np.arange(steps + 1.0)
+    desired, target = (_sampled(reference, t, plant.nv) for t in (times, times + lead))
     run = _prepared(plant, desired, period, limit, *_start(desired, q0, v0))
-    run.info.update(controller=type(controller).__name__, plant=repr(plant), plant_step=period / substeps)
+    run.info.update(
+        controller=type(controller).__name__, plant=repr(plant), plant_step=period / substeps, lookahead=lead
+    )
     # Overflow needs no warning here: every torque and every state is checked, and reported with its time.
     with np.errstate(over="ignore", invalid="ignore"):
-        _run_loop(run, plant, controller, disturbance, substeps, progress)
+        _run_loop(run, plant, controller, target, lead, disturbance, substeps, progress)
     return run
 
 
 def _run_loop(
-    run: Run, plant: Plant, controller: Controller, disturbance: Disturbance | None, substeps: int, progress: bool
+    run: Run,
+    plant: Plant,
+    controller: Controller,
+    target: Reference,
+    lead: float,
+    disturbance: Disturbance | None,
+    substeps: int,
+    progress: bool,
 ) -> None:
-    """Fill the rows of the run from its first state on."""
+    """Fill the rows of the run from its first state on; `target` is the reference `lead` [s] after each instant."""
     limit = run.effort_limit
     memory = controller.initial_memory(run.q[0])
     for k in tracked(range(len(run.t)), "simulating", progress):
         t, q, v = float(run.t[k]), run.q[k], run.v[k]
-        desired = Reference(run.q_ref[k], run.v_ref[k], run.a_ref[k])
-        command, memory = controller.step(memory, q, v, desired, run.period)
+        dv = lead * run.a_ref[k]
+        aim = Reference(target.q[k], target.v[k], target.a[k])
+        command, memory = controller.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, run.period)
         # Finite before clipped: a clip can turn a torque that is not a number into full effort.
         run.tau_command[k] = _checked(command, q.shape, controller, t)
         tau = run.tau[k] = np.maximum(np.minimum(run.tau_command[k], limit), -limit)
@@ -87,6 +103,13 @@ def _substeps(period: float, plant_step: float | None) -> int:
         return whole(period, plant_step, "period", "plant_step")
     positive("period", period, "s")
     return max(1, math.ceil(period / LONGEST_PLANT_STEP - 1e-9))
+
+
+def _lead(lookahead: float | None, period: float) -> float:
+    lead = 0.5 * period if lookahead is None else lookahead
+    if not 0.0 <= lead < math.inf:
+        raise ArgumentError(f"lookahead is {lookahead} s, expected a finite time ≥ 0; half a period is usual.")
+    return lead
 
 
 def _sampled(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
@@ -127,7 +150,7 @@ def _prepared(
     """The run with its times, reference and start in place, and room for the rest."""
     rows, n = desired.q.shape
     shape = (rows, *q0.shape)
-    q_ref, v_ref, a_ref = (np.broadcast_to(x.reshape(rows, *(1,) * (q0.ndim - 1), n), shape) for x in desired)
+    q_ref, v_ref, a_ref = (np.array(np.broadcast_to(x.reshape(rows, *(1,) * (q0.ndim - 1), n), shape)) for x in desired)
     robot = plant.robot
     run = Run(
         t=period * np.arange(float(rows)),

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nbs_pin.catalogue import ROBOT_NAMES
 from nbs_pin.exceptions import ArgumentError, FileFormatError
 from nbs_pin.npz import write_npz
 from nbs_pin.reference_files import Sampled, load_reference
@@ -230,3 +231,11 @@ def test_a_motion_beyond_the_arms_limits_is_refused_with_joint_and_time():
         check_reference(paper_reference(2), robot, 3.0)
     with pytest.raises(ArgumentError, match="duration"):
         check_reference(Hold(q), robot, -1.0)
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_the_motion_made_for_an_arm_is_one_it_can_follow(name):
+    robot = load_robot(name)
+    reference = Sinusoid.for_robot(robot)
+    check_reference(reference, robot, 7.0)
+    assert (reference.amplitude > 0.0).all()

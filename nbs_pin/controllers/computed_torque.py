@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, constant_like
 from nbs_pin.controllers.controller import MemorylessController
-from nbs_pin.controllers.gains import check_sampling, positive_gains
+from nbs_pin.controllers.gains import PerJoint, check_sampling, positive_gains
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -24,8 +24,8 @@ class ComputedTorque(MemorylessController):
         self,
         dynamics: DynamicsProvider,
         *,
-        kp: Float[np.ndarray, " n"],
-        kd: Float[np.ndarray, " n"],
+        kp: PerJoint,
+        kd: PerJoint,
         friction: JointFriction | None = None,
     ) -> None:
         self.dynamics, self.friction = dynamics, friction

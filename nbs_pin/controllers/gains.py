@@ -1,7 +1,7 @@
 """Gains for an arm that nobody tuned, from its inertia and its effort limits."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -9,6 +9,9 @@ from jaxtyping import Float
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
+
+PerJoint: TypeAlias = float | Float[np.ndarray, " n"]
+"""One number for all joints, or one per joint (n,)."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +94,10 @@ def check_sampling(bandwidth: float, period: float) -> None:
         )
 
 
-def positive_gains(nv: int, **gains: Any) -> tuple[Float[np.ndarray, " n"], ...]:
+def positive_gains(nv: int, **gains: PerJoint) -> tuple[Float[np.ndarray, " n"], ...]:
     """The gains as float arrays (nv,), a number for all joints broadcast; raises ArgumentError unless positive."""
     arrays = {name: np.asarray(gain, dtype=float) for name, gain in gains.items()}
     for name, gain in arrays.items():
         if gain.shape not in ((), (nv,)) or not (gain > 0.0).all():
             raise ArgumentError(f"{name} is {gain.tolist()}; give one positive number, or {nv}, one per joint.")
-    return tuple(np.broadcast_to(gain, (nv,)) for gain in arrays.values())
+    return tuple(np.full(nv, gain) for gain in arrays.values())

@@ -108,7 +108,7 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         root = np.sqrt(chosen.stiffness)
         phi = Potential(np.diag(0.5 * chosen.stiffness), form=potential, scale=root, seed=seed)
         if damping == "paper":
-            d = Damping(robot.nv, form="paper", scale=np.sqrt(chosen.damping), seed=seed + 1)
+            d = Damping(robot.nv, form="paper", m=1.0, scale=np.sqrt(chosen.damping), seed=seed + 1)
         else:
             d = Damping(robot.nv, floor=np.diag(chosen.damping), scale=np.sqrt(chosen.damping), seed=seed + 1)
         omega = chosen.bandwidth if damping == "inertial" else 0.0

@@ -1,11 +1,10 @@
 """Proportional-derivative control with a model: gravity compensation, or the full PD+ feedforward."""
 
-import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, constant_like
 from nbs_pin.controllers.controller import MemorylessController
-from nbs_pin.controllers.gains import pd_gains, positive_gains
+from nbs_pin.controllers.gains import PerJoint, pd_gains, positive_gains
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -29,8 +28,8 @@ class PD(MemorylessController):
         dynamics: DynamicsProvider,
         *,
         feedforward: str,
-        kp: Float[np.ndarray, " n"],
-        kd: Float[np.ndarray, " n"],
+        kp: PerJoint,
+        kd: PerJoint,
         friction: JointFriction | None = None,
     ) -> None:
         if feedforward not in FEEDFORWARDS:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from nbs_pin.arrays import Array
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.gains import pd_gains, positive_gains
+from nbs_pin.controllers.gains import PerJoint, pd_gains, positive_gains
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot, configuration_difference
@@ -36,9 +36,9 @@ class PID(Controller):
         self,
         *,
         kp: Float[np.ndarray, " n"],
-        ki: Float[np.ndarray, " n"],
-        kd: Float[np.ndarray, " n"],
-        effort_limit: Float[np.ndarray, " n"],
+        ki: PerJoint,
+        kd: PerJoint,
+        effort_limit: PerJoint,
         filter_time: float = 0.0,
         continuous: np.ndarray | None = None,
     ) -> None:

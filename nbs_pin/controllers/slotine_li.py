@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, constant_like
 from nbs_pin.controllers.controller import MemorylessController
-from nbs_pin.controllers.gains import effective_inertia, gains_for_robot, positive_gains
+from nbs_pin.controllers.gains import PerJoint, effective_inertia, gains_for_robot, positive_gains
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -24,8 +24,8 @@ class SlotineLi(MemorylessController):
         self,
         dynamics: DynamicsProvider,
         *,
-        rate: Float[np.ndarray, " n"],
-        gain: Float[np.ndarray, " n"],
+        rate: PerJoint,
+        gain: PerJoint,
         friction: JointFriction | None = None,
     ) -> None:
         self.dynamics, self.friction = dynamics, friction

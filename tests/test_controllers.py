@@ -1,0 +1,279 @@
+"""One contract for every tracking law, and the theorems of the neural one."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nbs_pin.arrays import matvec
+from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.controllers.gains import effective_inertia, gains_for_robot
+from nbs_pin.controllers.neural_backstepping import DAMPINGS, NeuralBackstepping, paper_controller
+from nbs_pin.controllers.pd import PD
+from nbs_pin.controllers.pid import PID
+from nbs_pin.controllers.slotine_li import SlotineLi
+from nbs_pin.dynamics.analytic import AnalyticDynamics
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.networks.damping import Damping
+from nbs_pin.networks.potential import POTENTIALS, Potential
+from nbs_pin.plants.dynamics_plant import DynamicsPlant
+from nbs_pin.references import Hold, Sinusoid
+from nbs_pin.robot import load_robot
+from nbs_pin.simulation import simulate
+from nbs_pin.state import Reference
+from tests.test_networks import randomise
+
+LAWS = {
+    "nbs": NeuralBackstepping.for_robot,
+    "slotine_li": SlotineLi.for_robot,
+    "computed_torque": ComputedTorque.for_robot,
+    "pd_plus": PD.for_robot,
+    "pd_gravity": lambda robot, **kw: PD.for_robot(robot, feedforward="gravity", **kw),
+    "pid": lambda robot, **kw: PID.for_robot(robot, **kw),
+}
+ARMS = ["two_link", "panda", "kinova"]
+
+
+@pytest.fixture(params=LAWS)
+def law(request):
+    return LAWS[request.param]
+
+
+@pytest.fixture(scope="module", params=ARMS)
+def robot(request):
+    return load_robot(request.param)
+
+
+def arguments(nv: int, batch: tuple[int, ...] = (5,), seed: int = 0) -> list[np.ndarray]:
+    """q, v, q_ref, v_ref, a_ref at random."""
+    return list(np.random.default_rng(seed).normal(size=(5, *batch, nv)))
+
+
+def call(controller, q, v, q_ref, v_ref, a_ref):
+    return controller.step(controller.initial_memory(q), q, v, Reference(q_ref, v_ref, a_ref), 0.001)[0]
+
+
+def test_batch_is_the_stack_of_its_rows(law, robot):
+    controller = law(robot)
+    states = arguments(robot.nv, (2, 3))
+    many = call(controller, *states)
+    rows = [call(controller, *(x.reshape(6, -1)[i] for x in states)) for i in range(6)]
+    assert many.shape == (2, 3, robot.nv)
+    np.testing.assert_allclose(many.reshape(6, -1), rows, rtol=1e-12, atol=1e-10)
+
+
+def test_whole_turns_of_a_continuous_joint_do_not_matter(law):
+    robot = load_robot("kinova")
+    controller = law(robot)
+    q, v, q_ref, v_ref, a_ref = arguments(robot.nv)
+    turned = q_ref + 2.0 * np.pi * robot.continuous * np.arange(-2, 3)[:, None]
+    tau = call(controller, q, v, q_ref, v_ref, a_ref)
+    np.testing.assert_allclose(call(controller, q, v, turned, v_ref, a_ref), tau, rtol=1e-9, atol=1e-9)
+
+
+def test_defaults_follow_a_moving_reference(law, robot):
+    """Out of the box: from the reference's start, every law stays near it in the truth its model believes."""
+    offset = np.pi if robot.name == "kinova" else -0.5
+    reference = Sinusoid(amplitude=np.full(robot.nv, 0.2), frequency=1.0, offset=offset)
+    run = simulate(DynamicsPlant(PinocchioDynamics(robot)), law(robot), reference, 0.5, 0.001)
+    error = np.abs(robot.difference(run.q, run.q_ref)).max()
+    modelled = law not in (LAWS["pid"], LAWS["pd_gravity"])
+    assert error < (0.01 if modelled else 0.35)
+
+
+def test_laws_with_a_model_give_the_inverse_dynamics_on_the_reference(law, robot):
+    """With no error the torque is exactly what the reference needs (gravity alone for PD + gravity)."""
+    if law is LAWS["pid"]:
+        pytest.skip("PID has no model")
+    controller = law(robot)
+    q, v, _, _, a = arguments(robot.nv)
+    dynamics = PinocchioDynamics(robot)
+    expected = dynamics.gravity(q) if law is LAWS["pd_gravity"] else dynamics.reference_torque(q, v, v, a)
+    np.testing.assert_allclose(call(controller, q, v, q, v, a), expected, rtol=1e-10, atol=1e-9)
+
+
+def test_controllers_pickle(law, robot):
+    controller = law(robot)
+    states = arguments(robot.nv)
+    np.testing.assert_array_equal(call(pickle.loads(pickle.dumps(controller)), *states), call(controller, *states))
+
+
+def test_torch_and_numpy_are_one_law(law, robot):
+    if law is LAWS["pid"]:
+        pytest.skip("PID is not trained")
+    controller = law(robot)
+    states = arguments(robot.nv)
+    tau = controller.torque(*states)
+    tensor = controller.torque(*(torch.as_tensor(x) for x in states))
+    assert isinstance(tensor, torch.Tensor)
+    np.testing.assert_allclose(tensor.detach().numpy(), tau, rtol=1e-12, atol=1e-12 * np.abs(tau).max())
+
+
+@pytest.mark.parametrize("damping", DAMPINGS)
+@pytest.mark.parametrize("potential", POTENTIALS)
+def test_torque_is_the_law_written_with_matrices(robot, potential, damping):
+    """The two-RNEA, no-Hessian form against docs/theory.md §2 written out term by term."""
+    controller = NeuralBackstepping.for_robot(robot, potential=potential, damping=damping, seed=2)
+    q, v, q_ref, v_ref, a_ref = arguments(robot.nv)
+    dynamics = PinocchioDynamics(robot)
+    rate = controller.rate.numpy()
+    z1, dz1 = robot.difference(q, q_ref), v - v_ref
+    gradient = controller.potential.terms(z1, dz1)[1]
+    columns = [controller.potential.terms(z1, np.broadcast_to(e, z1.shape))[2] for e in np.eye(robot.nv)]
+    hessian = np.stack(columns, axis=-1)
+    phi, dphi = v_ref - rate * gradient, a_ref - rate * matvec(hessian, dz1)
+    z2 = v - phi
+    mass = dynamics.mass_matrix(q)
+    matrix = controller.inertial_rate * mass + controller.damping.matrix(z2)
+    tau = matvec(mass, dphi) + matvec(dynamics.coriolis_matrix(q, v), phi) + dynamics.gravity(q)
+    tau = tau - gradient - matvec(matrix, z2)
+    np.testing.assert_allclose(
+        controller.torque(q, v, q_ref, v_ref, a_ref), tau, rtol=1e-11, atol=1e-11 * abs(tau).max()
+    )
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10_000),
+    damping=st.sampled_from(DAMPINGS),
+    potential=st.sampled_from(POTENTIALS),
+    name=st.sampled_from(["three_link", "panda"]),
+)
+def test_lyapunov_identity_along_simulated_motion(seed, damping, potential, name):
+    """V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ(ωM + D)z2 + z2ᵀτ_d for random weights, V̇ by differentiating V along the motion."""
+    robot = load_robot(name)
+    dynamics = PinocchioDynamics(robot)
+    controller = NeuralBackstepping.for_robot(robot, dynamics, damping=damping, potential=potential)
+    randomise(controller, seed)
+    rng = np.random.default_rng(seed)
+    reference = Sinusoid(amplitude=rng.uniform(0.1, 1.0, robot.nv), frequency=rng.uniform(0.5, 3.0), offset=0.0)
+    start = reference(0.0).q + rng.normal(size=robot.nv)
+    run = simulate(DynamicsPlant(dynamics), controller, reference, 0.002, 1e-4, q0=start, effort_limit=np.inf)
+    rows = slice(0, None, 4)
+    disturbance = rng.normal(size=run.q[rows].shape)
+    q, v, q_ref, v_ref, a_ref = (x[rows] for x in (run.q, run.v, run.q_ref, run.v_ref, run.a_ref))
+    tau = controller.torque(q, v, q_ref, v_ref, a_ref)
+    acceleration = dynamics.forward_dynamics(q, v, tau + disturbance)
+    tensors = [torch.as_tensor(x).requires_grad_() for x in (q, v, q_ref, v_ref)]
+    gradients = torch.autograd.grad(controller.storage(*tensors).sum(), tensors)
+    rates = (v, acceleration, v_ref, a_ref)
+    parts = [(g.numpy() * rate).sum(-1) for g, rate in zip(gradients, rates, strict=True)]
+    power = (controller.errors(q, v, q_ref, v_ref, a_ref).z2 * disturbance).sum(-1)
+    dissipation = controller.dissipation(q, v, q_ref, v_ref)
+    scale = np.abs(parts).max(axis=0) + dissipation
+    assert (np.abs(sum(parts) - (power - dissipation)) <= 1e-8 * scale).all()
+
+
+@pytest.mark.parametrize("damping", DAMPINGS)
+@pytest.mark.parametrize("potential", POTENTIALS)
+def test_storage_never_rises_for_any_weights(potential, damping):
+    """Theorem 1 in simulation: without disturbance V falls from starts far away, whatever the weights."""
+    robot = load_robot("two_link")
+    dynamics = PinocchioDynamics(robot)
+    controller = NeuralBackstepping.for_robot(robot, dynamics, potential=potential, damping=damping, bandwidth=3.0)
+    randomise(controller, seed=5, gain=0.5)
+    starts = np.random.default_rng(1).uniform(-2.0, 2.0, (20, 2))
+    hold = Hold(np.zeros(2))
+    run = simulate(DynamicsPlant(dynamics), controller, hold, 0.3, 5e-4, q0=starts, effort_limit=np.inf)
+    storage = controller.storage(run.q, run.v, run.q_ref, run.v_ref)[::20]
+    assert (storage[1:] < storage[:-1]).all()
+    assert (storage[-1] < 0.5 * storage[0]).all()
+
+
+def test_the_paper_torque_jumps_and_the_smooth_one_does_not():
+    """Crossing z1 = 0, where the paper's ∇²ψ is undefined, at speed (docs/theory.md §3)."""
+    dynamics = AnalyticDynamics()
+    smooth = NeuralBackstepping(dynamics, Potential(np.eye(2), seed=1), Damping(2, floor=np.eye(2)))
+    zero, fast = np.zeros(2), np.array([5.0, -5.0])
+
+    def jump(controller, distance: float) -> float:
+        z = np.array([distance, -distance])
+        after, before = (controller.torque(s * z, fast, zero, zero, zero) for s in (1.0, -1.0))
+        return float(np.abs(after - before).max())
+
+    paper = paper_controller(dynamics, seed=1)
+    assert jump(paper, 1e-9) > 0.1
+    assert jump(paper, 1e-9) == pytest.approx(jump(paper, 1e-11), rel=1e-3)  # a jump, not a steep slope
+    assert jump(smooth, 1e-9) < 1e-6
+
+
+def test_friction_fed_forward_at_the_reference_velocity_only_dissipates():
+    """Monotone friction f: −z2ᵀ(f(v) − f(v_r)) ≤ 0, so V falls at least as fast as without it."""
+    robot = load_robot("z1")
+    friction = JointFriction.of(robot)
+    with_it = NeuralBackstepping.for_robot(robot, friction=friction)
+    without = NeuralBackstepping.for_robot(robot)
+    states = arguments(robot.nv, (50,))
+    e = with_it.errors(*states)
+    fed = with_it.torque(*states) - without.torque(*states)
+    np.testing.assert_allclose(fed, friction.torque(e.v_r), rtol=1e-9, atol=1e-9)
+    assert (e.z2 * (fed - friction.torque(states[1]))).sum(-1).max() <= 0.0
+
+
+def test_gains_scale_with_the_inertia_and_respect_the_effort():
+    robot = load_robot("panda")
+    dynamics = PinocchioDynamics(robot)
+    gains = gains_for_robot(robot, dynamics, bandwidth=8.0, period=0.001)
+    inertia = effective_inertia(robot, dynamics)
+    assert (gains.stiffness * 0.3 <= robot.effort_limit + 1e-9).all()
+    assert (gains.stiffness <= 1e4 * inertia + 1e-9).all()
+    np.testing.assert_allclose(gains.rate * gains.stiffness, 8.0)
+    np.testing.assert_allclose(gains.damping, 1.4 * np.sqrt(gains.stiffness * inertia))
+    mass = dynamics.mass_matrix(np.random.default_rng(5).uniform(robot.lower, robot.upper, (500, 7)))
+    assert (inertia <= 1.05 / np.diagonal(np.linalg.inv(mass), axis1=-2, axis2=-1)).all()
+
+
+def test_pid_integral_rests_while_saturated():
+    pid = PID(kp=np.ones(1), ki=np.ones(1), kd=np.ones(1), effort_limit=np.array([0.5]))
+    away = Reference(np.zeros(1), np.zeros(1), np.zeros(1))
+    memory = pid.initial_memory(np.ones(1))
+    for _ in range(100):
+        _, memory = pid.step(memory, np.ones(1), np.zeros(1), away, 0.01)
+    assert memory.integral[0] == 0.0
+    _, free = pid.step(pid.initial_memory(np.ones(1)), np.full(1, 0.1), np.zeros(1), away, 0.01)
+    assert free.integral[0] == pytest.approx(0.001)
+
+
+def test_pid_removes_the_offset_of_an_unknown_load():
+    robot = load_robot("two_link")
+    hold = Hold(np.array([0.3, 0.4]))
+    run = simulate(DynamicsPlant(PinocchioDynamics(robot)), PID.for_robot(robot, period=0.004), hold, 5.0, 0.004)
+    assert np.abs(run.q[-1] - run.q_ref[-1]).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda r, d: NeuralBackstepping.for_robot(r, bandwidth=-1.0), "must be positive and finite"),
+        (lambda r, d: NeuralBackstepping.for_robot(r, bandwidth=900.0), "at most 500 rad/s"),
+        (lambda r, d: NeuralBackstepping.for_robot(r, damping="none"), "choose one of inertial, bounded, paper"),
+        (lambda r, d: NeuralBackstepping.for_robot(r, potential="none"), "choose one of paper, smooth"),
+        (lambda r, d: NeuralBackstepping(d, Potential(np.eye(3)), Damping(2, floor=np.eye(2))), "2, 3 and 2 joints"),
+        (
+            lambda r, d: NeuralBackstepping(d, Potential(np.eye(2)), Damping(2, form="paper"), rate=np.zeros(2)),
+            "rate Λ is",
+        ),
+        (
+            lambda r, d: NeuralBackstepping(d, Potential(np.eye(2)), Damping(2, form="paper"), inertial_rate=-1.0),
+            "inertial rate ω is -1.0",
+        ),
+        (lambda r, d: PD(d, feedforward="all", kp=1.0, kd=1.0), "choose one of gravity, reference"),
+        (lambda r, d: PD(d, feedforward="gravity", kp=np.array([1.0, -1.0]), kd=1.0), "kp is"),
+        (lambda r, d: SlotineLi(d, rate=np.ones(3), gain=1.0), "rate is"),
+        (lambda r, d: ComputedTorque(d, kp=np.nan, kd=1.0), "kp is nan"),
+        (
+            lambda r, d: PID(kp=np.ones(2), ki=1.0, kd=1.0, effort_limit=1.0, filter_time=-1.0),
+            "filter_time is -1.0 s",
+        ),
+        (lambda r, d: paper_controller(d).torque(*[np.zeros(3)] * 5), r"q has shape \(3,\), expected \(\.\.\., 2\)"),
+    ],
+)
+def test_impossible_controllers_are_refused(make, words):
+    robot = load_robot("two_link")
+    with pytest.raises(ArgumentError, match=words):
+        make(robot, PinocchioDynamics(robot))
