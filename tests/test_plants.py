@@ -183,9 +183,20 @@ def test_kept_damping_is_the_urdfs():
     kept = MujocoPlant(robot, joint_friction="keep").acceleration(zero, v, zero)
     np.testing.assert_allclose(kept, MujocoPlant(robot).acceleration(zero, v, -friction.torque(v)), rtol=1e-12)
     plant = DynamicsPlant(PinocchioDynamics(robot), friction=friction)
-    np.testing.assert_allclose(
-        plant.step(zero, v, zero, 1e-3), MujocoPlant(robot, joint_friction="keep").step(zero, v, zero, 1e-3), atol=1e-12
-    )
+    same = MujocoPlant(robot, "rk4", joint_friction="keep")
+    np.testing.assert_allclose(plant.step(zero, v, zero, 1e-3), same.step(zero, v, zero, 1e-3), atol=1e-12)
+
+
+def test_kept_dry_friction_is_coulomb_friction_on_light_and_heavy_joints():
+    """A sliding joint feels its whole Coulomb torque, whatever the inertia behind it."""
+    robot = load_robot("z1")
+    q, v = middle(robot), np.full(robot.nv, 0.5)
+    friction = JointFriction.of(robot)
+    push = PinocchioDynamics(robot).reference_torque(q, v, v, 0.0 * v) + friction.torque(v)
+    accelerations = MujocoPlant(robot, joint_friction="keep").acceleration(q, v, push)
+    free = MujocoPlant(robot).acceleration(q, v, push - friction.torque(v))
+    assert np.abs(free).max() < 1e-10
+    assert np.abs(accelerations).max() < 1e-3 * np.abs(MujocoPlant(robot).acceleration(q, v, push)).max()
 
 
 def test_kept_dry_friction_holds_an_arm_that_otherwise_falls():

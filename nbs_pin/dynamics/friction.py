@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, array_namespace, is_torch_array
+from nbs_pin.arrays import Array, array_namespace, constant_like
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
 
@@ -22,7 +22,7 @@ class JointFriction:
     """Viscous coefficient per joint [N·m·s/rad]."""
     coulomb: Float[np.ndarray, " n"]
     """Coulomb torque per joint [N·m]."""
-    transition: float = 0.05
+    transition: float = 0.01
     """Speed at which 76 % of the Coulomb torque is reached [rad/s]."""
 
     def __post_init__(self) -> None:
@@ -36,17 +36,14 @@ class JointFriction:
                 f"viscous has {self.viscous.size} joints and coulomb {self.coulomb.size}; give one number per joint."
             )
         if not 0.0 < self.transition < np.inf:
-            raise ArgumentError(f"transition is {self.transition} rad/s, expected a finite speed > 0; 0.05 is usual.")
+            raise ArgumentError(f"transition is {self.transition} rad/s, expected a finite speed > 0; 0.01 is usual.")
 
     @classmethod
-    def of(cls, robot: Robot, transition: float = 0.05) -> "JointFriction":
+    def of(cls, robot: Robot, transition: float = 0.01) -> "JointFriction":
         """The friction that the arm's URDF states (`<dynamics damping friction>`); zero where it states none."""
         return cls(robot.damping, robot.friction, transition)
 
     def torque(self, v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
         """Torque [N·m] that friction takes at the velocity v [rad/s]; numpy in numpy out, torch in torch out."""
-        if not is_torch_array(v):
-            return self.viscous * v + self.coulomb * np.tanh(v / self.transition)
-        xp = array_namespace(v)
-        viscous, coulomb = (xp.asarray(x, dtype=v.dtype, device=v.device) for x in (self.viscous, self.coulomb))
-        return viscous * v + coulomb * xp.tanh(v / self.transition)
+        viscous, coulomb = constant_like(v, self.viscous), constant_like(v, self.coulomb)
+        return viscous * v + coulomb * array_namespace(v).tanh(v / self.transition)

@@ -1,6 +1,5 @@
 """MuJoCo as a plant, built from the same URDF bytes as the Pinocchio model (the only room that imports mujoco)."""
 
-import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from typing import Any, Literal, TypeAlias
 
@@ -27,14 +26,19 @@ _CONSTRAINTS_OFF = {
     "drop": _OFF.mjDSBL_CONSTRAINT,
     "keep": _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_CONTACT | _OFF.mjDSBL_EQUALITY,  # dry friction is a constraint
 }
+# MuJoCo's default lets a tenth of the free acceleration through dry friction, so that a light joint never really
+# sticks nor slides; its hardest setting is Coulomb friction to 1e-4 of the torque.
+_DRY_FRICTION_SOLREF = (0.002, 1.0)
+_DRY_FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 
 class MujocoPlant(Plant):
     """The arm in MuJoCo: same inertias, joint axes and gravity; no contacts, position limits or effort clamps.
 
-    integrator: "rk4" (fourth order), "euler" (semi-implicit) or "implicitfast".
+    integrator: "rk4" (fourth order), "euler" (semi-implicit) or "implicitfast" (semi-implicit, damping implicit); None
+    takes "rk4" without friction and "implicitfast" with it, since joint damping can be too stiff for explicit steps.
     joint_friction: "drop" leaves out the URDF's damping and dry friction, as Pinocchio does; "keep" has MuJoCo apply
-    both, the dry friction as its soft constraint.
+    both, the dry friction as its hardest constraint.
     Effort limits belong to `simulate`. Each plant owns one scratch `mujoco.MjData`: use one plant per thread.
     Raises ArgumentError for an unknown choice and RobotError for an arm that MuJoCo cannot build.
     """
@@ -42,9 +46,10 @@ class MujocoPlant(Plant):
     def __init__(
         self,
         robot: Robot,
-        integrator: MujocoIntegrator = "rk4",
+        integrator: MujocoIntegrator | None = None,
         joint_friction: JointFrictionChoice = "drop",
     ) -> None:
+        integrator = integrator or ("implicitfast" if joint_friction == "keep" else "rk4")
         if integrator not in _INTEGRATORS:
             raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(_INTEGRATORS)}.")
         if joint_friction not in _CONSTRAINTS_OFF:
@@ -152,19 +157,16 @@ class MujocoPlant(Plant):
 
 
 def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: JointFrictionChoice) -> mujoco.MjModel:
-    """MuJoCo's model of the arm, from `robot.urdf.xml` without its shapes; raises RobotError when it cannot be built.
+    """MuJoCo's model of the arm, from its URDF without shapes; raises RobotError when it cannot be built.
 
     It goes through `MjSpec` and never through MuJoCo's own XML, which prints six digits.
     """
-    root = ET.fromstring(robot.urdf.xml)
-    for parent, tags in (("link", ("visual", "collision")), (None, ("mujoco",))):
-        for element in [root] if parent is None else root.iter(parent):
-            for child in [child for tag in tags for child in element.findall(tag)]:
-                element.remove(child)
     try:
-        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
-        for joint in spec.joints if joint_friction == "drop" else ():
-            joint.damping, joint.frictionloss = np.zeros(3), 0.0
+        spec = mujoco.MjSpec.from_string(robot.urdf.without_geometry().decode())
+        for joint in spec.joints:
+            if joint_friction == "drop":
+                joint.damping, joint.frictionloss = np.zeros(3), 0.0
+            joint.solref_friction, joint.solimp_friction = _DRY_FRICTION_SOLREF, _DRY_FRICTION_SOLIMP
         spec.option.gravity = robot.gravity_vector
         spec.option.integrator = _INTEGRATORS[integrator]
         spec.option.disableflags = _ALWAYS_OFF | _CONSTRAINTS_OFF[joint_friction]
