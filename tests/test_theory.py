@@ -102,7 +102,7 @@ def test_theorems_2_and_3_are_false_and_the_true_bound_holds():
 
 @pytest.mark.parametrize("potential", POTENTIALS)
 def test_the_inertial_bound_holds_for_any_weights(potential):
-    """limsup z1ᵀS z1 ≤ V∞ = Δ/(8ω), and each |z1_i| ≤ √(2V∞/K_i), under square waves of 1 to 30 rad/s on every joint."""
+    """limsup z1ᵀS z1 ≤ V∞ = Δ/(8ω), and each |z1_i| ≤ √(2V∞/K_i), under square waves of 1 to 30 rad/s."""
     robot = load_robot("three_link")
     dynamics = PinocchioDynamics(robot)
     omega, h = 4.0, 0.004
