@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from nbs_pin.checks import positive, whole
+from nbs_pin.checks import all_finite, positive, whole
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.disturbances import Disturbance
 from nbs_pin.exceptions import ArgumentError, SimulationDiverged
@@ -83,18 +83,20 @@ def _run_loop(
     progress: bool,
 ) -> None:
     """Fill the rows of the run from its first state on; `target` is the reference `lead` [s] after each instant."""
-    limit = run.effort_limit
-    memory = controller.initial_memory(run.q[0])
-    for k in tracked(range(len(run.t)), "simulating", progress):
-        t, q, v = float(run.t[k]), run.q[k], run.v[k]
+    law = controller.compile()
+    memory = law.initial_memory(run.q[0])
+    upper, lower, last = run.effort_limit, -run.effort_limit, len(run.t) - 1
+    for k in tracked(range(last + 1), "simulating", progress):
+        t, q, v, tau = float(run.t[k]), run.q[k], run.v[k], run.tau[k]
         dv = lead * run.a_ref[k]
         aim = Reference(target.q[k], target.v[k], target.a[k])
-        command, memory = controller.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, run.period)
+        command, memory = law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, run.period)
         # Finite before clipped: a clip can turn a torque that is not a number into full effort.
-        run.tau_command[k] = _checked(command, q.shape, controller, t)
-        tau = run.tau[k] = np.maximum(np.minimum(run.tau_command[k], limit), -limit)
-        run.disturbance[k] = _disturbance(disturbance, t, q, v)
-        if k + 1 < len(run.t):
+        run.tau_command[k] = command = _checked(command, q.shape, controller, t)
+        np.maximum(np.minimum(command, upper, out=tau), lower, out=tau)
+        if disturbance is not None:
+            run.disturbance[k] = _disturbance(disturbance, t, q, v)
+        if k < last:
             run.q[k + 1], run.v[k + 1] = _advance(plant, q, v, tau, disturbance, t, run.period, substeps)
 
 
@@ -191,7 +193,7 @@ def _checked(command: Any, shape: tuple[int, ...], controller: Controller, t: fl
             f"{type(controller).__name__} gave a torque of shape {command.shape} at t = {t:g} s, expected {shape}; "
             "a controller returns one torque per joint for every start."
         )
-    if not np.isfinite(command).all():
+    if not all_finite(command):
         raise SimulationDiverged(
             f"{type(controller).__name__} asked for the torque {command} at t = {t:g} s, expected finite numbers; "
             "look for a division by zero or an unstable gain."
@@ -199,15 +201,13 @@ def _checked(command: Any, shape: tuple[int, ...], controller: Controller, t: fl
     return command
 
 
-def _disturbance(disturbance: Disturbance | None, t: float, q: np.ndarray, v: np.ndarray) -> Any:
-    if disturbance is None:
-        return 0.0
+def _disturbance(disturbance: Disturbance, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     torque = np.asarray(disturbance(t, q, v), dtype=float)
     if torque.shape not in (q.shape, q.shape[-1:]):
         raise ArgumentError(
             f"the disturbance at t = {t:g} s has shape {torque.shape}, expected {q.shape}; return one torque per joint."
         )
-    if not np.isfinite(torque).all():
+    if not all_finite(torque):
         raise SimulationDiverged(f"the disturbance at t = {t:g} s is {torque}, expected finite torques; correct it.")
     return torque
 

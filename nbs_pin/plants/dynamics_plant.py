@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.checks import all_finite
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError, SimulationDiverged
@@ -64,7 +65,7 @@ class DynamicsPlant(Plant):
 
         with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below, with its cause
             q, v = self._step(acceleration, q, v, duration)
-        if not (np.isfinite(q).all() and np.isfinite(v).all()):
+        if not (all_finite(q) and all_finite(v)):
             raise SimulationDiverged(
                 f"{self!r} left the finite numbers in a step of {duration:g} s; "
                 "take a shorter plant step, or look for an unstable controller."

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.checks import all_finite
 from nbs_pin.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.plants.plant import Plant
 from nbs_pin.robot import Robot
@@ -59,9 +60,12 @@ class MujocoPlant(Plant):
         self.joint_friction = joint_friction
         self.model = build_model(robot, integrator, joint_friction)
         self._data = mujoco.MjData(self.model)
+        # Live arrays, fetched once: every access through the data would make them anew.
+        self._qpos, self._qvel, self._torque = self._data.qpos, self._data.qvel, self._data.qfrc_applied
+        self._warnings = self._data.warning.number
         ids = [self.model.joint(name).id for name in robot.joint_names]
-        self._at_q = self.model.jnt_qposadr[ids]
-        self._at_v = self.model.jnt_dofadr[ids]
+        self._at_q = _in_order(self.model.jnt_qposadr[ids])
+        self._at_v = _in_order(self.model.jnt_dofadr[ids])
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as the arguments it is rebuilt from: MuJoCo's scratch data is no part of its value."""
@@ -73,7 +77,7 @@ class MujocoPlant(Plant):
     @property
     def nv(self) -> int:
         """Number of joints."""
-        return len(self._at_v)
+        return self._robot.nv
 
     @property
     def robot(self) -> Robot:
@@ -92,7 +96,9 @@ class MujocoPlant(Plant):
         Raises SimulationDiverged when an input or the result is not finite or MuJoCo counts a warning.
         """
         self.model.opt.timestep = duration
-        result = _stack(self._step_row, q, v, tau)
+        if q.ndim == 1:
+            return self._step_row(q, v, tau)
+        result = _stack(lambda *row: np.array(self._step_row(*row)), q, v, tau)
         return result[..., 0, :], result[..., 1, :]
 
     def acceleration(
@@ -102,11 +108,11 @@ class MujocoPlant(Plant):
         tau: Float[np.ndarray, "*batch n"],
     ) -> Float[np.ndarray, "*batch n"]:
         """v̇ [rad/s²] that MuJoCo's forward dynamics gives the torque τ [N·m]."""
-        return _stack(lambda *row: self._forward(*row).qacc[self._at_v], q, v, tau)
+        return _stack(lambda *row: self._forward(*row).qacc[self._at_v].copy(), q, v, tau)
 
     def bias(self, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n"]:
         """C(q, v) v + G(q) [N·m], without joint friction."""
-        return _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v], q, v, np.zeros_like(v))
+        return _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v].copy(), q, v, np.zeros_like(v))
 
     def mass_matrix(self, q: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n n"]:
         """M(q) [kg·m²]."""
@@ -115,7 +121,7 @@ class MujocoPlant(Plant):
     def _mass_matrix_row(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
         full = np.zeros((self.model.nv, self.model.nv))
         mujoco.mj_fullM(self.model, self._forward(q, v, tau), full)
-        return full[np.ix_(self._at_v, self._at_v)]
+        return full[self._at_v][:, self._at_v]
 
     def _forward(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> mujoco.MjData:
         self._set(q, v, tau)
@@ -123,13 +129,12 @@ class MujocoPlant(Plant):
         self._check_warnings()
         return self._data
 
-    def _step_row(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    def _step_row(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         self._set(q, v, tau)
-        data = self._data
-        mujoco.mj_step(self.model, data)
+        mujoco.mj_step(self.model, self._data)
         self._check_warnings()
-        row = np.array((data.qpos[self._at_q], data.qvel[self._at_v]))
-        if not np.isfinite(row).all():
+        row = self._qpos[self._at_q].copy(), self._qvel[self._at_v].copy()
+        if not (all_finite(row[0]) and all_finite(row[1])):
             raise SimulationDiverged(
                 f"{self!r} left the finite numbers; take a shorter plant step, or look for an unstable controller."
             )
@@ -137,18 +142,17 @@ class MujocoPlant(Plant):
 
     def _set(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
         # MuJoCo reads a torque that is not a number as zero and goes on, so it must never see one.
-        if not np.isfinite((q, v, tau)).all():
+        if not (all_finite(q) and all_finite(v) and all_finite(tau)):
             raise SimulationDiverged(
                 f"{self!r} was given q = {q}, v = {v}, torque = {tau}, expected finite numbers; look for their source."
             )
-        self._data.qpos[self._at_q] = q
-        self._data.qvel[self._at_v] = v
-        self._data.qfrc_applied[self._at_v] = tau
+        self._qpos[self._at_q] = q
+        self._qvel[self._at_v] = v
+        self._torque[self._at_v] = tau
 
     def _check_warnings(self) -> None:
-        counts = self._data.warning.number
-        if counts.any():
-            kind = int(np.flatnonzero(counts)[0])
+        if np.count_nonzero(self._warnings):
+            kind = int(np.flatnonzero(self._warnings)[0])
             cause = mujoco.mju_warningText(kind, int(self._data.warning.lastinfo[kind]))
             mujoco.mj_resetData(self.model, self._data)
             raise SimulationDiverged(
@@ -175,6 +179,11 @@ def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: Join
         raise RobotError(
             f"{robot.source}: MuJoCo cannot build this arm ({error}); correct that link or joint."
         ) from error
+
+
+def _in_order(addresses: np.ndarray) -> np.ndarray | slice:
+    """The addresses, or for 0, 1, 2, … the whole slice, which needs no gathering."""
+    return slice(None) if np.array_equal(addresses, np.arange(addresses.size)) else addresses
 
 
 def _stack(function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
