@@ -29,6 +29,7 @@ from nbs_pin.networks.activations import Activation, SmoothedReLU, Squareplus
 from nbs_pin.networks.damping import Damping
 from nbs_pin.networks.potential import POTENTIALS, Potential
 from nbs_pin.robot import load_robot
+from nbs_pin.runtime import jit, laws
 from nbs_pin.runtime.convex import potential
 from nbs_pin.runtime.damping import damping_force, tanh
 from nbs_pin.runtime.laws import difference
@@ -362,6 +363,48 @@ def test_laws_without_a_compiled_form_are_their_own():
         phi.packed()
 
 
+class Doubled(NeuralBackstepping):
+    def torque(self, *given):
+        return 2.0 * super().torque(*given)
+
+
+class DoubledPD(PD):
+    def torque(self, *given):
+        return 2.0 * super().torque(*given)
+
+
+class Loaded(PinocchioDynamics):
+    def reference_torque(self, q, v, v_r, a_r):
+        return 1.0 + super().reference_torque(q, v, v_r, a_r)
+
+
+class Shifted(AnalyticDynamics):
+    def reference_torque(self, q, v, v_r, a_r):
+        return 1.0 + super().reference_torque(q, v, v_r, a_r)
+
+    def difference(self, q, q_ref):
+        return 1.0 + super().difference(q, q_ref)
+
+
+class Stiction(JointFriction):
+    def torque(self, v):
+        return 3.0 + super().torque(v)
+
+
+def test_what_a_subclass_overrides_is_not_lost():
+    robot = load_robot("two_link")
+    for controller in (
+        Doubled.for_robot(robot),
+        DoubledPD.for_robot(robot),
+        SlotineLi.for_robot(robot, Loaded(robot)),
+        NeuralBackstepping.for_robot(robot, Loaded(robot)),
+        SlotineLi.for_robot(robot, friction=Stiction(np.ones(2), np.ones(2))),
+        SlotineLi(Shifted(), rate=1.0, gain=1.0),
+        paper_controller(Shifted()),
+    ):
+        assert_one_law(controller, *states(2))
+
+
 @pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
 def test_pid_remembers_as_the_written_one_does(robot, batch):
     pid = PID.for_robot(robot)
@@ -424,3 +467,10 @@ def test_a_second_process_does_not_compile(tmp_path):
     """`compile_laws` ran in this process or an earlier one; a new process loads what it left."""
     NeuralBackstepping.for_robot(load_robot("two_link")).compile()
     assert misses(tmp_path, Path(__file__).parent.parent) == [0, 0, 0]
+
+
+def test_machine_code_is_stamped_with_the_whole_folder():
+    """numba looks at one file only; a change in a callee or a constant must renew its callers too."""
+    stamps = {laws.law_row._cache._cache_file._source_stamp, potential._cache._cache_file._source_stamp}
+    assert stamps == {jit._SOURCES}
+    assert len(jit._SOURCES) == 64

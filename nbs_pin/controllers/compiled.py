@@ -90,6 +90,11 @@ class CompiledController(MemorylessController):
         return (self._model(rows[0], rows[1], v_r, a_r) + feedback).reshape(shape)
 
 
+def is_packable(dynamics: DynamicsProvider, friction: JointFriction | None) -> bool:
+    """Whether error and friction are the ones the kernels know, and not those of a subclass."""
+    return type(dynamics).difference is DynamicsProvider.difference and type(friction) in (JointFriction, type(None))
+
+
 def _model_route(law: int, dynamics: DynamicsProvider) -> Any:
     """(q, v, v_r, a_r) -> M a_r + C v_r + G by the shortest way that this law allows."""
     if law == PD_GRAVITY:

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, constant_like
-from nbs_pin.controllers.compiled import CompiledController
-from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.controllers.compiled import CompiledController, is_packable
+from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.controllers.gains import PerJoint, check_sampling, positive_gains
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -62,6 +62,8 @@ class ComputedTorque(MemorylessController):
         tau = self.dynamics.reference_torque(q, v, v, a)
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
 
-    def compile(self) -> CompiledController:
+    def compile(self) -> Controller:
         """The law as machine code (`Controller.compile`)."""
+        if type(self) is not ComputedTorque or not is_packable(self.dynamics, self.friction):
+            return self
         return CompiledController.of(COMPUTED_TORQUE, self.dynamics, (self.kp, self.kd), self.friction)

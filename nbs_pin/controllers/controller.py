@@ -30,7 +30,8 @@ class Controller(ABC):
     def compile(self) -> "Controller":
         """The same law as machine code, for numpy: a snapshot that later changes of this controller do not reach.
 
-        It agrees with this form to 1e-12 of the torque. A law without a compiled form is its own.
+        It agrees with this form to 1e-12 of the torque. A law without a compiled form is its own: one from outside the
+        package, a subclass, whose torque may be another, or a network with an activation of the user's.
         """
         return self
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.arrays import Array, array_namespace, as_vectors, is_torch_array, matvec
-from nbs_pin.controllers.compiled import CompiledController
+from nbs_pin.controllers.compiled import CompiledController, is_packable
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.controllers.gains import Gains, gains_for_robot
 from nbs_pin.dynamics.friction import JointFriction
@@ -140,8 +140,9 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         return tau if self.friction is None else tau + self.friction.torque(e.v_r)
 
     def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
-        """The law as machine code (`Controller.compile`); itself when its activation has no compiled form."""
-        if self.potential.network.activation.kernel is None:
+        """The law as machine code (`Controller.compile`)."""
+        known = (type(self), type(self.potential), type(self.damping)) == (NeuralBackstepping, Potential, Damping)
+        if not (known and self.potential.network.activation.kernel and is_packable(self.dynamics, self.friction)):
             return self
         rate = self.rate.double().numpy()
         return CompiledController.of(

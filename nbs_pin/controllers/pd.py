@@ -3,8 +3,8 @@
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, constant_like
-from nbs_pin.controllers.compiled import CompiledController
-from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.controllers.compiled import CompiledController, is_packable
+from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.controllers.gains import PerJoint, pd_gains, positive_gains
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -71,7 +71,9 @@ class PD(MemorylessController):
             tau = tau + self.dynamics.reference_torque(q, v, v_ref, a_ref)
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
 
-    def compile(self) -> CompiledController:
+    def compile(self) -> Controller:
         """The law as machine code (`Controller.compile`)."""
+        if type(self) is not PD or not is_packable(self.dynamics, self.friction):
+            return self
         law = PD_GRAVITY if self.feedforward == "gravity" else PD_REFERENCE
         return CompiledController.of(law, self.dynamics, (self.kp, self.kd), self.friction)

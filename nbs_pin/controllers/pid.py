@@ -88,8 +88,10 @@ class PID(Controller):
         integral = memory.integral + np.where(winding, 0.0, self.ki * period * z1)
         return tau, PIDMemory(integral, derivative)
 
-    def compile(self) -> "CompiledPID":
+    def compile(self) -> Controller:
         """The law as machine code (`Controller.compile`)."""
+        if type(self) is not PID:
+            return self
         continuous = np.zeros(self.nv) if self.continuous is None else self.continuous
         filter_time = np.full(self.nv, self.filter_time)
         return CompiledPID(np.array([self.kp, self.ki, self.kd, self.effort_limit, filter_time, continuous]))

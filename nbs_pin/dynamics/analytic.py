@@ -68,7 +68,9 @@ class AnalyticDynamics(DynamicsProvider):
         return xp.stack([self._weights[0] * xp.cos(q[..., 0]) + elbow, elbow], axis=-1)
 
     def compiled_reference_torque(self) -> ReferenceTorque:
-        """The equations above as machine code."""
+        """The equations above as machine code; a subclass's own `reference_torque`."""
+        if type(self) is not AnalyticDynamics:
+            return self.reference_torque
         from nbs_pin.runtime.models import two_link_torques
 
         constants = np.array([self._shoulder, self._forearm, self._coupling, *self._weights])

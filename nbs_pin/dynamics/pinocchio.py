@@ -88,8 +88,8 @@ class PinocchioDynamics(DynamicsProvider):
         return _evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q, v, tau)
 
     def compiled_reference_torque(self) -> ReferenceTorque:
-        """The two RNEA on scratch space of its own; one where v_r is v itself."""
-        return _TwoRnea(self._model, self._weightless)
+        """The two RNEA on scratch space of its own, one where v_r is v itself; a subclass's own `reference_torque`."""
+        return _TwoRnea(self._model, self._weightless) if type(self) is PinocchioDynamics else self.reference_torque
 
     # One state at a time: values.
 

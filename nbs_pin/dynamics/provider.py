@@ -48,7 +48,7 @@ class DynamicsProvider(ABC):
         """V(q) [J], up to a constant."""
 
     def difference(self, q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-        """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on the continuous joints of `robot`; no provider overrides it."""
+        """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on the continuous joints of `robot`."""
         return configuration_difference(q, q_ref, None if self.robot is None else self.robot.continuous)
 
     def reference_torque(
