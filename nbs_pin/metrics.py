@@ -28,11 +28,11 @@ def error(run: Run) -> Float[np.ndarray, "rows *batch n"]:
 def squared_error(run: Run, shift: int = 0) -> Float[np.ndarray, "rows *batch"]:
     """‖z1‖² at every control instant [rad²].
 
-    shift: hold q of row k + shift against q_ref of row k. 0 is the tracking error; 1 is the paper's own score, which
-    sets q(t + h) against q_d(t) and so counts the reference's own motion in h as error (docs/theory.md §8).
+    shift: hold q of row k + shift against q_ref of row k. 0 is the tracking error; 1 is the score of the authors'
+    program: q(t + h) against q_d(t), which counts the reference's own motion in h as error (docs/theory.md §8).
     """
     if not 0 <= shift < len(run.t):
-        raise ArgumentError(f"shift is {shift}, expected 0 (aligned) or 1 (the paper's index) for {len(run.t)} rows.")
+        raise ArgumentError(f"shift is {shift}, expected 0 (aligned) or 1 (the authors' index) for {len(run.t)} rows.")
     z1 = configuration_difference(run.q[shift:], run.q_ref[: len(run.t) - shift], run.continuous)
     return np.sum(z1 * z1, axis=-1)
 

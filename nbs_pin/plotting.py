@@ -116,7 +116,7 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
         axes.set_xlim(run.t[0], run.t[-1] if run.t[-1] > run.t[0] else run.t[0] + 1.0)
-    named = [str(run.info[key]) for key in ("controller", "plant") if run.info.get(key)]
+    named = [str(run.info[key]).partition("(")[0] for key in ("controller", "plant") if run.info.get(key)]
     title = " · ".join([_short(run.robot.rsplit("/", 1)[-1]) or f"{run.nv} joints", *map(_short, named)])
     figure.suptitle(title, x=0.008, ha="left", fontsize=12, fontweight="bold", color="#1d2733")
     handles = [

@@ -16,7 +16,7 @@ PerJoint: TypeAlias = float | Float[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class Gains:
-    """K, Λ and D₀ of the potential Φ = ½zᵀKz + ψ(z) and the damping D = ωM + D₀ + TᵀT, with ΛK = ωI."""
+    """K, Λ and D₀ of the potential Φ = ½zᵀKz + ψ(z) and the total damping ωM + D₀ + TᵀT, with ΛK = ωI."""
 
     bandwidth: float
     """ω [rad/s]."""
@@ -59,7 +59,7 @@ def pd_gains(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """K_p [N·m/rad], that of `gains_for_robot`, and K_d [N·m·s/rad], critical for the largest inertia each joint moves.
 
-    K_d stays below ½M_e/h, where a sampled derivative begins to chatter (docs/theory.md §5).
+    K_d stays at or below ½M_e/h, a quarter of what makes a sampled damper on that inertia alone chatter (2M_e/h).
     Raises ArgumentError when ω or h is out of range.
     """
     kp = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period).stiffness
