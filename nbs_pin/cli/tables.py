@@ -39,7 +39,7 @@ def _lines(figures: dict[str, Any], wall_time: float) -> list[str]:
     outside = zip(figures["joints"], figures["outside_position_range_rad"], strict=True)
     return [
         f"converged (‖error‖ < 0.1 rad to the end): {converged(figures)}",
-        f"torque at its limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
+        f"some joint at its effort limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
         *(f"{joint} went {excess:.3g} rad beyond its range, which the plant lets it" for joint, excess in outside
           if excess > 0.0),
         f"simulated {figures['duration_s']:g} s in {wall_time:.1f} s",
