@@ -33,7 +33,7 @@ def main(starts: int = 40, duration: float = 2.0, seed: int = 0) -> nbs.Run:
     storage = controller.storage(run.q, run.v, run.q_ref, run.v_ref)
     rise = np.diff(storage, axis=0).max() / storage[0].max()
     print(
-        f"{starts} starts, all within 0.1 rad after {times.max():.2f} s; largest rise of V in a step: {rise:.1e} of V(0)"
+        f"{starts} starts, all within 0.1 rad after {times.max():.2f} s; V rises by at most {rise:.0e} V(0) in a step"
     )
     return run
 

@@ -23,7 +23,7 @@ def main(out: Path = Path("out/demo"), duration: float = 8.0) -> dict[str, dict]
     """Tracks the arms in MuJoCo at 1 kHz; returns the figures of each by name."""
     console = Console(highlight=False)
     table = Table("arm", box=box.SIMPLE_HEAD)
-    for heading in ("joints", "near after\n[s]", "steady error\n[rad]", "at its limits\n[s]", "computed in\n[s]"):
+    for heading in ("joints", "near after\n[s]", "steady error\n[rad]", "saturated\n[s]", "computed in\n[s]"):
         table.add_column(Text(heading), justify="right", no_wrap=True)
     results = {}
     for name in ARMS:
@@ -41,9 +41,7 @@ def main(out: Path = Path("out/demo"), duration: float = 8.0) -> dict[str, dict]
             f"{wall_time:.1f}",
         )
     console.print(table)
-    console.print(
-        "near: ‖error‖ below 0.1 rad to the end; steady: RMS of the worst joint over the last 30 %", soft_wrap=True
-    )
+    console.print("near: ‖error‖ below 0.1 rad to the end; steady: RMS, worst joint, last 30 %", soft_wrap=True)
     console.print(f"Open {out / ARMS[-1] / 'replay.html'} in a browser.", soft_wrap=True)
     return results
 
