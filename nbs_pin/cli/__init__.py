@@ -28,11 +28,19 @@ Command: TypeAlias = (
     | Annotated[Robots, tyro.conf.subcommand("robots")]
 )
 NAMES = ("track", "replay", "robots")
-BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
+BAD_INPUT, INTERRUPTED = 2, 130
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` shows the options of a command; "
     "`nbs-pin --version` the version. Exit codes: 0 done, 2 bad input, 130 interrupted."
 )
+
+
+class Output(Console):
+    """Standard output, whose reader may leave early."""
+
+    def on_broken_pipe(self) -> None:
+        """Let `main` end quietly; rich would end with exit code 1."""
+        raise BrokenPipeError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,35 +53,45 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? for them
     notes = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
     arguments = sys.argv[1:] if argv is None else list(argv)
-    try:
-        with _terminable(), _warnings_to(notes):
+    with _stops() as stops, _warnings_to(notes):
+        try:
             return _run(arguments, notes)
-    except NbsPinError as error:
+        except BaseException as error:
+            # A signal that meets the import of an extension comes out as its ImportError: ask the signal first.
+            if stops or isinstance(error, KeyboardInterrupt):
+                notes.print("nbs-pin: interrupted.")
+                return stops[0] if stops else INTERRUPTED
+            return _failed(error, notes)
+
+
+def _failed(error: BaseException, notes: Console) -> int:
+    """The exit code for an error that the user can mend, after one sentence; raises any other again."""
+    if isinstance(error, NbsPinError):
         notes.print(f"nbs-pin: error: {_one_line(str(error))}")
-    except KeyboardInterrupt:
-        notes.print("nbs-pin: interrupted; nothing was written.")
-        return INTERRUPTED
-    except BrokenPipeError:
+    elif isinstance(error, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # whoever read the output has seen enough
         return 0
-    except OSError as error:
+    elif isinstance(error, OSError):
         where = f"'{error.filename}': " if error.filename is not None else ""
-        notes.print(f"nbs-pin: error: {where}{(error.strerror or str(error)).lower()}; check the path and the disk.")
+        reason = (error.strerror or str(error)).lower()
+        notes.print(f"nbs-pin: error: {where}{reason}; check the path, its permissions and the space left.")
+    else:
+        raise error
     return BAD_INPUT
 
 
 def _run(arguments: list[str], notes: Console) -> int:
-    console = Console()
+    console = Output()
     if arguments == ["--version"]:
         console.print(f"nbs-pin {__version__}", highlight=False)
         return 0
-    command = _parsed(arguments)
+    command = parse(arguments)
     if command is not None:
         command.run(console, notes)
     return 0
 
 
-def _parsed(arguments: list[str]) -> Any:
+def parse(arguments: list[str]) -> Any:
     """The command with its options, None when help was asked for; raises OptionError for words that make no command."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in NAMES:
         raise OptionError(f"no command '{arguments[0]}'; {_near(arguments[0], NAMES)}give {', '.join(NAMES)}.")
@@ -117,25 +135,32 @@ def _one_line(text: str) -> str:
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends the program like an exception, so that drafts are removed; only the main thread may ask for it."""
+def _stops() -> Iterator[list[int]]:
+    """The exit codes of the signals that came: Ctrl-C and SIGTERM end the program like an exception, drafts removed.
+
+    Only the main thread may ask for signals; elsewhere the list stays empty.
+    """
+    stops: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield stops
         return
 
-    def stop(*_: Any) -> None:
-        raise SystemExit(TERMINATED)
+    def stop(number: int, _: Any) -> None:
+        stops.append(128 + number)
+        raise KeyboardInterrupt
 
-    previous = signal.signal(signal.SIGTERM, stop)
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield stops
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
 def _warnings_to(notes: Console) -> Iterator[None]:
-    """Warnings as one line each."""
+    """Warnings as one line each, without those that speak to the authors of a library."""
     with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
         warnings.showwarning = lambda message, *_, **__: notes.print(f"nbs-pin: warning: {_one_line(str(message))}")
         yield

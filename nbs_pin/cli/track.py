@@ -119,14 +119,15 @@ class Track:
 
 @contextlib.contextmanager
 def _folder(folder: Path) -> Iterator[None]:
-    """The folder, made before any long work so that a bad path is known at once; removed again if it stays empty."""
-    made = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
+    """The folder, made before any long work so that a bad path is known at once; unmade again if it stays empty."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        if made and not any(folder.iterdir()):
-            folder.rmdir()
+        for path in made:
+            if path.is_dir() and not any(path.iterdir()):
+                path.rmdir()
 
 
 def _check_folder(folder: Path, names: tuple[str, ...], same: dict[str, Any], force: bool) -> None:

@@ -35,7 +35,9 @@ from nbs_pin.state import Run
 from nbs_pin.studies.motions import check_motion
 
 PlantName: TypeAlias = Literal["mujoco", "pinocchio"]
+"""What `build_plant` knows."""
 ControllerName: TypeAlias = Literal["nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid"]
+"""What `build_controller` knows."""
 FILES = ("run.npz", "tracking.png", "replay.html", "summary.json")
 """What `write_results` writes, the summary last."""
 _ROWS_OF_ARRAYS = 8  # the arrays of a Run with a number per row and joint
@@ -51,8 +53,8 @@ class Tracked(NamedTuple):
 def track(
     robot: Robot,
     *,
-    plant: Plant | PlantName = "mujoco",
-    controller: Controller | ControllerName = "nbs",
+    plant: Plant | str = "mujoco",
+    controller: Controller | str = "nbs",
     reference: DesiredMotion | None = None,
     duration: float = 10.0,
     period: float = 0.001,
@@ -100,7 +102,7 @@ def track(
 
 
 def build_controller(
-    name: ControllerName,
+    name: str,
     robot: Robot,
     *,
     bandwidth: float = 8.0,
@@ -136,7 +138,7 @@ def build_controller(
     return make[name]()
 
 
-def build_plant(name: PlantName, robot: Robot, friction: JointFriction | None = None) -> Plant:
+def build_plant(name: str, robot: Robot, friction: JointFriction | None = None) -> Plant:
     """The arm in MuJoCo, or Pinocchio's dynamics integrated by RK4; with `friction` the joints have it.
 
     MuJoCo takes the friction of the URDF, whatever `friction` says beyond being there.
@@ -171,9 +173,10 @@ def versions() -> dict[str, str]:
 
 
 def write_results(run: Run, folder: str | Path, robot: Robot, summary: dict[str, Any]) -> Path:
-    """Writes `FILES` for the run into the folder: all of them, or on any failure none; returns the folder.
+    """Writes `FILES` for the run into the folder, all drawn before the first takes its place; returns the folder.
 
-    summary: what summary.json holds. Files of those names are replaced. Raises OSError when they cannot be written.
+    summary: what summary.json holds. Files of those names are replaced, and left alone when drawing or writing fails.
+    Raises OSError when they cannot be written.
     """
     from nbs_pin.plotting import plot_tracking
     from nbs_pin.replay_page import replay
