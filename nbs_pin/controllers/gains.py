@@ -63,9 +63,8 @@ def pd_gains(
     Raises ArgumentError when ω or h is out of range.
     """
     kp = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period).stiffness
-    q = sample_configurations(robot)
-    largest = np.diagonal(dynamics.mass_matrix(q), axis1=-2, axis2=-1).max(axis=0)
-    return kp, np.minimum(2.0 * np.sqrt(kp * largest), 0.5 * effective_inertia(robot, dynamics) / period)
+    critical = 2.0 * np.sqrt(kp * largest_inertia(robot, dynamics))
+    return kp, np.minimum(critical, 0.5 * effective_inertia(robot, dynamics) / period)
 
 
 def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndarray, " n"]:
@@ -75,6 +74,11 @@ def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndar
     """
     inverse = np.linalg.inv(dynamics.mass_matrix(sample_configurations(robot)))
     return (1.0 / np.diagonal(inverse, axis1=-2, axis2=-1)).min(axis=0)
+
+
+def largest_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndarray, " n"]:
+    """max_q M_ii(q) [kg·m²] over sampled configurations: the most inertia joint i moves with the others held."""
+    return np.diagonal(dynamics.mass_matrix(sample_configurations(robot)), axis1=-2, axis2=-1).max(axis=0)
 
 
 def sample_configurations(robot: Robot, count: int = 1000, seed: int = 0) -> Float[np.ndarray, "count n"]:
