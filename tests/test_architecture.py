@@ -16,7 +16,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # From the ground up; a module imports only its own floor and the floors below.
 FLOORS = [
     {"exceptions", "arrays", "files", "progress"},
-    {"checks", "npz", "state"},
+    {"checks", "npz", "state", "runtime"},
     {"urdf_source", "urdf_checks", "urdf", "catalogue", "robot", "networks"},
     {"dynamics", "references", "reference_files", "disturbances", "metrics", "meshes", "visuals"},
     {"controllers", "plants"},
@@ -34,6 +34,7 @@ HOMES = {
     "trimesh": {"meshes", "visuals", "replay_page"},
     "scipy": {"reference_files", "visuals"},
     "xacrodoc": {"urdf_source"},
+    "numba": {"runtime.jit", "runtime.laws", "runtime.threads"},
 }
 
 
@@ -103,7 +104,7 @@ def test_a_library_stays_in_its_rooms(library):
 def test_importing_the_package_is_light():
     code = "import nbs_pin, sys; nbs_pin.load_robot; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    heavy = {"torch", "matplotlib", "mujoco", "meshcat", "yourdfpy", "trimesh", "scipy"}
+    heavy = {"torch", "matplotlib", "mujoco", "meshcat", "yourdfpy", "trimesh", "scipy", "numba"}
     assert not heavy & set(loaded)
 
 

@@ -4,12 +4,14 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, constant_like
+from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.gains import PerJoint, gains_for_robot, largest_inertia, positive_gains
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robot import Robot
+from nbs_pin.runtime.layout import COMPUTED_TORQUE
 
 
 class ComputedTorque(MemorylessController):
@@ -59,3 +61,7 @@ class ComputedTorque(MemorylessController):
         a = a_ref - kd * (v - v_ref) - kp * self.dynamics.difference(q, q_ref)
         tau = self.dynamics.reference_torque(q, v, v, a)
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
+
+    def compile(self) -> CompiledController:
+        """The law as machine code (`Controller.compile`)."""
+        return CompiledController.of(COMPUTED_TORQUE, self.dynamics, (self.kp, self.kd), self.friction)

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.arrays import Array, array_namespace, as_vectors, is_torch_array, matvec
-from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.controllers.compiled import CompiledController
+from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.controllers.gains import Gains, gains_for_robot
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -16,6 +17,7 @@ from nbs_pin.exceptions import ArgumentError
 from nbs_pin.networks.damping import Damping
 from nbs_pin.networks.potential import Potential
 from nbs_pin.robot import Robot
+from nbs_pin.runtime.layout import BACKSTEPPING
 
 DAMPINGS = ("inertial", "bounded", "paper")
 
@@ -136,6 +138,21 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         feedforward = self.dynamics.reference_torque(q, v, e.v_r, e.a_r - self.inertial_rate * e.z2)
         tau = feedforward - e.gradient - self.damping.force(e.z2)
         return tau if self.friction is None else tau + self.friction.torque(e.v_r)
+
+    def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
+        """The law as machine code (`Controller.compile`); itself when its activation has no compiled form."""
+        if self.potential.network.activation.kernel is None:
+            return self
+        rate = self.rate.double().numpy()
+        return CompiledController.of(
+            BACKSTEPPING,
+            self.dynamics,
+            (rate, 0.0 * rate),
+            self.friction,
+            inertial_rate=self.inertial_rate,
+            potential=self.potential.packed(),
+            damping=self.damping.packed(),
+        )
 
     def storage(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
         """V = Φ(z1) + ½z2ᵀM(q)z2 [J], the Lyapunov function of the closed loop."""

@@ -3,6 +3,7 @@
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, constant_like
+from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.gains import PerJoint, pd_gains, positive_gains
 from nbs_pin.dynamics.friction import JointFriction
@@ -10,6 +11,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
+from nbs_pin.runtime.layout import PD_GRAVITY, PD_REFERENCE
 
 FEEDFORWARDS = ("gravity", "reference")
 
@@ -68,3 +70,8 @@ class PD(MemorylessController):
         else:
             tau = tau + self.dynamics.reference_torque(q, v, v_ref, a_ref)
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
+
+    def compile(self) -> CompiledController:
+        """The law as machine code (`Controller.compile`)."""
+        law = PD_GRAVITY if self.feedforward == "gravity" else PD_REFERENCE
+        return CompiledController.of(law, self.dynamics, (self.kp, self.kd), self.friction)

@@ -5,12 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array
+from nbs_pin.arrays import Array, as_vectors, is_torch_array
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import PerJoint, pd_gains, positive_gains
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot, configuration_difference
+from nbs_pin.runtime.laws import compile_laws, pid
 from nbs_pin.state import Reference
 
 
@@ -85,4 +86,66 @@ class PID(Controller):
         tau = -self.kp * z1 - memory.integral - self.kd * derivative
         winding = (np.abs(tau) > self.effort_limit) & (tau * z1 < 0.0)
         integral = memory.integral + np.where(winding, 0.0, self.ki * period * z1)
+        return tau, PIDMemory(integral, derivative)
+
+    def compile(self) -> "CompiledPID":
+        """The law as machine code (`Controller.compile`)."""
+        continuous = np.zeros(self.nv) if self.continuous is None else self.continuous
+        filter_time = np.full(self.nv, self.filter_time)
+        return CompiledPID(np.array([self.kp, self.ki, self.kd, self.effort_limit, filter_time, continuous]))
+
+
+class CompiledPID(Controller):
+    """`PID.step` as machine code, memory in, memory out; numpy only.
+
+    gains: rows k_p, k_i, k_d, effort limit, T_f, continuous (6, n).
+    """
+
+    def __init__(self, gains: Float[np.ndarray, "6 n"]) -> None:
+        compile_laws()
+        self.gains = gains
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return int(self.gains.shape[1])
+
+    def initial_memory(self, q: Float[np.ndarray, "*batch n"]) -> PIDMemory:
+        """No integral, derivative at rest."""
+        return PIDMemory(np.zeros_like(q), np.zeros_like(q))
+
+    def step(
+        self, memory: PIDMemory, q: Array, v: Array, reference: Reference, period: float
+    ) -> tuple[Float[np.ndarray, "*batch n"], PIDMemory]:
+        """τ [N·m] for the next period [s], and the memory after it.
+
+        Raises ArgumentError when shapes do not fit, or for tensors.
+        """
+        if isinstance(q, np.ndarray) and q.ndim == 1:
+            out = np.empty((3, self.nv))
+            try:
+                fits = pid(*memory, q, v, reference.q, reference.v, period, self.gains, out)
+            except TypeError:  # not all contiguous float64 vectors: converted and checked below
+                fits = False
+            if fits:
+                return out[0], PIDMemory(out[1], out[2])
+        return self._steps(memory, q, v, reference, period)
+
+    def _steps(
+        self, memory: PIDMemory, q: Array, v: Array, reference: Reference, period: float
+    ) -> tuple[Float[np.ndarray, "*batch n"], PIDMemory]:
+        given = as_vectors(
+            self.nv,
+            integral=memory.integral,
+            derivative=memory.derivative,
+            q=q,
+            v=v,
+            q_ref=reference.q,
+            v_ref=reference.v,
+        )
+        if is_torch_array(given[0]):
+            raise ArgumentError("a compiled PID was given torch tensors, expected numpy arrays; convert them.")
+        out = np.empty((3, given[0].size))
+        pid(*(np.array(x, dtype=float).ravel() for x in given), period, self.gains, out)
+        tau, integral, derivative = out.reshape(3, *given[0].shape)
         return tau, PIDMemory(integral, derivative)

@@ -4,12 +4,14 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, constant_like
+from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.gains import PerJoint, effective_inertia, gains_for_robot, positive_gains
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robot import Robot
+from nbs_pin.runtime.layout import SLOTINE_LI
 
 
 class SlotineLi(MemorylessController):
@@ -60,3 +62,7 @@ class SlotineLi(MemorylessController):
         a_r = a_ref - rate * (v - v_ref)
         tau = self.dynamics.reference_torque(q, v, v_r, a_r) - gain * (v - v_r)
         return tau if self.friction is None else tau + self.friction.torque(v_r)
+
+    def compile(self) -> CompiledController:
+        """The law as machine code (`Controller.compile`)."""
+        return CompiledController.of(SLOTINE_LI, self.dynamics, (self.rate, self.gain), self.friction)

@@ -9,7 +9,7 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, is_torch_array
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.provider import DynamicsProvider, ReferenceTorque
 from nbs_pin.robot import Robot
 
 Row: TypeAlias = np.ndarray
@@ -87,6 +87,10 @@ class PinocchioDynamics(DynamicsProvider):
         """v̇ [rad/s²] by the articulated body algorithm."""
         return _evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q, v, tau)
 
+    def compiled_reference_torque(self) -> ReferenceTorque:
+        """The two RNEA on scratch space of its own; one where v_r is v itself."""
+        return _TwoRnea(self._model, self._weightless)
+
     # One state at a time: values.
 
     def _mass_matrix(self, q: Row) -> Row:
@@ -150,6 +154,28 @@ class PinocchioDynamics(DynamicsProvider):
         live = pin.computeRNEADerivatives(model, self._data, q, v, a)  # views into data that the next call overwrites
         dq, dv, mass = (np.array(x) for x in live)
         return dq, dv, mass
+
+
+class _TwoRnea:
+    """`PinocchioDynamics.reference_torque` for numpy, without a check or an array to spare."""
+
+    def __init__(self, model: pin.Model, weightless: pin.Model) -> None:
+        from nbs_pin.runtime.models import halves
+
+        self._model, self._weightless, self._data, self._halves = model, weightless, model.createData(), halves
+        self._mean, self._half, self._zero = np.zeros((3, model.nv))
+
+    def __call__(self, q: Row, v: Row, v_r: Row, a_r: Row) -> Row:
+        if q.ndim > 1:
+            same = v_r is v
+            rows = zip(q, v, v if same else v_r, a_r, strict=True)
+            return np.stack([self(x, w, w if same else w_r, b) for x, w, w_r, b in rows])
+        if v_r is v:
+            return pin.rnea(self._model, self._data, q, v, a_r)
+        self._halves(v, v_r, self._mean, self._half)
+        tau = pin.rnea(self._model, self._data, q, self._mean, a_r)
+        tau -= pin.rnea(self._weightless, self._data, q, self._half, self._zero)
+        return tau
 
 
 def _evaluate(quantity: Quantity, *arguments: Array) -> Array:

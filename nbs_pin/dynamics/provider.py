@@ -1,11 +1,16 @@
 """The protocol of every dynamics model: four ingredients, from which every equation follows."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TypeAlias
 
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, array_namespace, matvec
 from nbs_pin.robot import Robot, configuration_difference
+
+ReferenceTorque: TypeAlias = Callable[[Array, Array, Array, Array], Array]
+"""(q, v, v_r, a_r) -> M(q) a_r + C(q, v) v_r + G(q) [N·m]."""
 
 
 class DynamicsProvider(ABC):
@@ -43,7 +48,7 @@ class DynamicsProvider(ABC):
         """V(q) [J], up to a constant."""
 
     def difference(self, q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-        """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
+        """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on the continuous joints of `robot`; no provider overrides it."""
         return configuration_difference(q, q_ref, None if self.robot is None else self.robot.continuous)
 
     def reference_torque(
@@ -55,6 +60,13 @@ class DynamicsProvider(ABC):
     ) -> Float[Array, "*batch n"]:
         """M(q) a_r + C(q, v) v_r + G(q) [N·m], the one quantity a passivity-based law needs (docs/theory.md §1)."""
         return matvec(self.mass_matrix(q), a_r) + matvec(self.coriolis_matrix(q, v), v_r) + self.gravity(q)
+
+    def compiled_reference_torque(self) -> ReferenceTorque:
+        """`reference_torque` for numpy arrays (..., nv) by this model's fastest route: what compiled laws call.
+
+        Whatever that route compiles is compiled when it is first called. It may own scratch space.
+        """
+        return self.reference_torque
 
     def forward_dynamics(
         self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from nbs_pin.arrays import Array, array_namespace
 from nbs_pin.exceptions import ArgumentError
+from nbs_pin.runtime.layout import SMOOTHED_RELU, SQUAREPLUS
 
 
 class Activation(ABC):
@@ -17,6 +18,11 @@ class Activation(ABC):
         self, x: Float[Array, "*shape"]
     ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "*shape"]]:
         """σ(x), σ'(x) and σ''(x)."""
+
+    @property
+    def kernel(self) -> tuple[int, float] | None:
+        """Code and parameter of its compiled form (`runtime/layout.py`), or None where there is none."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,11 @@ class SmoothedReLU(Activation):
         inside = (x > 0.0) & (x < self.d)
         return slope * (x - 0.5 * self.d * slope), slope, xp.astype(inside, x.dtype) / self.d
 
+    @property
+    def kernel(self) -> tuple[int, float]:
+        """Code and parameter of the compiled form."""
+        return SMOOTHED_RELU, self.d
+
 
 @dataclass(frozen=True)
 class Squareplus(Activation):
@@ -62,3 +73,8 @@ class Squareplus(Activation):
         """σ, σ', σ''."""
         root = array_namespace(x).sqrt(x * x + self.b)
         return 0.5 * (x + root), 0.5 * (1.0 + x / root), 0.5 * self.b / (root * root * root)
+
+    @property
+    def kernel(self) -> tuple[int, float]:
+        """Code and parameter of the compiled form."""
+        return SQUAREPLUS, self.b

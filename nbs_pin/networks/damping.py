@@ -11,6 +11,7 @@ from torch import nn
 from nbs_pin.arrays import Array, array_namespace, is_torch_array, matvec
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.networks.potential import positive_definite, positive_scale
+from nbs_pin.runtime.layout import Packed, pack_damping
 
 DAMPINGS = ("bounded", "paper")
 
@@ -90,6 +91,11 @@ class Damping(nn.Module):
         t = self.factor(r * z)
         return matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
 
+    def packed(self) -> Packed:
+        """The weights as the compiled form of `force` takes them (`runtime/damping.py`)."""
+        networks = self.diagonal.layers(), self.lower.layers()
+        return pack_damping(networks, self.form == "paper", self.m, self.scale.numpy(), self.floor.numpy())
+
 
 class _FCNN(nn.Module):
     """Tanh hidden layers, linear output; starts like the authors', U(−gain, gain) and no bias (docs/theory.md §8)."""
@@ -102,6 +108,10 @@ class _FCNN(nn.Module):
             weight = torch.empty(out, size, dtype=torch.float64).uniform_(-gain, gain)
             self.register_parameter(f"w{i}", nn.Parameter(weight))
             self.register_parameter(f"b{i}", nn.Parameter(torch.zeros(out, dtype=torch.float64)))
+
+    def layers(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        named = {k: p.detach().numpy() for k, p in self._parameters.items() if p is not None}
+        return [(named[f"w{i}"], named[f"b{i}"]) for i in range(self.depth)]
 
     def output(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
         xp = array_namespace(x)

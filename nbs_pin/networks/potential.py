@@ -8,6 +8,8 @@ from nbs_pin.arrays import Array, array_namespace, is_torch_array, matvec
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.networks.activations import Activation, SmoothedReLU, Squareplus
 from nbs_pin.networks.convex import FICNN, rectified
+from nbs_pin.runtime.convex import subtract_tangent
+from nbs_pin.runtime.layout import Packed, pack_potential
 
 POTENTIALS = ("paper", "smooth")
 
@@ -73,6 +75,18 @@ class Potential(nn.Module):
         value, gradient, product = self._psi(r * z, r * dz)
         force, force_rate = 2.0 * matvec(s, z), 2.0 * matvec(s, dz)
         return value + 0.5 * xp.sum(z * force, axis=-1), r * gradient + force, r * product + force_rate
+
+    def packed(self) -> Packed:
+        """The weights as the compiled form of `terms` takes them (`runtime/convex.py`).
+
+        Raises ArgumentError when the activation has no compiled form.
+        """
+        activation = self.network.activation
+        if activation.kernel is None:
+            raise ArgumentError(f"{activation} has no compiled form; take SmoothedReLU or Squareplus.")
+        layers = self.network.layers(numpy=True)
+        packed = pack_potential(layers, activation.kernel, self.scale.numpy(), self.stiffness.numpy())
+        return packed if self.form == "paper" else subtract_tangent(packed)
 
     def _psi(
         self, x: Float[Array, "*batch n"], dx: Float[Array, "*batch n"]

@@ -1,0 +1,25 @@
+"""Batches over the cores: kernels release the interpreter's lock, so threads are enough."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import numba
+import numpy as np
+
+FEWEST_ROWS = 64
+"""Fewer rows than this are not worth a thread."""
+
+
+def over_cores(function: Callable[[slice], None], rows: int) -> None:
+    """`function` of slices that make up all rows, at the same time; NUMBA_NUM_THREADS bounds their number."""
+    parts = min(
+        numba.config.NUMBA_NUM_THREADS,  # type: ignore[attr-defined]  # read from the environment
+        rows // FEWEST_ROWS,
+    )
+    if parts < 2:
+        function(slice(0, rows))
+        return
+    bounds = np.linspace(0, rows, parts + 1).astype(int).tolist()
+    with ThreadPoolExecutor(parts) as pool:
+        list(pool.map(function, [slice(a, b) for a, b in pairwise(bounds)]))
