@@ -276,7 +276,7 @@ def test_a_provider_that_leaves_the_finite_numbers_raises(panda):
 
 def test_unknown_choices_are_refused(panda):
     dynamics = PinocchioDynamics(panda)
-    with pytest.raises(ArgumentError, match="2 joints, the dynamics 7"):
+    with pytest.raises(ArgumentError, match="2 joints, the arm has 7"):
         DynamicsPlant(dynamics, friction=JointFriction(np.ones(2), np.ones(2)))
     # The annotations are executed in tests, and refuse first what the constructor refuses for a user.
     for make in (MujocoPlant, lambda *a: DynamicsPlant(dynamics, *a[1:])):
