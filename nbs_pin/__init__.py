@@ -47,7 +47,7 @@ _HOMES = {
     "nbs_pin.plotting": ("plot_tracking",),
     "nbs_pin.reference_files": ("Sampled", "load_reference"),
     "nbs_pin.references": ("Hold", "MinimumJerk", "Sinusoid", "check_reference", "paper_reference"),
-    "nbs_pin.replay": ("replay",),
+    "nbs_pin.replay_page": ("replay",),
     "nbs_pin.robot": ("Robot", "load_robot"),
     "nbs_pin.simulation": ("simulate",),
     "nbs_pin.state": ("Reference", "Run", "State"),

@@ -1,5 +1,6 @@
 """One code for numpy arrays and torch tensors: the array kind in is the array kind out."""
 
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -10,7 +11,7 @@ from nbs_pin.exceptions import ArgumentError
 Array: TypeAlias = Any
 """A `numpy.ndarray` or a `torch.Tensor`; shapes are annotated with jaxtyping around it."""
 
-__all__ = ["Array", "array_namespace", "as_vectors", "constant_like", "is_torch_array", "matvec"]
+__all__ = ["Array", "array_namespace", "as_vectors", "constant_like", "is_torch_array", "matvec", "over_rows"]
 
 
 def matvec(matrix: Array, vector: Array) -> Array:
@@ -22,13 +23,16 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
     """The given vectors as arrays of one kind and one batch shape (..., nv).
 
     Lists and numbers become float64 numpy arrays; tensors stay tensors.
-    Raises ArgumentError when kinds are mixed, a last axis is not nv, or batches do not broadcast.
+    Raises ArgumentError when kinds are mixed, a tensor is not float64, a last axis is not nv, or batches do not
+    broadcast.
     """
     arrays = [x if is_torch_array(x) else np.asarray(x, dtype=float) for x in vectors.values()]
     if len({is_torch_array(x) for x in arrays}) > 1:
         kinds = ", ".join(f"{k} {type(x).__name__}" for k, x in vectors.items())
         raise ArgumentError(f"numpy and torch were mixed ({kinds}); give all arguments in one kind.")
     for name, x in zip(vectors, arrays, strict=True):
+        if str(x.dtype) not in ("float64", "torch.float64"):
+            raise ArgumentError(f"{name} is a {x.dtype} tensor, expected float64; give {name}.double().")
         if x.ndim == 0 or x.shape[-1] != nv:
             raise ArgumentError(f"{name} has shape {tuple(x.shape)}, expected (..., {nv}): one number per joint.")
     if len({tuple(x.shape) for x in arrays}) == 1:
@@ -45,3 +49,12 @@ def constant_like(x: Array, constant: np.ndarray) -> Array:
     if not is_torch_array(x):
         return constant
     return array_namespace(x).asarray(constant, dtype=x.dtype, device=x.device)
+
+
+def over_rows(function: Callable[..., np.ndarray], *arguments: np.ndarray) -> np.ndarray:
+    """The function of every row of numpy arrays with equal leading axes, stacked with those axes."""
+    batch = arguments[0].shape[:-1]
+    rows = [x.reshape(-1, x.shape[-1]) for x in arguments]
+    values = [function(*row) for row in zip(*rows, strict=True)]
+    shape = values[0].shape if values else function(*(np.zeros(x.shape[-1]) for x in arguments)).shape
+    return np.array(values).reshape(*batch, *shape)

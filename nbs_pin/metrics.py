@@ -28,11 +28,11 @@ def error(run: Run) -> Float[np.ndarray, "rows *batch n"]:
 def squared_error(run: Run, shift: int = 0) -> Float[np.ndarray, "rows *batch"]:
     """‖z1‖² at every control instant [rad²].
 
-    shift: hold q of row k + shift against q_ref of row k. 0 is the tracking error; 1 is the paper's own score, which
-    sets q(t + h) against q_d(t) and so counts the reference's own motion in h as error (docs/theory.md §8).
+    shift: hold q of row k + shift against q_ref of row k. 0 is the tracking error; 1 is the score of the authors'
+    program: q(t + h) against q_d(t), which counts the reference's own motion in h as error (docs/theory.md §8).
     """
     if not 0 <= shift < len(run.t):
-        raise ArgumentError(f"shift is {shift}, expected 0 (aligned) or 1 (the paper's index) for {len(run.t)} rows.")
+        raise ArgumentError(f"shift is {shift}, expected 0 (aligned) or 1 (the authors' index) for {len(run.t)} rows.")
     z1 = configuration_difference(run.q[shift:], run.q_ref[: len(run.t) - shift], run.continuous)
     return np.sum(z1 * z1, axis=-1)
 
@@ -43,7 +43,7 @@ def steady_error(run: Run, last: float = 0.3, shift: int = 0) -> Numbers:
         raise ArgumentError(f"last is {last}, expected a fraction in (0, 1]; the paper's is 0.3.")
     values = squared_error(run, shift)
     start = run.t[-1] - last * (run.t[-1] - run.t[0])
-    late = run.t[: len(values)] >= start - 1e-9 * run.period
+    late = run.t[shift:] >= start - 1e-9 * run.period
     return np.max(values[late], axis=0)
 
 
@@ -76,12 +76,13 @@ def rms_torque(run: Run) -> Numbers:
 
 
 def saturated_fraction(run: Run, after: float = 0.0) -> Numbers:
-    """Fraction of the control instants from `after` [s] on at which some joint's command exceeded its limit.
+    """Fraction of the holds that end after the time `after` [s] for which some joint's command exceeded its limit.
 
     While it does, no Lyapunov argument holds (docs/theory.md §7).
     """
-    exceeded = np.any(np.abs(run.tau_command) > run.effort_limit, axis=-1)
-    return np.mean(exceeded[:-1][_from(run, after)[:-1]], axis=0)
+    exceeded = np.any(np.abs(run.tau_command[:-1]) > run.effort_limit, axis=-1)
+    _from(run, after)
+    return np.mean(exceeded[run.t[1:] > after + 1e-9 * run.period], axis=0)
 
 
 def peak_torque_rate(run: Run) -> Numbers:

@@ -14,6 +14,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.files import write_whole
+from nbs_pin.metrics import saturated_fraction
 from nbs_pin.robot import configuration_difference
 from nbs_pin.state import Run
 
@@ -51,10 +52,12 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
     if not 0 <= start < starts:
         raise ArgumentError(f"start={start} does not exist: the run has starts 0 to {starts - 1}.")
     q, q_ref, tau, asked = (
-        array.reshape(len(run.t), starts, run.nv)[:, start] for array in (run.q, run.q_ref, run.tau, run.tau_command)
+        np.array(x.reshape(len(run.t), starts, run.nv)[:, start]) for x in (run.q, run.q_ref, run.tau, run.tau_command)
     )
     error = np.abs(configuration_difference(q, q_ref, run.continuous))
-    cut = np.abs(asked) > run.effort_limit * (1.0 + 1e-9)
+    cut = np.abs(asked) > run.effort_limit
+    tau[-1], cut[-1] = np.nan, False  # asked for, never applied
+    fraction = float(np.ravel(saturated_fraction(run))[start])
     with rc_context(_STYLE):
         figure = Figure(figsize=(13.0, 1.15 + 1.5 * run.nv), dpi=120, layout="constrained")
         FigureCanvasAgg(figure)
@@ -64,7 +67,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
             _draw_error(error_axes, run.t, error[:, joint])
             _draw_torque(torque_axes, run.t, tau[:, joint], float(run.effort_limit[joint]), cut[:, joint])
             position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color="#1d2733")
-        _dress(figure, grid, run, float(cut.mean()))
+        _dress(figure, grid, run, fraction)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png")
     return write_whole(path, buffer.getvalue())
@@ -116,13 +119,13 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
         axes.set_xlim(run.t[0], run.t[-1] if run.t[-1] > run.t[0] else run.t[0] + 1.0)
-    named = [str(run.info[key]) for key in ("controller", "plant") if run.info.get(key)]
+    named = [str(run.info[key]).partition("(")[0] for key in ("controller", "plant") if run.info.get(key)]
     title = " · ".join([_short(run.robot.rsplit("/", 1)[-1]) or f"{run.nv} joints", *map(_short, named)])
     figure.suptitle(title, x=0.008, ha="left", fontsize=12, fontweight="bold", color="#1d2733")
     handles = [
         figure.axes[0].plot([], [], color=ACTUAL, label="actual")[0],
         figure.axes[0].plot([], [], color=REFERENCE, linewidth=2.6, alpha=0.75, label="reference")[0],
-        figure.axes[2].axvspan(np.nan, np.nan, color=SATURATED, alpha=0.45, label=f"saturated ({cut:.2%} of samples)"),
+        figure.axes[2].axvspan(np.nan, np.nan, color=SATURATED, alpha=0.45, label=f"saturated ({cut:.2%} of the time)"),
     ]
     figure.legend(handles=handles, loc="outside upper right", ncols=3, frameon=False)
 

@@ -1,6 +1,8 @@
 """The one time loop: a controller, a reference and a plant make a Run."""
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,8 +37,8 @@ def simulate(
 ) -> Run:
     """The motion of `plant` under `controller` following `reference` for `duration` [s].
 
-    Every `period` [s] the controller sees the state and the reference; its torque is clipped to the effort limits and
-    held until the next instant, while the plant takes steps of `plant_step` [s] under τ + τ_d.
+    Every `period` [s] the controller, in its compiled form, sees the state and the reference; its torque is clipped to
+    the effort limits and held until the next instant, while the plant takes steps of `plant_step` [s] under τ + τ_d.
 
     duration: a whole number of periods. period: a whole number of plant steps; without `plant_step`, the longest step
     of at most 1 ms that divides it.
@@ -52,52 +54,142 @@ def simulate(
     Raises ArgumentError for arguments that do not fit each other, and SimulationDiverged, naming the time, when the
     controller's torque or the state is not finite or the engine warns.
     """
+    loop = _loop(plant, controller, period, plant_step, effort_limit, disturbance, lookahead, duration)
+    run, _ = _block(loop, reference, 0, loop.steps, loop.start(reference, q0, v0), None, progress)
+    return run
+
+
+def stream(
+    plant: Plant,
+    controller: Controller,
+    reference: DesiredMotion,
+    duration: float,
+    period: float,
+    *,
+    block: int = 1000,
+    q0: Any = None,
+    v0: Any = None,
+    plant_step: float | None = None,
+    effort_limit: Any = None,
+    disturbance: Disturbance | None = None,
+    lookahead: float | None = None,
+    progress: bool = False,
+) -> Iterator[Run]:
+    """`simulate` without keeping what is past: one Run per `block` control periods, for hours of motion.
+
+    Each run begins at the instant and in the state in which the one before ended, and all of them together are the run
+    that `simulate` gives. Arguments and errors are those of `simulate`.
+    """
+    loop = _loop(plant, controller, period, plant_step, effort_limit, disturbance, lookahead, duration)
+    if block < 1:
+        raise ArgumentError(f"block is {block} periods, expected at least one; 1000 is usual.")
+    state, memory = loop.start(reference, q0, v0), None
+    for first in tracked(range(0, loop.steps, block), "simulating", progress):
+        run, memory = _block(loop, reference, first, min(block, loop.steps - first), state, memory, False)
+        state = (run.q[-1], run.v[-1])
+        yield run
+
+
+@dataclass(frozen=True, eq=False)
+class _Loop:
+    """What stays the same from step to step."""
+
+    plant: Plant
+    law: Controller
+    name: str
+    period: float
+    steps: int
+    substeps: int
+    lead: float
+    limit: np.ndarray
+    disturbance: Disturbance | None
+
+    def start(self, reference: DesiredMotion, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Start (q, v) of one batch shape."""
+        return _start(_sampled(reference, np.zeros(1), self.plant.nv), q0, v0)
+
+
+def _loop(
+    plant: Plant,
+    controller: Controller,
+    period: float,
+    plant_step: float | None,
+    effort_limit: Any,
+    disturbance: Disturbance | None,
+    lookahead: float | None,
+    duration: float,
+) -> _Loop:
     if controller.nv != plant.nv:
         raise ArgumentError(
             f"the controller has {controller.nv} joints and the plant {plant.nv}; build both for one arm."
         )
-    steps = whole(duration, period, "duration", "period")
-    substeps = _substeps(period, plant_step)
-    limit = _effort_limit(plant, effort_limit)
-    lead = _lead(lookahead, period)
-    times = period * np.arange(steps + 1.0)
-    desired, target = (_sampled(reference, t, plant.nv) for t in (times, times + lead))
-    run = _prepared(plant, desired, period, limit, *_start(desired, q0, v0))
-    run.info.update(
-        controller=type(controller).__name__, plant=repr(plant), plant_step=period / substeps, lookahead=lead
+    return _Loop(
+        plant=plant,
+        law=controller.compile(),
+        name=type(controller).__name__,
+        period=period,
+        steps=whole(duration, period, "duration", "period"),
+        substeps=_substeps(period, plant_step),
+        lead=_lead(lookahead, period),
+        limit=_effort_limit(plant, effort_limit),
+        disturbance=disturbance,
     )
+
+
+def _block(
+    loop: _Loop,
+    reference: DesiredMotion,
+    first: int,
+    steps: int,
+    start: tuple[np.ndarray, np.ndarray],
+    memory: Any,
+    progress: bool,
+) -> tuple[Run, Any]:
+    """The rows of `steps` periods from the instant number `first` on, and the controller's memory at their end."""
+    times = loop.period * np.arange(first, first + steps + 1.0)
+    # A motion is not asked for what comes after its end: at the last instant the law does not look ahead.
+    seen = np.minimum(times + loop.lead, loop.period * loop.steps)
+    leads = (seen - times).tolist()
+    desired, target = (_sampled(reference, t, loop.plant.nv) for t in (times, seen))
+    run = _prepared(loop, times, desired, *start)
+    memory = loop.law.initial_memory(run.q[0]) if first == 0 else memory
     # Overflow needs no warning here: every torque and every state is checked, and reported with its time.
     with np.errstate(over="ignore", invalid="ignore"):
-        _run_loop(run, plant, controller, target, lead, disturbance, substeps, progress)
-    return run
+        for k in tracked(range(steps), "simulating", progress):
+            tau, memory = _control(loop, run, k, leads[k], target, memory)
+            run.q[k + 1], run.v[k + 1] = _advance(loop, run, k, tau)
+        _control(
+            loop, run, steps, leads[steps], target, memory
+        )  # recorded, and asked for again by whoever goes on from here
+    return run, memory
 
 
-def _run_loop(
-    run: Run,
-    plant: Plant,
-    controller: Controller,
-    target: Reference,
-    lead: float,
-    disturbance: Disturbance | None,
-    substeps: int,
-    progress: bool,
-) -> None:
-    """Fill the rows of the run from its first state on; `target` is the reference `lead` [s] after each instant."""
-    law = controller.compile()
-    memory = law.initial_memory(run.q[0])
-    upper, lower, last = run.effort_limit, -run.effort_limit, len(run.t) - 1
-    for k in tracked(range(last + 1), "simulating", progress):
-        t, q, v, tau = float(run.t[k]), run.q[k], run.v[k], run.tau[k]
-        dv = lead * run.a_ref[k]
-        aim = Reference(target.q[k], target.v[k], target.a[k])
-        command, memory = law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, run.period)
-        # Finite before clipped: a clip can turn a torque that is not a number into full effort.
-        run.tau_command[k] = command = _checked(command, q.shape, controller, t)
-        np.maximum(np.minimum(command, upper, out=tau), lower, out=tau)
-        if disturbance is not None:
-            run.disturbance[k] = _disturbance(disturbance, t, q, v)
-        if k < last:
-            run.q[k + 1], run.v[k + 1] = _advance(plant, q, v, tau, disturbance, t, run.period, substeps)
+def _control(loop: _Loop, run: Run, k: int, lead: float, target: Reference, memory: Any) -> tuple[np.ndarray, Any]:
+    """The torque of row k, seen `lead` [s] ahead and written into the run, and the memory after it."""
+    q, v, tau, dv = run.q[k], run.v[k], run.tau[k], lead * run.a_ref[k]
+    aim = Reference(target.q[k], target.v[k], target.a[k])
+    command, memory = loop.law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, loop.period)
+    # Finite before clipped: a clip can turn a torque that is not a number into full effort.
+    run.tau_command[k] = command = _checked(command, q.shape, loop.name, float(run.t[k]))
+    np.maximum(np.minimum(command, loop.limit, out=tau), -loop.limit, out=tau)
+    return tau, memory
+
+
+def _advance(loop: _Loop, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The state one period after row k; the disturbance at its start goes into the run."""
+    q, v, t, step = run.q[k], run.v[k], float(run.t[k]), loop.period / loop.substeps
+    try:
+        for j in range(loop.substeps):
+            total = tau
+            if loop.disturbance is not None:
+                torque = _disturbance(loop.disturbance, t + j * step, q, v)
+                total = tau + torque
+                if j == 0:
+                    run.disturbance[k] = torque
+            q, v = loop.plant.step(q, v, total, step)
+    except SimulationDiverged as error:
+        raise SimulationDiverged(f"after t = {t:g} s: {error}") from error
+    return q, v
 
 
 def _substeps(period: float, plant_step: float | None) -> int:
@@ -128,7 +220,7 @@ def _sampled(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
     return sampled
 
 
-def _start(desired: Reference, q0: Any, v0: Any) -> list[np.ndarray]:
+def _start(desired: Reference, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
     """Start (q, v) of one batch shape."""
     rest = desired.v[0] if q0 is None else np.zeros_like(desired.v[0])
     given = {"q0": desired.q[0] if q0 is None else q0, "v0": rest if v0 is None else v0}
@@ -140,22 +232,20 @@ def _start(desired: Reference, q0: Any, v0: Any) -> list[np.ndarray]:
         if not np.isfinite(x).all():
             raise ArgumentError(f"{name} is {x}, expected finite numbers; correct the start.")
     try:
-        return list(np.broadcast_arrays(start["q0"], start["v0"]))
+        q, v = np.broadcast_arrays(start["q0"], start["v0"])
+        return q, v
     except ValueError as error:
         shapes = ", ".join(f"{name} {x.shape}" for name, x in start.items())
         raise ArgumentError(f"the starts do not broadcast ({shapes}); give equal leading axes.") from error
 
 
-def _prepared(
-    plant: Plant, desired: Reference, period: float, limit: np.ndarray, q0: np.ndarray, v0: np.ndarray
-) -> Run:
+def _prepared(loop: _Loop, t: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray) -> Run:
     """The run with its times, reference and start in place, and room for the rest."""
     rows, n = desired.q.shape
-    shape = (rows, *q0.shape)
+    shape, robot = (rows, *q0.shape), loop.plant.robot
     q_ref, v_ref, a_ref = (np.array(np.broadcast_to(x.reshape(rows, *(1,) * (q0.ndim - 1), n), shape)) for x in desired)
-    robot = plant.robot
     run = Run(
-        t=period * np.arange(float(rows)),
+        t=t,
         q=np.zeros(shape),
         v=np.zeros(shape),
         tau=np.zeros(shape),
@@ -164,12 +254,18 @@ def _prepared(
         q_ref=q_ref,
         v_ref=v_ref,
         a_ref=a_ref,
-        effort_limit=limit,
+        effort_limit=loop.limit,
         continuous=np.zeros(n, dtype=bool) if robot is None else robot.continuous,
         joint_names=tuple(f"q{i + 1}" for i in range(n)) if robot is None else robot.joint_names,
-        period=period,
+        period=loop.period,
         robot="" if robot is None else robot.source,
         robot_sha256="" if robot is None else robot.sha256,
+        info={
+            "controller": loop.name,
+            "plant": repr(loop.plant),
+            "plant_step": loop.period / loop.substeps,
+            "lookahead": loop.lead,
+        },
     )
     run.q[0], run.v[0] = q0, v0
     return run
@@ -186,16 +282,16 @@ def _effort_limit(plant: Plant, given: Any) -> np.ndarray:
     return np.full(plant.nv, limit)
 
 
-def _checked(command: Any, shape: tuple[int, ...], controller: Controller, t: float) -> np.ndarray:
+def _checked(command: Any, shape: tuple[int, ...], name: str, t: float) -> np.ndarray:
     command = np.asarray(command, dtype=float)
     if command.shape != shape:
         raise ArgumentError(
-            f"{type(controller).__name__} gave a torque of shape {command.shape} at t = {t:g} s, expected {shape}; "
+            f"{name} gave a torque of shape {command.shape} at t = {t:g} s, expected {shape}; "
             "a controller returns one torque per joint for every start."
         )
     if not all_finite(command):
         raise SimulationDiverged(
-            f"{type(controller).__name__} asked for the torque {command} at t = {t:g} s, expected finite numbers; "
+            f"{name} asked for the torque {command} at t = {t:g} s, expected finite numbers; "
             "look for a division by zero or an unstable gain."
         )
     return command
@@ -210,24 +306,3 @@ def _disturbance(disturbance: Disturbance, t: float, q: np.ndarray, v: np.ndarra
     if not all_finite(torque):
         raise SimulationDiverged(f"the disturbance at t = {t:g} s is {torque}, expected finite torques; correct it.")
     return torque
-
-
-def _advance(
-    plant: Plant,
-    q: np.ndarray,
-    v: np.ndarray,
-    tau: np.ndarray,
-    disturbance: Disturbance | None,
-    t: float,
-    period: float,
-    substeps: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The state one period later."""
-    step = period / substeps
-    try:
-        for j in range(substeps):
-            total = tau if disturbance is None else tau + _disturbance(disturbance, t + j * step, q, v)
-            q, v = plant.step(q, v, total, step)
-    except SimulationDiverged as error:
-        raise SimulationDiverged(f"after t = {t:g} s: {error}") from error
-    return q, v

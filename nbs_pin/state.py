@@ -53,7 +53,7 @@ class Run:
     tau_command: Float[np.ndarray, "rows *batch n"]
     """Torque the controller asked for [N·m]."""
     disturbance: Float[np.ndarray, "rows *batch n"]
-    """Disturbance torque τ_d at the control instants [N·m]."""
+    """Disturbance torque τ_d at the control instants [N·m], 0 in the last row."""
     q_ref: Float[np.ndarray, "rows *batch n"]
     """Desired configuration [rad]."""
     v_ref: Float[np.ndarray, "rows *batch n"]

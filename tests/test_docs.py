@@ -134,3 +134,11 @@ def test_the_package_and_the_theory_write_the_same_symbols():
     for symbols in ("M(q)v̇+C(q,v)v+G(q)=τ+τ_d", "G=+∂V/∂q", "z1", "φ=v_d−Λ∇Φ(z1)", "z2"):
         assert symbols in package
         assert symbols in theory
+
+
+def test_every_public_name_is_the_thing_and_not_its_module():
+    """A function named like its module would be shadowed by it after the first import."""
+    for module in set(nbs_pin._HOME_OF.values()):
+        import_module(module)
+    for name in nbs_pin._HOME_OF:
+        assert not inspect.ismodule(getattr(nbs_pin, name)), name

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from nbs_pin.references import Sinusoid
 from nbs_pin.robot import load_robot
 from nbs_pin.simulation import simulate
 
+GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # prismatic, revolute and continuous
 PUBLISHED = {  # docs/theory.md §8: row k is the state after k − 1 steps of 1 ms
     2: (-6.2168733e-06, 7.9008678e-06, -2.2411318e-06),
     100: (-0.06075149, 0.07693954, -0.0214924),
@@ -47,11 +49,6 @@ def panda():
     return load_robot("panda")
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo appends its warnings to a file in the working directory
-
-
 def middle(robot):
     inside = np.isfinite(robot.lower) & np.isfinite(robot.upper)
     return np.where(inside, 0.5 * (np.where(inside, robot.lower, 0.0) + np.where(inside, robot.upper, 0.0)), 0.3)
@@ -77,7 +74,7 @@ class AccelerationOnly:
         return type(values)(0.0 * values.q, 0.0 * values.q, values.q)
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
+@pytest.mark.parametrize("name", [*ROBOT_NAMES, GANTRY])
 def test_mujoco_and_pinocchio_move_every_arm_alike(name):
     robot = load_robot(name)
     dynamics = PinocchioDynamics(robot)
@@ -91,7 +88,7 @@ def test_mujoco_and_pinocchio_move_every_arm_alike(name):
     np.testing.assert_allclose(runs[0].v, runs[1].v, rtol=0, atol=1e-10, equal_nan=False)
 
 
-@pytest.mark.parametrize("name", ROBOT_NAMES)
+@pytest.mark.parametrize("name", [*ROBOT_NAMES, GANTRY])
 def test_mujoco_and_pinocchio_agree_on_mass_bias_and_acceleration(name):
     robot = load_robot(name)
     mujoco, dynamics = MujocoPlant(robot), PinocchioDynamics(robot)
@@ -172,6 +169,11 @@ def test_a_mujoco_step_depends_on_its_arguments_alone(joint_friction):
     np.testing.assert_array_equal(plant.step(*first, 0.001), before)
     for twin in (pickle.loads(pickle.dumps(plant)), copy.deepcopy(plant)):
         np.testing.assert_array_equal(twin.step(*first, 0.001), before)
+
+
+def test_kept_friction_is_integrated_implicitly():
+    assert MujocoPlant(load_robot("xarm7"), joint_friction="keep").integrator == "implicitfast"
+    assert MujocoPlant(load_robot("xarm7")).integrator == "rk4"
 
 
 def test_kept_damping_is_the_urdfs():
@@ -269,7 +271,7 @@ def test_a_provider_that_leaves_the_finite_numbers_raises(panda):
 
 def test_unknown_choices_are_refused(panda):
     dynamics = PinocchioDynamics(panda)
-    with pytest.raises(ArgumentError, match="2 joints, the dynamics 7"):
+    with pytest.raises(ArgumentError, match="2 joints, the arm has 7"):
         DynamicsPlant(dynamics, friction=JointFriction(np.ones(2), np.ones(2)))
     # The annotations are executed in tests, and refuse first what the constructor refuses for a user.
     for make in (MujocoPlant, lambda *a: DynamicsPlant(dynamics, *a[1:])):

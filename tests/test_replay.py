@@ -11,7 +11,7 @@ import pytest
 
 from nbs_pin.exceptions import ArgumentError, RobotError
 from nbs_pin.meshes import MeshError, find_mesh, read_mesh
-from nbs_pin.replay import body_poses, replay
+from nbs_pin.replay_page import body_poses, replay
 from nbs_pin.robot import load_robot
 from nbs_pin.state import Run
 from nbs_pin.visuals import STEEL, Mimic, Transmission, link_visuals, read_couplings, tip

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nbs_pin.controllers.controller import Controller, MemorylessController
+from nbs_pin.controllers.pid import PID
 from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -14,9 +15,10 @@ from nbs_pin.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.plants.mujoco_plant import MujocoPlant
 from nbs_pin.progress import tracked
+from nbs_pin.reference_files import Sampled
 from nbs_pin.references import Hold, Sinusoid
 from nbs_pin.robot import load_robot
-from nbs_pin.simulation import simulate
+from nbs_pin.simulation import simulate, stream
 from nbs_pin.state import Reference, Run
 
 N = 2
@@ -175,9 +177,45 @@ def test_a_finer_plant_step_converges_to_the_closed_form_whatever_the_period():
         options = {"plant_step": plant_step, "disturbance": lambda t, q, v: np.full(q.shape, np.sin(t))}
         run = simulate(PLANT, SILENT, STILL, 1.0, 0.1, **options)
         errors.append(abs(run.q[-1, 0] - (1.0 - np.sin(1.0))))
-        np.testing.assert_allclose(run.disturbance[:, 1], np.sin(run.t), rtol=1e-12)
+        np.testing.assert_allclose(run.disturbance[:-1, 1], np.sin(run.t[:-1]), rtol=1e-12)
     assert errors[0] == pytest.approx(2.0 * errors[1], rel=0.05)
     assert errors[1] < 2e-3
+
+
+def test_the_recorded_disturbance_is_the_one_that_acted():
+    """A callable with a memory of its own is asked once per plant step, and what it said is what is written."""
+    rng = np.random.default_rng(0)
+    said = []
+    run = simulate(PLANT, SILENT, STILL, 0.03, 0.01, plant_step=0.01, disturbance=lambda t, q, v: said.append(
+        rng.normal(size=q.shape)) or said[-1])  # fmt: skip
+    assert len(said) == 3
+    np.testing.assert_array_equal(run.disturbance[:-1], said)
+    np.testing.assert_array_equal(run.disturbance[-1], 0.0)
+    np.testing.assert_allclose(np.diff(run.v, axis=0), 0.01 * np.array(said), rtol=1e-12)
+
+
+@pytest.mark.parametrize("law", ["memoryless", "pid"])
+def test_a_stream_is_the_run_in_pieces(law):
+    """Block by block, the very numbers of one simulation, for laws with and without memory."""
+    reference = Sinusoid([1.0, 0.5], [2.0, 3.0])
+    pid = PID(kp=np.full(2, 50.0), ki=np.full(2, 20.0), kd=np.full(2, 10.0), effort_limit=np.full(2, 5.0))
+    controller = pid if law == "pid" else PD
+    options = {"q0": np.ones((3, 2)), "disturbance": SquareWave(1.0, 9.0), "effort_limit": 5.0}
+    whole = simulate(PLANT, controller, reference, 1.0, 0.01, **options)
+    pieces = list(stream(PLANT, controller, reference, 1.0, 0.01, block=37, **options))
+    assert [len(piece.t) - 1 for piece in pieces] == [37, 37, 26]
+    for name in ("t", "q", "v", "tau", "tau_command", "disturbance", "q_ref"):
+        joined = np.concatenate([*(getattr(piece, name)[:-1] for piece in pieces), getattr(pieces[-1], name)[-1:]])
+        np.testing.assert_array_equal(joined, getattr(whole, name))
+    with pytest.raises(ArgumentError, match="block is 0 periods"):
+        next(stream(PLANT, controller, reference, 1.0, 0.01, block=0))
+
+
+def test_a_motion_is_not_asked_for_what_comes_after_its_end():
+    """A reference that ends in motion: looking ahead of the last instant would see it stop dead."""
+    t = np.linspace(0.0, 1.0, 101)
+    run = simulate(PLANT, PD, Sampled(t, np.stack([t, t**2], axis=-1)), 1.0, 0.01)
+    assert np.abs(np.diff(run.tau, axis=0)[-1]).max() < 0.1
 
 
 def test_the_default_plant_step_is_the_longest_within_a_millisecond():

@@ -6,8 +6,8 @@ from jaxtyping import Float
 from nbs_pin.arrays import Array, as_vectors, constant_like
 from nbs_pin.controllers.compiled import CompiledController, is_packable
 from nbs_pin.controllers.controller import Controller, MemorylessController
-from nbs_pin.controllers.gains import PerJoint, check_sampling, positive_gains
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.controllers.gains import PerJoint, gains_for_robot, largest_inertia, positive_gains, warn_if_too_fast
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robot import Robot
@@ -30,7 +30,7 @@ class ComputedTorque(MemorylessController):
         kd: PerJoint,
         friction: JointFriction | None = None,
     ) -> None:
-        self.dynamics, self.friction = dynamics, friction
+        self.dynamics, self.friction = dynamics, friction_of_size(friction, dynamics.nv)
         self.kp, self.kd = positive_gains(dynamics.nv, kp=kp, kd=kd)
 
     @classmethod
@@ -43,11 +43,12 @@ class ComputedTorque(MemorylessController):
         period: float = 0.001,
         friction: JointFriction | None = None,
     ) -> "ComputedTorque":
-        """Critically damped with both poles at −2ω: the error falls by e in about 1/ω, as in the other laws."""
-        check_sampling(bandwidth, period)
-        one = np.ones(robot.nv)
+        """Critically damped, poles at −2ω or, where effort allows more, at the stiffness of `gains_for_robot`."""
         dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
-        return cls(dynamics, kp=4.0 * bandwidth**2 * one, kd=4.0 * bandwidth * one, friction=friction)
+        gains = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period)
+        warn_if_too_fast(robot, dynamics, 2.0 * bandwidth)
+        kp = np.maximum(4.0 * bandwidth**2, gains.stiffness / largest_inertia(robot, dynamics))
+        return cls(dynamics, kp=kp, kd=2.0 * np.sqrt(kp), friction=friction)
 
     @property
     def nv(self) -> int:

@@ -1,5 +1,6 @@
 """Gains for an arm that nobody tuned, from its inertia and its effort limits."""
 
+import warnings
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -16,7 +17,7 @@ PerJoint: TypeAlias = float | Float[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class Gains:
-    """K, Λ and D₀ of the potential Φ = ½zᵀKz + ψ(z) and the damping D = ωM + D₀ + TᵀT, with ΛK = ωI."""
+    """K, Λ and D₀ of the potential Φ = ½zᵀKz + ψ(z) and the total damping ωM + D₀ + TᵀT, with ΛK = ωI."""
 
     bandwidth: float
     """ω [rad/s]."""
@@ -46,9 +47,11 @@ def gains_for_robot(
     M_e: `effective_inertia`. bandwidth: ω [rad/s]. period: control period h [s]. √k·h = 0.03 is soft, 0.1 a good
     default, 0.4 still stable without delay (docs/theory.md §2). damping_ratio: ζ. start_error: the error [rad] up to
     which the stiffness alone saturates no joint.
-    Raises ArgumentError when ω or h is out of range.
+    Raises ArgumentError when ω or h is out of range, or the dynamics is of another number of joints.
     """
     check_sampling(bandwidth, period)
+    if dynamics.nv != robot.nv:
+        raise ArgumentError(f"the dynamics has {dynamics.nv} joints and {robot.name} {robot.nv}; give its own model.")
     inertia = effective_inertia(robot, dynamics)
     stiffness = np.minimum((stiffness_per_sample / period) ** 2 * inertia, robot.effort_limit / start_error)
     return Gains(bandwidth, stiffness, 2.0 * damping_ratio * np.sqrt(stiffness * inertia))
@@ -59,13 +62,12 @@ def pd_gains(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """K_p [N·m/rad], that of `gains_for_robot`, and K_d [N·m·s/rad], critical for the largest inertia each joint moves.
 
-    K_d stays below ½M_e/h, where a sampled derivative begins to chatter (docs/theory.md §5).
+    K_d stays at or below ½M_e/h, a quarter of what makes a sampled damper on that inertia alone chatter (2M_e/h).
     Raises ArgumentError when ω or h is out of range.
     """
     kp = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period).stiffness
-    q = sample_configurations(robot)
-    largest = np.diagonal(dynamics.mass_matrix(q), axis1=-2, axis2=-1).max(axis=0)
-    return kp, np.minimum(2.0 * np.sqrt(kp * largest), 0.5 * effective_inertia(robot, dynamics) / period)
+    critical = 2.0 * np.sqrt(kp * largest_inertia(robot, dynamics))
+    return kp, np.minimum(critical, 0.5 * effective_inertia(robot, dynamics) / period)
 
 
 def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndarray, " n"]:
@@ -77,10 +79,14 @@ def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndar
     return (1.0 / np.diagonal(inverse, axis1=-2, axis2=-1)).min(axis=0)
 
 
+def largest_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndarray, " n"]:
+    """max_q M_ii(q) [kg·m²] over sampled configurations: the most inertia joint i moves with the others held."""
+    return np.diagonal(dynamics.mass_matrix(sample_configurations(robot)), axis1=-2, axis2=-1).max(axis=0)
+
+
 def sample_configurations(robot: Robot, count: int = 1000, seed: int = 0) -> Float[np.ndarray, "count n"]:
     """Uniform configurations within the position limits, a full turn where there are none [rad]."""
-    lower, upper = np.clip(robot.lower, -np.pi, np.pi), np.clip(robot.upper, -np.pi, np.pi)
-    return np.random.default_rng(seed).uniform(lower, upper, (count, robot.nv))
+    return np.random.default_rng(seed).uniform(*robot.sampling_range, (count, robot.nv))
 
 
 def check_sampling(bandwidth: float, period: float) -> None:
@@ -91,6 +97,22 @@ def check_sampling(bandwidth: float, period: float) -> None:
         raise ArgumentError(
             f"bandwidth {bandwidth} rad/s at a period of {period} s leaves {1 / (bandwidth * period):.2g} samples per"
             f" time constant; give a bandwidth of at most {0.5 / period:.4g} rad/s or a shorter period."
+        )
+
+
+def warn_if_too_fast(robot: Robot, dynamics: DynamicsProvider, bandwidth: float, start_error: float = 0.3) -> None:
+    """Warns when ω asks a joint for several times its effort limit from `start_error` [rad]: ω²M_ii of it alone.
+
+    A law that saturates for long has no proof left, and from about four times the limit some arms no longer converge.
+    """
+    asked = bandwidth**2 * largest_inertia(robot, dynamics) * start_error / robot.effort_limit
+    worst = int(np.argmax(asked))
+    if asked[worst] > 4.0:
+        warnings.warn(
+            f"a bandwidth of {bandwidth:g} rad/s asks joint '{robot.joint_names[worst]}' of {robot.name} for"
+            f" {asked[worst]:.1f} times its effort limit from an error of {start_error} rad and may not converge from"
+            f" there; take at most {bandwidth * np.sqrt(4.0 / asked[worst]):.3g} rad/s, or start on the reference.",
+            stacklevel=3,
         )
 
 

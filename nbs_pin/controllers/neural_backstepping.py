@@ -10,8 +10,8 @@ from torch import nn
 from nbs_pin.arrays import Array, array_namespace, as_vectors, is_torch_array, matvec
 from nbs_pin.controllers.compiled import CompiledController, is_packable
 from nbs_pin.controllers.controller import Controller, MemorylessController
-from nbs_pin.controllers.gains import Gains, gains_for_robot
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.controllers.gains import Gains, gains_for_robot, warn_if_too_fast
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.networks.damping import Damping
@@ -74,7 +74,7 @@ class NeuralBackstepping(MemorylessController, nn.Module):
             raise ArgumentError(f"the rate Λ is {rates.tolist()}; give {nv} positive numbers [rad/s per N·m].")
         if not 0.0 <= inertial_rate < np.inf:
             raise ArgumentError(f"the inertial rate ω is {inertial_rate}; give a number ≥ 0 [1/s].")
-        self.dynamics, self.friction = dynamics, friction
+        self.dynamics, self.friction = dynamics, friction_of_size(friction, dynamics.nv)
         self.potential, self.damping = potential, damping
         self.inertial_rate = inertial_rate
         self.register_buffer("rate", rates.clone())
@@ -95,7 +95,8 @@ class NeuralBackstepping(MemorylessController, nn.Module):
     ) -> "NeuralBackstepping":
         """A controller for an arm that nobody tuned, from its inertia, effort limits and control period.
 
-        bandwidth: ω [rad/s], the rate at which errors decay. period: control period h [s].
+        bandwidth: ω [rad/s], the rate at which errors decay; warns when it is too fast for the effort limits.
+        period: control period h [s].
         potential: "smooth" or "paper". damping: "inertial" (ωM + D₀ + TᵀT), "bounded" (D₀ + TᵀT) or "paper" (TᵀT).
         dynamics: None takes Pinocchio's model of `robot`. gains: None computes them (`gains_for_robot`).
         The paper's networks with S = I, Λ = I are built by hand: see `paper_controller`.
@@ -107,6 +108,7 @@ class NeuralBackstepping(MemorylessController, nn.Module):
             raise ArgumentError(f"damping '{damping}' is unknown; choose one of {', '.join(DAMPINGS)}.")
         dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
         chosen = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period) if gains is None else gains
+        warn_if_too_fast(robot, dynamics, chosen.bandwidth)
         root = np.sqrt(chosen.stiffness)
         phi = Potential(np.diag(0.5 * chosen.stiffness), form=potential, scale=root, seed=seed)
         if damping == "paper":

@@ -6,7 +6,7 @@ from nbs_pin.arrays import Array, as_vectors, constant_like
 from nbs_pin.controllers.compiled import CompiledController, is_packable
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.controllers.gains import PerJoint, pd_gains, positive_gains
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
@@ -36,7 +36,7 @@ class PD(MemorylessController):
     ) -> None:
         if feedforward not in FEEDFORWARDS:
             raise ArgumentError(f"feedforward '{feedforward}' is unknown; choose one of {', '.join(FEEDFORWARDS)}.")
-        self.dynamics, self.feedforward, self.friction = dynamics, feedforward, friction
+        self.dynamics, self.feedforward, self.friction = dynamics, feedforward, friction_of_size(friction, dynamics.nv)
         self.kp, self.kd = positive_gains(dynamics.nv, kp=kp, kd=kd)
 
     @classmethod

@@ -43,11 +43,16 @@ class PID(Controller):
         filter_time: float = 0.0,
         continuous: np.ndarray | None = None,
     ) -> None:
-        self.kp, self.ki, self.kd = positive_gains(len(kp), kp=kp, ki=ki, kd=kd)
-        (self.effort_limit,) = positive_gains(len(kp), effort_limit=effort_limit)
+        nv = np.size(kp)
+        self.kp, self.ki, self.kd, self.effort_limit = positive_gains(
+            nv, kp=kp, ki=ki, kd=kd, effort_limit=effort_limit
+        )
         if not 0.0 <= filter_time < np.inf:
             raise ArgumentError(f"filter_time is {filter_time} s; give a time ≥ 0.")
-        self.filter_time, self.continuous = filter_time, continuous
+        self.filter_time = filter_time
+        self.continuous = np.zeros(nv, dtype=bool) if continuous is None else np.asarray(continuous, dtype=bool)
+        if self.continuous.shape != (nv,):
+            raise ArgumentError(f"continuous has {self.continuous.size} entries, expected {nv}: one per joint.")
 
     @classmethod
     def for_robot(cls, robot: Robot, *, bandwidth: float = 8.0, period: float = 0.001) -> "PID":
@@ -92,9 +97,8 @@ class PID(Controller):
         """The law as machine code (`Controller.compile`)."""
         if type(self) is not PID:
             return self
-        continuous = np.zeros(self.nv) if self.continuous is None else self.continuous
         filter_time = np.full(self.nv, self.filter_time)
-        return CompiledPID(np.array([self.kp, self.ki, self.kd, self.effort_limit, filter_time, continuous]))
+        return CompiledPID(np.array([self.kp, self.ki, self.kd, self.effort_limit, filter_time, self.continuous]))
 
 
 class CompiledPID(Controller):

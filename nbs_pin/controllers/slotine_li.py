@@ -6,8 +6,8 @@ from jaxtyping import Float
 from nbs_pin.arrays import Array, as_vectors, constant_like
 from nbs_pin.controllers.compiled import CompiledController, is_packable
 from nbs_pin.controllers.controller import Controller, MemorylessController
-from nbs_pin.controllers.gains import PerJoint, effective_inertia, gains_for_robot, positive_gains
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.controllers.gains import PerJoint, effective_inertia, gains_for_robot, positive_gains, warn_if_too_fast
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robot import Robot
@@ -30,7 +30,7 @@ class SlotineLi(MemorylessController):
         gain: PerJoint,
         friction: JointFriction | None = None,
     ) -> None:
-        self.dynamics, self.friction = dynamics, friction
+        self.dynamics, self.friction = dynamics, friction_of_size(friction, dynamics.nv)
         self.rate, self.gain = positive_gains(dynamics.nv, rate=rate, gain=gain)
 
     @classmethod
@@ -46,6 +46,7 @@ class SlotineLi(MemorylessController):
         """λ = ω, and K such that a static error meets the stiffness λK of `gains_for_robot`, short of chatter."""
         dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
         gains = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period)
+        warn_if_too_fast(robot, dynamics, bandwidth)
         gain = np.minimum(gains.stiffness / bandwidth, 0.5 * effective_inertia(robot, dynamics) / period)
         return cls(dynamics, rate=np.full(robot.nv, bandwidth), gain=gain, friction=friction)
 

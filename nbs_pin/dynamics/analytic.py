@@ -24,8 +24,12 @@ class AnalyticDynamics(DynamicsProvider):
         gravity: float = 9.8,
         robot: Robot | None = None,
     ) -> None:
-        if not min(*masses, *lengths) > 0.0:
-            raise ArgumentError(f"masses {masses} and lengths {lengths} must be positive; give kg and m above 0.")
+        numbers = np.array([*masses, *lengths])
+        if not (np.isfinite([*numbers, gravity]).all() and (numbers > 0.0).all()):
+            raise ArgumentError(
+                f"masses {masses}, lengths {lengths} and gravity {gravity} were given, expected finite numbers; masses"
+                " [kg] and lengths [m] must be positive."
+            )
         (m1, m2), (l1, l2) = masses, lengths
         self._robot = robot
         self._shoulder = (m1 + m2) * l1 * l1  # inertia of both masses at the elbow about the shoulder

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
+from nbs_pin.arrays import over_rows
+
 
 def differentiable(
     value: Callable[..., np.ndarray], vjp: Callable[..., Sequence[np.ndarray]], *arguments: torch.Tensor
@@ -15,9 +17,8 @@ def differentiable(
     return _OverRows.apply(value, vjp, *arguments)  # type: ignore[no-untyped-call]
 
 
-def _rows(tensor: torch.Tensor, batch_ndim: int) -> np.ndarray:
-    array = tensor.detach().to("cpu", torch.float64).numpy()
-    return array.reshape(-1, *array.shape[batch_ndim:])
+def _numpy(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().to("cpu", torch.float64).numpy()
 
 
 class _OverRows(torch.autograd.Function):
@@ -27,17 +28,14 @@ class _OverRows(torch.autograd.Function):
     ) -> torch.Tensor:
         ctx.vjp = vjp
         ctx.save_for_backward(*arguments)
-        like, batch = arguments[0], arguments[0].shape[:-1]
-        rows = [_rows(x, len(batch)) for x in arguments]
-        values = np.stack([value(*row) for row in zip(*rows, strict=True)])
-        return torch.as_tensor(values.reshape(*batch, *values.shape[1:]), dtype=like.dtype, device=like.device)
+        return arguments[0].new_tensor(over_rows(value, *(_numpy(x) for x in arguments)))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, cotangent: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         arguments = ctx.saved_tensors
-        like, batch = arguments[0], arguments[0].shape[:-1]
-        rows = [_rows(x, len(batch)) for x in (cotangent, *arguments)]
-        gradients = zip(*(ctx.vjp(*row) for row in zip(*rows, strict=True)), strict=True)
-        tensors = (torch.as_tensor(np.stack(g), dtype=like.dtype, device=like.device) for g in gradients)
-        return (None, None, *(t.reshape(x.shape) for t, x in zip(tensors, arguments, strict=True)))
+        n, batch = arguments[0].shape[-1], arguments[0].shape[:-1]
+        outputs = _numpy(cotangent).reshape(-1, *cotangent.shape[len(batch) :])
+        rows = [_numpy(x).reshape(-1, n) for x in arguments]
+        gradients = np.array([ctx.vjp(*row) for row in zip(outputs, *rows, strict=True)]).reshape(-1, len(arguments), n)
+        return (None, None, *(x.new_tensor(gradients[:, k]).reshape(x.shape) for k, x in enumerate(arguments)))

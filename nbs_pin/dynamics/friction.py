@@ -26,10 +26,12 @@ class JointFriction:
     """Speed at which 76 % of the Coulomb torque is reached [rad/s]."""
 
     def __post_init__(self) -> None:
-        for name, value in {"viscous": self.viscous, "coulomb": self.coulomb}.items():
-            if not (np.isfinite(value).all() and (value >= 0.0).all()):
+        for name in ("viscous", "coulomb"):
+            object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=float)))
+            value = getattr(self, name)
+            if value.ndim != 1 or not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ArgumentError(
-                    f"{name} friction is {value}, expected finite numbers ≥ 0; correct the coefficient."
+                    f"{name} friction is {value.tolist()}, expected finite numbers ≥ 0, one per joint; correct it."
                 )
         if self.viscous.shape != self.coulomb.shape:
             raise ArgumentError(
@@ -47,3 +49,12 @@ class JointFriction:
         """Torque [N·m] that friction takes at the velocity v [rad/s]; numpy in numpy out, torch in torch out."""
         viscous, coulomb = constant_like(v, self.viscous), constant_like(v, self.coulomb)
         return viscous * v + coulomb * array_namespace(v).tanh(v / self.transition)
+
+
+def friction_of_size(friction: JointFriction | None, nv: int) -> JointFriction | None:
+    """The friction itself; raises ArgumentError unless it is None or has a number for each of the nv joints."""
+    if friction is not None and friction.viscous.size != nv:
+        raise ArgumentError(
+            f"the friction is for {friction.viscous.size} joints, the arm has {nv}; give one per joint."
+        )
+    return friction

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, is_torch_array
+from nbs_pin.arrays import Array, as_vectors, is_torch_array, over_rows
 from nbs_pin.dynamics.provider import DynamicsProvider, ReferenceTorque
 from nbs_pin.robot import Robot
 
@@ -53,19 +53,19 @@ class PinocchioDynamics(DynamicsProvider):
 
     def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
         """M(q) [kg·m²] by the composite rigid body algorithm."""
-        return _evaluate(Quantity(self._mass_matrix, self._mass_matrix_vjp), q)
+        return self._evaluate(Quantity(self._mass_matrix, self._mass_matrix_vjp), q=q)
 
     def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
         """C(q, v) [N·m·s], the Christoffel one."""
-        return _evaluate(Quantity(self._coriolis_matrix, self._coriolis_matrix_vjp), q, v)
+        return self._evaluate(Quantity(self._coriolis_matrix, self._coriolis_matrix_vjp), q=q, v=v)
 
     def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
         """G(q) [N·m]."""
-        return _evaluate(Quantity(self._gravity, self._gravity_vjp), q)
+        return self._evaluate(Quantity(self._gravity, self._gravity_vjp), q=q)
 
     def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
         """V(q) [J], zero where all masses lie at the height of the base."""
-        return _evaluate(Quantity(self._potential_energy, self._potential_energy_vjp), q)
+        return self._evaluate(Quantity(self._potential_energy, self._potential_energy_vjp), q=q)
 
     def reference_torque(
         self,
@@ -79,17 +79,28 @@ class PinocchioDynamics(DynamicsProvider):
         C(q, v) w is bilinear and symmetric in (v, w), so with h(x) = C(q, x) x:
         C(q, v) v_r = h((v + v_r)/2) − h((v − v_r)/2) (docs/theory.md §1).
         """
-        return _evaluate(Quantity(self._reference_torque, self._reference_torque_vjp), q, v, v_r, a_r)
+        return self._evaluate(Quantity(self._reference_torque, self._reference_torque_vjp), q=q, v=v, v_r=v_r, a_r=a_r)
 
     def forward_dynamics(
         self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
     ) -> Float[Array, "*batch n"]:
         """v̇ [rad/s²] by the articulated body algorithm."""
-        return _evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q, v, tau)
+        return self._evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q=q, v=v, tau=tau)
 
     def compiled_reference_torque(self) -> ReferenceTorque:
         """The two RNEA on scratch space of its own, one where v_r is v itself; a subclass's own `reference_torque`."""
         return _TwoRnea(self._model, self._weightless) if type(self) is PinocchioDynamics else self.reference_torque
+
+    def _evaluate(self, quantity: Quantity, **arguments: Array) -> Array:
+        """The quantity over leading batch axes, in the kind of the arguments."""
+        vectors = as_vectors(self.nv, **arguments)
+        if is_torch_array(vectors[0]):
+            from nbs_pin.dynamics.autograd import differentiable
+
+            return differentiable(quantity.value, quantity.vjp, *vectors)
+        if vectors[0].ndim == 1:
+            return quantity.value(*vectors)
+        return over_rows(quantity.value, *vectors)
 
     # One state at a time: values.
 
@@ -176,22 +187,3 @@ class _TwoRnea:
         tau = pin.rnea(self._model, self._data, q, self._mean, a_r)
         tau -= pin.rnea(self._weightless, self._data, q, self._half, self._zero)
         return tau
-
-
-def _evaluate(quantity: Quantity, *arguments: Array) -> Array:
-    """The quantity over leading batch axes, in the kind of the arguments."""
-    if is_torch_array(arguments[0]):
-        from nbs_pin.dynamics.autograd import differentiable
-
-        return differentiable(quantity.value, quantity.vjp, *arguments)
-    if arguments[0].ndim == 1:
-        return quantity.value(*arguments)
-    return over_rows(quantity.value, *arguments)
-
-
-def over_rows(function: Callable[..., Row], *arguments: Row) -> Row:
-    """The function applied to every row of arrays with equal leading axes, stacked again."""
-    batch = arguments[0].shape[:-1]
-    rows = [x.reshape(-1, x.shape[-1]) for x in arguments]
-    values = np.stack([function(*row) for row in zip(*rows, strict=True)])
-    return values.reshape(*batch, *values.shape[1:])

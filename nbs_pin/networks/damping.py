@@ -98,7 +98,7 @@ class Damping(nn.Module):
 
 
 class _FCNN(nn.Module):
-    """Tanh hidden layers, linear output, weights U(−gain, gain), biases zero (paper eq. (3))."""
+    """Tanh hidden layers, linear output; starts like the authors', U(−gain, gain) and no bias (docs/theory.md §8)."""
 
     def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, gain: float) -> None:
         super().__init__()

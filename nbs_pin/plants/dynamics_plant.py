@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.checks import all_finite
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.plants.integrators import INTEGRATORS, IntegratorName
@@ -26,11 +26,9 @@ class DynamicsPlant(Plant):
     ) -> None:
         if integrator not in INTEGRATORS:
             raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(INTEGRATORS)}.")
-        if friction is not None and friction.viscous.shape != (dynamics.nv,):
-            raise ArgumentError(f"friction has {friction.viscous.size} joints, the dynamics {dynamics.nv}; match them.")
         self.dynamics = dynamics
         self.integrator = integrator
-        self.friction = friction
+        self.friction = friction_of_size(friction, dynamics.nv)
         self._step = INTEGRATORS[integrator]
 
     def __repr__(self) -> str:

@@ -32,7 +32,7 @@ def semi_implicit_euler(acceleration: Acceleration, q: Vector, v: Vector, h: flo
 
 
 def euler(acceleration: Acceleration, q: Vector, v: Vector, h: float) -> tuple[Vector, Vector]:
-    """q⁺ = q + h v, v⁺ = v + h a: first order and gains energy; the paper's plant uses it."""
+    """q⁺ = q + h v, v⁺ = v + h a: first order, gains energy; the authors' plant (docs/theory.md §8)."""
     return q + h * v, v + h * acceleration(q, v)
 
 

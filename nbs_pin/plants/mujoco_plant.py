@@ -1,5 +1,6 @@
 """MuJoCo as a plant, built from the same URDF bytes as the Pinocchio model (the only room that imports mujoco)."""
 
+import logging
 from collections.abc import Callable
 from typing import Any, Literal, TypeAlias
 
@@ -12,6 +13,7 @@ from nbs_pin.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.plants.plant import Plant
 from nbs_pin.robot import Robot
 
+_LOGGER = logging.getLogger("nbs_pin.mujoco")
 MujocoIntegrator: TypeAlias = Literal["rk4", "euler", "implicitfast"]
 JointFrictionChoice: TypeAlias = Literal["drop", "keep"]
 
@@ -40,7 +42,9 @@ class MujocoPlant(Plant):
     takes "rk4" without friction and "implicitfast" with it, since joint damping can be too stiff for explicit steps.
     joint_friction: "drop" leaves out the URDF's damping and dry friction, as Pinocchio does; "keep" has MuJoCo apply
     both, the dry friction as its hardest constraint.
-    Effort limits belong to `simulate`. Each plant owns one scratch `mujoco.MjData`: use one plant per thread.
+    Effort limits belong to `simulate`. MuJoCo's own warnings become SimulationDiverged here; for the whole process they
+    go to the logger "nbs_pin.mujoco" in place of a file in the working directory. Each plant owns one scratch
+    `mujoco.MjData`: use one plant per thread.
     Raises ArgumentError for an unknown choice and RobotError for an arm that MuJoCo cannot build.
     """
 
@@ -55,6 +59,7 @@ class MujocoPlant(Plant):
             raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(_INTEGRATORS)}.")
         if joint_friction not in _CONSTRAINTS_OFF:
             raise ArgumentError(f"joint_friction '{joint_friction}' is unknown; give 'drop' or 'keep'.")
+        mujoco.set_mju_user_warning(_LOGGER.info)
         self._robot = robot
         self.integrator = integrator
         self.joint_friction = joint_friction

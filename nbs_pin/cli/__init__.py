@@ -1,0 +1,166 @@
+"""The command line `nbs-pin`: a module per command, whose heavy imports wait until it runs."""
+
+import contextlib
+import difflib
+import io
+import os
+import re
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, TypeAlias, cast
+
+import tyro
+from rich.console import Console
+
+from nbs_pin import __version__
+from nbs_pin.cli.replay import Replay
+from nbs_pin.cli.robots import Robots
+from nbs_pin.cli.track import Track
+from nbs_pin.cli.values import OptionError
+from nbs_pin.exceptions import NbsPinError
+
+Command: TypeAlias = (
+    Annotated[Track, tyro.conf.subcommand("track")]
+    | Annotated[Replay, tyro.conf.subcommand("replay")]
+    | Annotated[Robots, tyro.conf.subcommand("robots")]
+)
+NAMES = ("track", "replay", "robots")
+BAD_INPUT, INTERRUPTED = 2, 130
+_DESCRIPTION = (
+    "Tracking control for any URDF arm. `nbs-pin COMMAND --help` shows the options of a command; "
+    "`nbs-pin --version` the version. Exit codes: 0 done, 2 bad input, 130 interrupted."
+)
+
+
+class Output(Console):
+    """Standard output, whose reader may leave early."""
+
+    def on_broken_pipe(self) -> None:
+        """Let `main` end quietly; rich would end with exit code 1."""
+        raise BrokenPipeError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs `nbs-pin` with these arguments, or the shell's; returns the exit code.
+
+    0 done, 2 bad input with one sentence on stderr, 130 interrupted by Ctrl-C, 143 by SIGTERM.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? for them
+    notes = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    with _stops() as stops, _warnings_to(notes):
+        try:
+            return _run(arguments, notes)
+        except BaseException as error:
+            # A signal that meets the import of an extension comes out as its ImportError: ask the signal first.
+            if stops or isinstance(error, KeyboardInterrupt):
+                notes.print("nbs-pin: interrupted.")
+                return stops[0] if stops else INTERRUPTED
+            return _failed(error, notes)
+
+
+def _failed(error: BaseException, notes: Console) -> int:
+    """The exit code for an error that the user can mend, after one sentence; raises any other again."""
+    if isinstance(error, NbsPinError):
+        notes.print(f"nbs-pin: error: {_one_line(str(error))}")
+    elif isinstance(error, BrokenPipeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # whoever read the output has seen enough
+        return 0
+    elif isinstance(error, OSError):
+        where = f"'{error.filename}': " if error.filename is not None else ""
+        reason = (error.strerror or str(error)).lower()
+        notes.print(f"nbs-pin: error: {where}{reason}; check the path, its permissions and the space left.")
+    else:
+        raise error
+    return BAD_INPUT
+
+
+def _run(arguments: list[str], notes: Console) -> int:
+    console = Output()
+    if arguments == ["--version"]:
+        console.print(f"nbs-pin {__version__}", highlight=False)
+        return 0
+    command = parse(arguments)
+    if command is not None:
+        command.run(console, notes)
+    return 0
+
+
+def parse(arguments: list[str]) -> Any:
+    """The command with its options, None when help was asked for; raises OptionError for words that make no command."""
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in NAMES:
+        raise OptionError(f"no command '{arguments[0]}'; {_near(arguments[0], NAMES)}give {', '.join(NAMES)}.")
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            command, unknown = tyro.cli(
+                cast(Any, Command),
+                prog="nbs-pin",
+                description=_DESCRIPTION,
+                args=arguments,
+                config=(tyro.conf.FlagCreatePairsOff,),
+                return_unknown_args=True,
+            )
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            return None
+        raise OptionError(f"{_first_paragraph(complaint.getvalue())}; see nbs-pin --help.") from None
+    if unknown:
+        flags = [f"--{name.replace('_', '-')}" for name in vars(command)]
+        what = "has no option" if unknown[0].startswith("-") else "cannot use the word"
+        remedy = f"{_near(unknown[0], flags)}see nbs-pin {arguments[0]} --help."
+        raise OptionError(f"nbs-pin {arguments[0]} {what} '{unknown[0]}'; {remedy}")
+    return command
+
+
+def _near(word: str, words: Sequence[str]) -> str:
+    near = difflib.get_close_matches(word.partition("=")[0], words, n=1)
+    return f"did you mean {near[0]}? " if near else ""
+
+
+def _first_paragraph(box: str) -> str:
+    """What tyro's box says before its first rule, as one line."""
+    inside = [line.strip("│ ") for line in box.splitlines() if not line.startswith(("╭", "╰"))]
+    rules = [k for k, line in enumerate(inside) if line.startswith("─")]
+    return _one_line(" ".join(inside[: rules[0] if rules else None])).rstrip(".")
+
+
+def _one_line(text: str) -> str:
+    return re.sub(r"\s+", " ", text).strip()
+
+
+@contextlib.contextmanager
+def _stops() -> Iterator[list[int]]:
+    """The exit codes of the signals that came: Ctrl-C and SIGTERM end the program like an exception, drafts removed.
+
+    Only the main thread may ask for signals; elsewhere the list stays empty.
+    """
+    stops: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield stops
+        return
+
+    def stop(number: int, _: Any) -> None:
+        stops.append(128 + number)
+        raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stops
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _warnings_to(notes: Console) -> Iterator[None]:
+    """Warnings as one line each, without those that speak to the authors of a library."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.showwarning = lambda message, *_, **__: notes.print(f"nbs-pin: warning: {_one_line(str(message))}")
+        yield

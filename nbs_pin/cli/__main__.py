@@ -1,0 +1,7 @@
+"""`python -m nbs_pin.cli`."""
+
+import sys
+
+from nbs_pin.cli import main
+
+sys.exit(main())

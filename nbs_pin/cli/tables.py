@@ -1,0 +1,46 @@
+"""Results as tables for people."""
+
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+
+def print_tracking(console: Console, title: str, figures: dict[str, Any], wall_time: float) -> None:
+    """A row per joint, then what counts for the whole arm; `figures` as `studies.tracking.figures` gives them."""
+    after = figures["late_after_s"]
+    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    table.add_column("joint", overflow="fold")
+    for heading in ("RMS error\n[rad]", f"after {after:g} s\n[rad]", "last 30 %\n[rad]", "peak\n[N·m]", "limit\n[N·m]"):
+        table.add_column(Text(heading), justify="right", no_wrap=True)
+    columns = ("rms_error_rad", "rms_error_late_rad", "rms_error_last_30_percent_rad")
+    torques = zip(figures["joint_peak_torque_Nm"], figures["effort_limit_Nm"], strict=True)
+    for joint, errors, (peak, limit) in zip(
+        figures["joints"], zip(*(figures[name] for name in columns), strict=True), torques, strict=True
+    ):
+        table.add_row(
+            Text(joint), *(f"{e:.2e}" for e in errors), f"{peak:.4g}", "none" if limit is None else f"{limit:.4g}"
+        )
+    console.print(table)
+    for line in _lines(figures, wall_time):
+        console.print(line, highlight=False, markup=False)
+
+
+def converged(figures: dict[str, Any]) -> str:
+    """When the error came to stay below the paper's threshold, in words."""
+    time = figures["convergence_time_s"]
+    return "not within the run" if time is None else f"{time:.3f} s"
+
+
+def _lines(figures: dict[str, Any], wall_time: float) -> list[str]:
+    saturated, late = figures["saturated_fraction"], figures["saturated_fraction_late"]
+    outside = zip(figures["joints"], figures["outside_position_range_rad"], strict=True)
+    return [
+        f"converged (‖error‖ < 0.1 rad to the end): {converged(figures)}",
+        f"some joint at its effort limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
+        *(f"{joint} went {excess:.3g} rad beyond its range, which the plant lets it" for joint, excess in outside
+          if excess > 0.0),
+        f"simulated {figures['duration_s']:g} s in {wall_time:.1f} s",
+    ]  # fmt: skip

@@ -1,0 +1,147 @@
+"""`nbs-pin track`: an arm follows a motion; run, summary, picture and replay land in a folder."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+from nbs_pin.cli.tables import print_tracking
+from nbs_pin.cli.values import OptionError, disturbance_text, integer, number, parse_disturbance
+
+
+def _default(hint: str) -> Any:
+    return tyro.conf.arg(help_behavior_hint=f"(default: {hint})")
+
+
+@dataclass(frozen=True)
+class Track:
+    """Let an arm follow a motion, and write run.npz, summary.json, tracking.png and replay.html.
+
+    Example: nbs-pin track panda --start-error 0.3 --disturbance square:5@8 --out out/panda
+    """
+
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
+    """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
+    plant: Literal["mujoco", "pinocchio"] = "mujoco"
+    """What simulates the arm."""
+    controller: Literal["nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid"] = "nbs"
+    """The law. nbs-paper is the paper's own on two_link, its networks with this arm's gains elsewhere."""
+    reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
+    """What to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints."""
+    frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0
+    """Frequency of the sinusoid [rad/s]."""
+    duration: Annotated[
+        float | None, number("--duration", above=0.0, most=100_000.0, unit="s"), _default("10, or the file's length")
+    ] = None
+    """Simulated time, a whole number of periods [s]."""
+    period: Annotated[float, number("--period", least=1e-5, most=0.1, unit="s")] = 0.001
+    """Control period [s]."""
+    bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
+    """Rate at which errors decay [rad/s]; the paper's own law on two_link has none."""
+    start_error: Annotated[float, number("--start-error", least=0.0, most=math.pi, unit="rad")] = 0.0
+    """Added to every joint with alternating sign, the arm then starting at rest [rad]; 0 starts on the motion."""
+    disturbance: Annotated[str, disturbance_text()] = "none"
+    """Torque on every joint [N·m]: none, constant:5, square:5@8, sine:5@8 (@ rad/s) or noise:0.5 (standard deviation).
+    A comma list gives one per joint: constant:5,5,3."""
+    joint_friction: Literal["drop", "keep"] = "drop"
+    """Joint friction of the URDF: left out, or acting and fed forward by every law with a model."""
+    effort_limit: Annotated[
+        float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), _default("the arm's")
+    ] = None
+    """Largest torque of every joint [N·m]."""
+    no_effort_limit: bool = False
+    """Let torques grow without limit."""
+    seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
+    """Of network weights and noise."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), _default("out/track-ROBOT")] = None
+    """Folder for the results."""
+    force: bool = False
+    """Replace the results of another run in that folder."""
+
+    def run(self, console: Console, notes: Console) -> None:
+        """Tracks, writes and prints; raises NbsPinError or OSError."""
+        if self.no_effort_limit and self.effort_limit is not None:
+            raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
+        with notes.status(f"loading {self.robot}"):
+            from nbs_pin.catalogue import ROBOT_NAMES
+            from nbs_pin.robot import load_robot
+            from nbs_pin.studies import motions, tracking
+
+            named = self.robot in ROBOT_NAMES or not Path(self.robot).is_file()
+            robot = load_robot(self.robot if named else Path(self.robot).resolve())  # the replay finds it from anywhere
+        motion, length = motions.motion_of(self.reference, robot, frequency=self.frequency, period=self.period)
+        settings = self._settings(robot.source, self.duration or length)
+        folder = self.out or Path("out") / f"track-{re.sub(r'[^A-Za-z0-9_.-]', '_', robot.name)}"
+        facts = {"settings": settings, "versions": tracking.versions(), "robot_sha256": robot.sha256}
+        _check_folder(folder, tracking.FILES, facts, self.force)
+        with _folder(folder):
+            run, wall_time = tracking.track(
+                robot,
+                plant=self.plant,
+                controller=self.controller,
+                reference=motion,
+                duration=settings["duration"],
+                period=self.period,
+                bandwidth=self.bandwidth,
+                start_error=self.start_error,
+                disturbance=parse_disturbance(self.disturbance).build(robot.nv, self.period, self.seed),
+                joint_friction=self.joint_friction,
+                effort_limit=math.inf if self.no_effort_limit else self.effort_limit,
+                seed=self.seed,
+                progress=True,
+            )
+            run.info.update(reference=self.reference, **facts)
+            figures = tracking.figures(run, robot)
+            with notes.status(f"drawing picture and replay into {folder}"):
+                summary = facts | {"seed": self.seed, "wall_time_s": wall_time, "figures": figures}
+                tracking.write_results(run, folder, robot, summary)
+        print_tracking(console, f"{robot.name}, {self.controller} in {self.plant}", figures, wall_time)
+        for name in tracking.FILES:
+            console.print(str(folder / name), soft_wrap=True, highlight=False, markup=False)
+
+    def _settings(self, robot: str, duration: float) -> dict[str, Any]:
+        """Everything that decides the run, as JSON can store it."""
+        settings = dataclasses.asdict(self) | {"robot": robot, "duration": duration}
+        del settings["out"], settings["force"]
+        if Path(self.reference).is_file():
+            settings["reference_sha256"] = hashlib.sha256(Path(self.reference).read_bytes()).hexdigest()
+        return settings
+
+
+@contextlib.contextmanager
+def _folder(folder: Path) -> Iterator[None]:
+    """The folder, made before any long work so that a bad path is known at once; unmade again if it stays empty."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        for path in made:
+            if path.is_dir() and not any(path.iterdir()):
+                path.rmdir()
+
+
+def _check_folder(folder: Path, names: tuple[str, ...], same: dict[str, Any], force: bool) -> None:
+    """Raises OptionError when the folder holds results that are not those of the very same run, unless forced."""
+    if folder.exists() and not folder.is_dir():
+        raise OptionError(f"--out '{folder}' is a file; give a folder.")
+    present = [name for name in names if (folder / name).exists()]
+    if not present or force:
+        return
+    try:
+        summary = json.loads((folder / "summary.json").read_text())
+    except (OSError, ValueError):
+        summary = None  # results without a readable summary are another run's
+    if not isinstance(summary, dict) or {key: summary.get(key) for key in same} != same:
+        raise OptionError(
+            f"'{folder}' holds {present[0]} of another run; give another --out, or --force to replace it."
+        )

@@ -1,0 +1,115 @@
+"""Values of options, read strictly: a number that cannot be meant is refused in one sentence that names the flag."""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+from tyro.constructors import PrimitiveConstructorSpec
+
+from nbs_pin.exceptions import NbsPinError
+
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_INTEGER = re.compile(r"[0-9]+")
+DisturbanceKind: TypeAlias = Literal["constant", "square", "sine", "noise"]
+
+
+class OptionError(NbsPinError):
+    """An option of the command line that cannot be meant; not a ValueError, which tyro would reword."""
+
+
+def number(
+    flag: str, *, above: float = -math.inf, least: float = -math.inf, most: float, unit: str
+) -> PrimitiveConstructorSpec[float]:
+    """A number in (above, most] or [least, most] for tyro; raises OptionError for any other text."""
+    low = f"above {above:g}" if above > -math.inf else f"of at least {least:g}"
+
+    def parse(words: list[str]) -> float:
+        value = plain_number(words[0])
+        if value is None or not (value > above and least <= value <= most):
+            raise OptionError(f"{flag} is '{words[0]}'; give a number {low} and at most {most:g} {unit}.")
+        return value
+
+    return _spec("NUMBER", parse, "{:g}".format)
+
+
+def integer(flag: str, most: int) -> PrimitiveConstructorSpec[int]:
+    """A whole number in [0, most] for tyro; raises OptionError for any other text."""
+
+    def parse(words: list[str]) -> int:
+        if not _INTEGER.fullmatch(words[0]) or int(words[0][:20]) > most:
+            raise OptionError(f"{flag} is '{words[0]}'; give a whole number from 0 to {most}.")
+        return int(words[0])
+
+    return _spec("INTEGER", parse, str)
+
+
+def plain_number(text: str) -> float | None:
+    """The finite number that plain ASCII digits spell, else None: float() would also read nan, 1_0 and ٣."""
+    value = float(text) if _NUMBER.fullmatch(text) else math.nan
+    return value if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class DisturbanceText:
+    """A disturbance as typed: `none`, or KIND:SIZE[,SIZE…][@FREQUENCY], sizes in [N·m], frequency in [rad/s]."""
+
+    text: str
+    kind: DisturbanceKind | Literal["none"]
+    sizes: tuple[float, ...] = ()
+    frequency: float = 0.0
+
+    def build(self, nv: int, period: float, seed: int) -> Callable[..., Any] | None:
+        """The torque on `nv` joints; noise changes every `period` [s]. Raises OptionError for another number."""
+        from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
+
+        if len(self.sizes) not in (0, 1, nv):
+            raise OptionError(
+                f"--disturbance '{self.text}' has {len(self.sizes)} torques for {nv} joints; give one, or one for each."
+            )
+        size = self.sizes[0] if len(self.sizes) == 1 else list(self.sizes)
+        match self.kind:
+            case "none":
+                return None
+            case "constant":
+                return ConstantTorque(size)
+            case "square":
+                return SquareWave(size, self.frequency)
+            case "sine":
+                return SinusoidalTorque(size, self.frequency)
+            case "noise":
+                return TorqueNoise(size, period, seed)
+
+
+def disturbance_text() -> PrimitiveConstructorSpec[str]:
+    """The text of a disturbance for tyro; raises OptionError for one that `parse_disturbance` cannot read."""
+    return _spec("TORQUE", lambda words: parse_disturbance(words[0]).text, str)
+
+
+def parse_disturbance(text: str) -> DisturbanceText:
+    """`none`, `constant:5`, `constant:5,5,3`, `square:5@8`, `sine:5@8` or `noise:0.5`; raises OptionError."""
+    if text == "none":
+        return DisturbanceText(text, "none")
+    parts = re.fullmatch(r"(?:(constant|noise):([^@]+)|(square|sine):([^@]+)@(.+))", text)
+    if parts:
+        kind, listed, frequency = parts[1] or parts[3], parts[2] or parts[4], plain_number(parts[5] or "0")
+        sizes = [plain_number(size) for size in listed.split(",")]
+        usable = frequency is not None and (frequency > 0.0 or not parts[5])
+        usable = usable and all(size is not None and (size >= 0.0 or kind != "noise") for size in sizes)
+        if usable:
+            return DisturbanceText(text, kind, tuple(sizes), frequency)  # type: ignore[arg-type]
+    raise OptionError(
+        f"--disturbance is '{text}'; give none, constant:5, square:5@8, sine:5@8 or noise:0.5 "
+        "(N·m on every joint or a comma list, one per joint; @ frequency above 0 rad/s)."
+    )
+
+
+def _spec(metavar: str, parse: Any, show: Any) -> PrimitiveConstructorSpec[Any]:
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=parse,
+        is_instance=lambda value: True,
+        str_from_instance=lambda value: ["" if value is None else show(value)],
+    )

@@ -1,0 +1,1 @@
+"""Whole studies: what the commands of the command line do, as functions."""

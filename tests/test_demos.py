@@ -1,0 +1,86 @@
+"""The demos run and show what their first lines promise; apart, without the shape checks that slow a loop down."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DEMOS = Path(__file__).parent.parent / "demos"
+
+
+def run_demo(name, folder, call):
+    """What `call` of the demo's names returns, as JSON, and what it printed."""
+    code = f"""
+import json, runpy, warnings, numpy as np, nbs_pin as nbs
+from pathlib import Path
+warnings.simplefilter("error", UserWarning)
+demo = runpy.run_path({str(DEMOS / f"{name}.py")!r})
+print(json.dumps((lambda main: {call})(demo["main"])))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    *printed, last = done.stdout.splitlines()
+    return json.loads(last), "\n".join(printed)
+
+
+def test_every_demo_says_first_what_to_see():
+    demos = sorted(DEMOS.glob("*.py"))
+    assert len(demos) >= 5
+    for demo in demos:
+        assert '"""' in demo.read_text()[:3], demo.name
+
+
+def test_three_arms_meet_their_reference_and_leave_replays(tmp_path):
+    results, printed = run_demo("three_arms", tmp_path, "main(duration=2.0)")
+    for name in ("two_link", "three_link", "panda"):
+        folder = tmp_path / "out" / "demo" / name
+        assert sorted(path.name for path in folder.iterdir()) == [
+            "replay.html",
+            "run.npz",
+            "summary.json",
+            "tracking.png",
+        ]
+        assert json.loads((folder / "summary.json").read_text())["figures"] == results[name]
+        assert results[name]["convergence_time_s"] < 0.2
+        assert max(results[name]["rms_error_last_30_percent_rad"]) < 1e-5
+        assert results[name]["saturated_fraction_late"] == 0.0
+    page = tmp_path / printed.strip().splitlines()[-1].removeprefix("Open ").removesuffix(" in a browser.")
+    assert page.is_file()
+
+
+def test_an_unknown_kilogram_is_bounded_and_a_known_one_is_nothing(tmp_path):
+    errors, _ = run_demo("payload", tmp_path, "main(duration=2.5)")
+    assert errors["NBS, no load"] < 1e-6
+    assert errors["NBS, 1 kg known"] < 1e-6
+    assert 3e-3 < errors["NBS, 1 kg unknown"] < 2e-2
+    assert errors["computed torque, 1 kg unknown"] > 3.0 * errors["NBS, 1 kg unknown"]
+
+
+def test_your_own_arm_tracks_and_a_slip_is_refused_by_line(tmp_path):
+    (error, refusal), _ = run_demo("own_arm", tmp_path, "main(duration=3.0)")
+    folder = tmp_path / "out" / "demo" / "own_arm"
+    assert error < 1e-6
+    assert (folder / "replay.html").stat().st_size > 100_000
+    line = int(refusal.split("broken.urdf:")[1].split(":")[0])
+    block = (folder / "broken.urdf").read_text().splitlines()[line - 1 : line + 3]
+    assert "'nan'" in refusal
+    assert any('mass value="nan"' in text for text in block)
+
+
+def test_every_start_of_a_batch_converges_and_its_storage_never_rises(tmp_path):
+    call = "(lambda r: [r.q.shape, nbs.metrics.convergence_time(r).tolist()])(main(starts=9, duration=1.0))"
+    (shape, times), printed = run_demo("batch", tmp_path, call)
+    assert shape == [501, 9, 2]
+    assert max(times) < 0.3
+    assert float(printed.rpartition("at most ")[2].split()[0]) < 1e-12
+    assert printed.count("█") == 9
+
+
+@pytest.mark.parametrize("epochs", [6])
+def test_the_gradient_of_a_motion_is_right_and_lowers_its_cost(tmp_path, epochs):
+    (disagreement, costs), _ = run_demo("torch_gradient", tmp_path, f"main(epochs={epochs})")
+    assert disagreement < 1e-6
+    assert len(costs) == epochs
+    assert costs[-1] < 0.75 * costs[0]

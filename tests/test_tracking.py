@@ -1,0 +1,139 @@
+"""The study behind `nbs-pin track`, called as a function."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from typing import get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+import nbs_pin as nbs
+from nbs_pin.cli.track import Track
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.studies import tracking
+from nbs_pin.studies.motions import check_motion, motion_of
+
+STATE = {"q": [0.3, -0.2], "v": [0.1, 0.4], "q_ref": [0.0, 0.1], "v_ref": [0.2, 0.0], "a_ref": [0.0, 1.0]}
+
+
+def test_the_command_line_offers_every_name_the_library_knows():
+    hints = get_type_hints(Track)
+    assert get_args(hints["controller"]) == get_args(tracking.ControllerName)
+    assert get_args(hints["plant"]) == get_args(tracking.PlantName)
+
+
+LAWS = """
+import json
+from typing import get_args
+import nbs_pin as nbs
+from nbs_pin.studies import tracking
+robot, late = nbs.load_robot("three_link"), {}
+for name in get_args(tracking.ControllerName):
+    run, _ = tracking.track(robot, controller=name, duration=1.5, period=0.002, start_error=0.1, plant="pinocchio")
+    late[name] = nbs.metrics.rms_error(run, after=1.2).max()
+print(json.dumps(late))
+"""
+
+
+def test_every_law_by_name_does_what_its_model_allows():
+    """From 0.1 rad off: a law that feeds the whole motion forward comes within 1 % of it, the others lag but stay."""
+    late = json.loads(subprocess.run([sys.executable, "-c", LAWS], capture_output=True, text=True, check=True).stdout)
+    lagging = {"pd-gravity", "pid"}
+    assert late.keys() == set(get_args(tracking.ControllerName))
+    assert all(1e-3 < late[name] < 0.03 for name in lagging)
+    assert all(late[name] < 1e-3 for name in late.keys() - lagging)
+
+
+def test_the_papers_law_is_its_own_on_two_link_and_tuned_elsewhere():
+    robot = nbs.load_robot("two_link")
+    paper = nbs.paper_controller(nbs.PinocchioDynamics(robot), seed=4)
+    named = tracking.build_controller("nbs-paper", robot, seed=4, bandwidth=30.0)
+    np.testing.assert_array_equal(named.torque(**STATE), paper.torque(**STATE))
+    panda = tracking.build_controller("nbs-paper", nbs.load_robot("panda"))
+    assert (panda.potential.form, panda.damping.form, panda.inertial_rate) == ("paper", "paper", 0.0)
+    assert panda.potential.modulus > 2.0
+
+
+def test_kept_friction_acts_in_the_plant_and_is_fed_forward():
+    """With friction kept and modelled the error is small; left out of the law it is not."""
+    robot = nbs.load_robot("z1")
+    kept, _ = tracking.track(robot, duration=0.4, period=0.002, joint_friction="keep")
+    unaware = tracking.build_controller("nbs", robot, period=0.002)
+    blind, _ = tracking.track(robot, controller=unaware, duration=0.4, period=0.002, joint_friction="keep")
+    assert nbs.metrics.rms_error(kept).max() < 0.1 * nbs.metrics.rms_error(blind).max()
+
+
+def test_the_pinocchio_plant_steps_finely_enough_for_its_friction():
+    """z1's light wrist with 1 N·m of dry friction is stiffer than a 1 ms step of RK4 can follow."""
+    robot = nbs.load_robot("z1")
+    run, _ = tracking.track(robot, plant="pinocchio", duration=0.004, joint_friction="keep", start_error=0.05)
+    assert run.info["plant_step"] < 1e-3
+    assert run.period / run.info["plant_step"] == pytest.approx(round(run.period / run.info["plant_step"]))
+    friction = nbs.JointFriction.of(robot)
+    plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot), friction=friction)
+    half = nbs.simulate(
+        plant,
+        tracking.build_controller("nbs", robot, friction=friction),
+        nbs.Sinusoid.for_robot(robot),
+        0.004,
+        0.001,
+        q0=run.q[0],
+        plant_step=0.5 * run.info["plant_step"],
+    )
+    np.testing.assert_allclose(run.q, half.q, atol=1e-5)
+
+
+def test_seed_and_effort_limit_matter():
+    robot = nbs.load_robot("two_link")
+    runs = [
+        tracking.track(robot, duration=0.1, start_error=0.3, seed=seed, effort_limit=limit).run
+        for seed, limit in ((0, None), (0, None), (1, None), (0, np.inf))
+    ]
+    np.testing.assert_array_equal(runs[0].q, runs[1].q)
+    assert (runs[0].q[-1] != runs[2].q[-1]).all()
+    assert np.abs(runs[0].tau).max() == 100.0 < np.abs(runs[3].tau).max()
+
+
+def test_a_motion_beyond_the_limits_is_refused():
+    robot = nbs.load_robot("two_link")
+    motion = nbs.Sinusoid.for_robot(robot)
+    t = np.linspace(0.0, 10.0, 2001)
+    desired = motion(t)
+    needed = np.abs(nbs.inverse_dynamics(nbs.PinocchioDynamics(robot), *desired)).max()
+    check_motion(motion, robot, 10.0, 1.001 * needed)
+    with pytest.raises(ArgumentError, match="beyond the effort limit"):
+        check_motion(motion, robot, 10.0, 0.999 * needed)
+    fast = nbs.Sinusoid(1.0, [1.0, 30.0])
+    with pytest.raises(ArgumentError, match=r"velocity .* of joint 'joint2'"):
+        check_motion(fast, robot, 10.0, np.inf)
+    hard = nbs.Sinusoid(1.0, [1.0, 15.0])
+    check_motion(hard, robot, 10.0, np.inf)
+    with pytest.raises(ArgumentError, match="torque"):
+        check_motion(hard, robot, 10.0, None)
+
+
+def test_the_papers_motion_is_within_reach_of_the_bundled_arms():
+    for name in ("two_link", "three_link"):
+        robot = nbs.load_robot(name)
+        motion, length = motion_of("paper", robot, frequency=1.0, period=0.001)
+        assert length == 10.0
+        check_motion(motion, robot, 100.0, None)
+        np.testing.assert_allclose(motion(7.0).q[:2], [np.sin(0.7), np.cos(0.7)], rtol=1e-14)
+
+
+def test_leaving_the_position_range_is_told():
+    robot = nbs.load_robot("panda")
+    run, _ = tracking.track(robot, duration=0.01)
+    assert tracking.figures(run, robot)["outside_position_range_rad"] == [0.0] * 7
+    q = run.q.copy()
+    q[3, 2], q[4, 5] = robot.upper[2] + 0.25, robot.lower[5] - 0.5
+    outside = tracking.figures(dataclasses.replace(run, q=q), robot)["outside_position_range_rad"]
+    np.testing.assert_allclose(outside, [0.0, 0.0, 0.25, 0.0, 0.0, 0.5, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("build", [tracking.build_controller, tracking.build_plant])
+def test_an_unknown_name_lists_the_known(build):
+    with pytest.raises(ArgumentError, match=r"'nope' is unknown; choose one of .*, or build one"):
+        build("nope", nbs.load_robot("two_link"))
