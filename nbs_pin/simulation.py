@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import joblib
 import numpy as np
 
 from nbs_pin.checks import all_finite, positive, whole
@@ -33,6 +34,7 @@ def simulate(
     effort_limit: Any = None,
     disturbance: Disturbance | None = None,
     lookahead: float | None = None,
+    workers: int = 1,
     progress: bool = False,
 ) -> Run:
     """The motion of `plant` under `controller` following `reference` for `duration` [s].
@@ -49,14 +51,37 @@ def simulate(
     lookahead: how far [s] ahead the controller is evaluated, on the reference of that time and the state predicted with
     the reference's acceleration. A held torque acts half a period late on average, so None takes half a period, which
     removes that lag (the tracking error of a panda at 1 kHz falls tenfold); 0 is the plain sampled law.
+    workers: processes that share the starts along the first axis of q0; a disturbance sees those of its own share.
     progress: show a progress bar when it takes longer than 2 s at a terminal.
 
     Raises ArgumentError for arguments that do not fit each other, and SimulationDiverged, naming the time, when the
     controller's torque or the state is not finite or the engine warns.
     """
+    if workers > 1:
+        given = (plant, controller.compile(), reference, duration, period)
+        options = {"plant_step": plant_step, "effort_limit": effort_limit, "disturbance": disturbance}
+        return _shared(workers, q0, v0, *given, **options, lookahead=lookahead)
     loop = _loop(plant, controller, period, plant_step, effort_limit, disturbance, lookahead, duration)
     run, _ = _block(loop, reference, 0, loop.steps, loop.start(reference, q0, v0), None, progress)
     return run
+
+
+def _shared(workers: int, q0: Any, v0: Any, *given: Any, **options: Any) -> Run:
+    """`simulate` of slices of the starts in processes of their own, joined along the first batch axis."""
+    starts = np.asarray(q0, dtype=float)
+    if starts.ndim < 2:
+        raise ArgumentError(
+            f"workers share starts, and q0 has shape {starts.shape}; give q0 of shape (starts, ..., nv)."
+        )
+    speeds = np.zeros_like(starts) if v0 is None else np.broadcast_to(np.asarray(v0, dtype=float), starts.shape)
+    shares = zip(np.array_split(starts, workers), np.array_split(speeds, workers), strict=True)
+    jobs = [joblib.delayed(simulate)(*given, q0=q, v0=v, **options) for q, v in shares if len(q)]
+    runs = joblib.Parallel(n_jobs=workers)(jobs)
+    joined = {
+        name: np.concatenate([getattr(run, name) for run in runs], axis=1)
+        for name in ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+    }
+    return replace(runs[0], **joined)
 
 
 def stream(

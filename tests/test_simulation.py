@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nbs_pin.controllers.controller import Controller, MemorylessController
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.controllers.pid import PID
 from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -209,6 +210,19 @@ def test_a_stream_is_the_run_in_pieces(law):
         np.testing.assert_array_equal(joined, getattr(whole, name))
     with pytest.raises(ArgumentError, match="block is 0 periods"):
         next(stream(PLANT, controller, reference, 1.0, 0.01, block=0))
+
+
+def test_workers_share_the_starts():
+    robot = load_robot("three_link")
+    plant, controller = MujocoPlant(robot), NeuralBackstepping.for_robot(robot)
+    reference = Sinusoid.for_robot(robot)
+    starts = np.random.default_rng(0).normal(size=(5, 3))
+    alone = simulate(plant, controller, reference, 0.05, 0.001, q0=starts, disturbance=SquareWave(1.0, 9.0))
+    shared = simulate(plant, controller, reference, 0.05, 0.001, q0=starts, disturbance=SquareWave(1.0, 9.0), workers=2)
+    for name in ("q", "v", "tau", "tau_command", "disturbance", "q_ref"):
+        np.testing.assert_allclose(getattr(shared, name), getattr(alone, name), rtol=1e-12, atol=1e-12)
+    with pytest.raises(ArgumentError, match=r"q0 has shape \(3,\); give q0 of shape \(starts, \.\.\., nv\)"):
+        simulate(plant, controller, reference, 0.05, 0.001, q0=starts[0], workers=2)
 
 
 def test_a_motion_is_not_asked_for_what_comes_after_its_end():
