@@ -50,7 +50,7 @@ _HOMES = {
     "nbs_pin.replay_page": ("replay",),
     "nbs_pin.robot": ("Robot", "load_robot"),
     "nbs_pin.simulation": ("simulate",),
-    "nbs_pin.state": ("Reference", "Run", "State"),
+    "nbs_pin.state": ("Reference", "Run"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nbs_pin.exceptions import RobotError, RobotNotFound
+from nbs_pin.urdf_checks import ZeroLimits
 
 
 @dataclass(frozen=True)
@@ -16,12 +17,12 @@ class Entry:
     path: Path
     lock: tuple[str, ...] = ()
     gravity: float = 9.81
-    zero_limits: str = "refuse"
+    zero_limits: ZeroLimits = "refuse"
 
 
 _BUNDLED = {"two_link": 9.8, "three_link": 9.81}
 _FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
-_EXAMPLES: dict[str, tuple[str, tuple[str, ...], str]] = {
+_EXAMPLES: dict[str, tuple[str, tuple[str, ...], ZeroLimits]] = {
     "panda": ("panda_description/urdf/panda.urdf", _FINGERS, "refuse"),
     "ur3": ("ur_description/urdf/ur3_robot.urdf", (), "refuse"),
     "ur5": ("ur_description/urdf/ur5_robot.urdf", (), "refuse"),

@@ -11,13 +11,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.checks import per_joint, positive
+from nbs_pin.checks import PerJoint, per_joint, positive
 from nbs_pin.exceptions import ArgumentError
 
 Disturbance: TypeAlias = Callable[[float, np.ndarray, np.ndarray], Any]
 """τ_d(t, q, v) [N·m], shape (..., n)."""
-PerJoint: TypeAlias = Any
-"""One number for all joints, or one per joint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +31,7 @@ class ConstantTorque:
         self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
-        return np.zeros(q.shape) + self.torque
+        return _on_joints(self.torque, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +49,7 @@ class SinusoidalTorque:
         self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
-        return np.zeros(q.shape) + self.amplitude * np.sin(self.frequency * t + self.phase)
+        return _on_joints(self.amplitude * np.sin(self.frequency * t + self.phase), q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +67,7 @@ class SquareWave:
         self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
-        return np.zeros(q.shape) + self.amplitude * np.where(np.sin(self.frequency * t + self.phase) >= 0.0, 1.0, -1.0)
+        return _on_joints(self.amplitude * np.where(np.sin(self.frequency * t + self.phase) >= 0.0, 1.0, -1.0), q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,4 +92,13 @@ class TorqueNoise:
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
         interval = math.floor(t / self.period + 1e-9)  # t = k·period may round to just below its interval
-        return self.std * np.random.default_rng((self.seed, interval)).standard_normal(q.shape)
+        return _on_joints(self.std, q) * np.random.default_rng((self.seed, interval)).standard_normal(q.shape)
+
+
+def _on_joints(torque: Any, q: np.ndarray) -> np.ndarray:
+    """The torque for every start and joint of q."""
+    if np.size(torque) not in (1, q.shape[-1]):
+        raise ArgumentError(
+            f"the disturbance has {np.size(torque)} torques for {q.shape[-1]} joints; give one, or one for each."
+        )
+    return np.zeros(q.shape) + torque

@@ -1,7 +1,5 @@
 """Arrays in npz files: written whole or not at all, read without pickle and without believing the headers."""
 
-import os
-import uuid
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -10,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nbs_pin.exceptions import FileFormatError
+from nbs_pin.files import whole_file
 
 LARGEST = 2**31
 """Most bytes of arrays that a file may hold, 2 GiB."""
@@ -18,16 +17,8 @@ _KINDS = {"f": "real numbers", "b": "booleans", "U": "text", "i": "integers"}
 
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write the arrays to `path`; whatever interrupts it, the name holds the old file or the new one, never half."""
-    path = Path(path)
-    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
-    try:
-        with draft.open("xb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    with whole_file(path) as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:

@@ -11,37 +11,32 @@ from typing import Any, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from nbs_pin.checks import per_joint, positive
+from nbs_pin.checks import PerJoint, floats, per_joint, positive
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
 from nbs_pin.state import Reference
 
 DesiredMotion: TypeAlias = Callable[[Any], Reference]
 """ref(t) -> Reference, of a time [s] (shapes (n,)) or of an array of times (shapes (..., n))."""
-Numbers: TypeAlias = Any
-"""A number, or one number per joint."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sinusoid:
     """q = offset + amplitude·sin(frequency·t + phase), per joint.
 
-    amplitude, offset [rad]; frequency [rad/s]; phase [rad]. Numbers serve every joint, lists give one per joint.
+    amplitude, offset [rad]; frequency [rad/s]; phase [rad]. The longest list says how many joints move, a number
+    beside it serves them all; numbers alone make the motion of one joint.
     """
 
-    amplitude: Numbers
-    frequency: Numbers
-    phase: Numbers = 0.0
-    offset: Numbers = 0.0
+    amplitude: PerJoint
+    frequency: PerJoint
+    phase: PerJoint = 0.0
+    offset: PerJoint = 0.0
 
     def __post_init__(self) -> None:
         names = ("amplitude", "frequency", "phase", "offset")
         per_joint(self, *names)
-        try:
-            fields = np.broadcast_arrays(*(np.atleast_1d(getattr(self, name)) for name in names))
-        except ValueError as error:
-            sizes = ", ".join(f"{name} {np.size(getattr(self, name))}" for name in names)
-            raise ArgumentError(f"Sinusoid was given {sizes}; give equally many numbers, or one for all.") from error
+        fields = np.broadcast_arrays(*(np.atleast_1d(getattr(self, name)) for name in names))
         for name, value in zip(names, fields, strict=True):
             object.__setattr__(self, name, value)
 
@@ -71,7 +66,7 @@ def resting_posture(robot: Robot) -> np.ndarray:
 
     Among postures within a quarter of each range of the middle; where none is so light, the lightest.
     """
-    lower, upper = np.clip(robot.lower, -np.pi, np.pi), np.clip(robot.upper, -np.pi, np.pi)
+    lower, upper = robot.sampling_range
     middle, data = 0.5 * (lower + upper), robot.model.createData()
     inner = np.random.default_rng(0).uniform(-0.25, 0.25, (2000, robot.nv)) * (upper - lower)
     postures = middle + inner[np.argsort(np.linalg.norm(inner, axis=-1))]
@@ -90,9 +85,9 @@ def paper_reference(n: int) -> Sinusoid:
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """q constant [rad], v = a = 0."""
+    """q constant [rad], one number per joint (a number alone: one joint), v = a = 0."""
 
-    q: Numbers
+    q: PerJoint
 
     def __post_init__(self) -> None:
         per_joint(self, "q")
@@ -116,7 +111,7 @@ class MinimumJerk:
     times: Any
 
     def __post_init__(self) -> None:
-        waypoints, times = np.asarray(self.waypoints, dtype=float), np.asarray(self.times, dtype=float)
+        waypoints, times = floats("waypoints", self.waypoints), floats("times", self.times)
         if waypoints.ndim != 2 or times.shape != waypoints.shape[:1] or times.size < 2 or waypoints.shape[1] == 0:
             raise ArgumentError(
                 f"MinimumJerk was given waypoints of shape {waypoints.shape} at times of shape {times.shape}, "
@@ -146,30 +141,33 @@ class MinimumJerk:
         )
 
 
-def check_reference(
-    reference: DesiredMotion, robot: Robot, duration: float, *, samples: int = 2001, torque: bool = True
-) -> None:
+def check_reference(reference: DesiredMotion, robot: Robot, duration: float, *, samples: int = 2001) -> None:
     """Refuse a motion that the arm cannot follow, before it starts.
 
-    Position and velocity limits, and (torque=True) the torque M a + C v + G against the effort limits, at `samples`
-    times over `duration` [s]. Joint friction is not counted.
+    Position and velocity limits, and the torque M a + C v + G against the effort limits (`Robot.with_effort_limit`
+    sets others), at `samples` times over `duration` [s]. Joint friction is not counted.
     Raises ArgumentError naming the joint, the time, the value, the limit and the remedy.
     """
     positive("duration", duration, "s")
     t = np.linspace(0.0, duration, samples)
-    desired = reference(t)
-    if desired.q.shape != (samples, robot.nv):
-        raise ArgumentError(
-            f"the reference has {desired.q.shape[-1]} joints, {robot.name} has {robot.nv}; give one motion per joint."
-        )
+    desired = Reference(*(floats(f"the reference's {name}", x) for name, x in zip("qva", reference(t), strict=True)))
+    for name, x in desired._asdict().items():
+        if x.ndim and x.shape[-1] != robot.nv:
+            raise ArgumentError(
+                f"the reference has {x.shape[-1]} joints, {robot.name} has {robot.nv}; give one motion per joint."
+            )
+        if x.shape != (samples, robot.nv):
+            raise ArgumentError(
+                f"the reference at {samples} times gave {name} of shape {x.shape}, expected ({samples}, {robot.nv}); "
+                "let it take arrays of times."
+            )
     degrees = " (are these degrees?)" if np.median(np.max(np.abs(desired.q), axis=-1)) > 2.0 * np.pi else ""
     speed, effort = robot.velocity_limit, robot.effort_limit
     _check_range(robot, t, "position", desired.q, robot.lower, robot.upper, f"stay inside{degrees}")
     _check_range(robot, t, "velocity", desired.v, -speed, speed, "slow it down")
-    if torque:
-        data = robot.model.createData()
-        tau = np.array([pin.rnea(robot.model, data, *row) for row in zip(*desired, strict=True)])
-        _check_range(robot, t, "torque", tau, -effort, effort, "slow it down or choose another posture")
+    data = robot.model.createData()
+    tau = np.array([pin.rnea(robot.model, data, *row) for row in zip(*desired, strict=True)])
+    _check_range(robot, t, "torque", tau, -effort, effort, "slow it down, choose another posture or raise the limit")
 
 
 _UNITS = {"position": ("rad", "m"), "velocity": ("rad/s", "m/s"), "torque": ("N·m", "N")}

@@ -97,7 +97,10 @@ def _robot_of(run: Run) -> Robot:
     """The robot a run names, if it is still the one that ran."""
     if not run.robot:
         raise ArgumentError("the run names no robot: give it as replay(run, path, robot=load_robot(…)).")
-    robot = load_robot(run.robot)
+    unknown = run.robot_options.keys() - {"gravity", "lock", "zero_limits"}
+    if unknown:
+        raise ArgumentError(f"the run loads its robot with {', '.join(sorted(unknown))}, unknown here: give robot=….")
+    robot = load_robot(run.robot, **run.robot_options)
     if robot.sha256 != run.robot_sha256:
         raise ArgumentError(
             f"'{run.robot}' is not the arm that ran (description or gravity differ: {robot.sha256[:12]} now, "

@@ -2,9 +2,10 @@
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -13,8 +14,10 @@ from jaxtyping import Bool, Float
 
 from nbs_pin.arrays import Array, array_namespace
 from nbs_pin.catalogue import find
+from nbs_pin.checks import PerJoint, floats
 from nbs_pin.exceptions import ArgumentError, RobotError
 from nbs_pin.urdf import JointData, Urdf, read_urdf
+from nbs_pin.urdf_checks import ZERO_LIMITS
 
 _SINGULAR = 1e-10
 """Smallest eigenvalue of M scaled to a unit diagonal that still counts as positive."""
@@ -30,11 +33,13 @@ class Robot:
 
     name: str
     source: str
-    """What `load_robot` was given: a catalogue name or a path."""
+    """A catalogue name, or the full path of the file."""
     urdf: Urdf
     model: pin.Model
     gravity_vector: Float[np.ndarray, "3"]
     """Gravitational acceleration in the base frame [m/s²]."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """What `load_robot` was told beside the source, as JSON can store it: load_robot(source, **options) is this arm."""
 
     @property
     def nv(self) -> int:
@@ -76,6 +81,12 @@ class Robot:
         return np.array([joint.upper for joint in self.joints])
 
     @property
+    def sampling_range(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """(lower, upper) to draw configurations from [rad, m]: the position limits, ∓π where there is none."""
+        lower, upper = self.lower, self.upper
+        return np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
+
+    @property
     def damping(self) -> Float[np.ndarray, " n"]:
         """Viscous joint friction of the URDF [N·m·s/rad]."""
         return np.array([joint.damping for joint in self.joints])
@@ -92,12 +103,27 @@ class Robot:
 
     @property
     def sha256(self) -> str:
-        """Fingerprint of links, joints, limits and gravity: equal for equal dynamics, however they are drawn."""
+        """Fingerprint of links, joints, stated limits and gravity: equal for equal dynamics, however they are drawn."""
         return hashlib.sha256(self.urdf.without_geometry() + self.gravity_vector.tobytes()).hexdigest()
 
     def difference(self, q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
         return configuration_difference(q, q_ref, self.continuous)
+
+    def with_effort_limit(self, limit: PerJoint) -> "Robot":
+        """The same arm with other effort limits [N·m, N for a prismatic joint]: one or one per joint, inf for none.
+
+        Its description and fingerprint stay those of the file. Raises ArgumentError unless the limits are > 0.
+        """
+        effort = floats("effort limit", limit)
+        if effort.shape not in ((), (self.nv,)) or not (effort > 0.0).all():
+            raise ArgumentError(
+                f"effort limit is {limit}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means no limit."
+            )
+        by_name = dict(zip(self.joint_names, np.full(self.nv, effort).tolist(), strict=True))
+        joints = tuple(replace(joint, effort=by_name[joint.name]) for joint in self.urdf.joints)
+        urdf = replace(self.urdf, joints=joints)
+        return replace(self, urdf=urdf, model=_with_limits(self.model.copy(), urdf))
 
 
 def configuration_difference(
@@ -120,23 +146,34 @@ def load_robot(
     *,
     gravity: float | Iterable[float] | None = None,
     lock: Iterable[str] | None = None,
+    zero_limits: str | None = None,
 ) -> Robot:
     """The arm of a bundled URDF, of example-robot-data by short name, or of a `.urdf` or `.xacro` file.
 
     gravity: downward acceleration [m/s²] or a vector in the base frame; None takes the catalogue's, else 9.81.
     lock: joints to fix at zero; None takes the catalogue's list.
+    zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range at zero, or read such zeros as
+    "unlimited", as files do that leave their limits open; None takes the catalogue's, else "refuse".
     Raises RobotNotFound for a name or path that leads nowhere, RobotError for a description that would give a wrong
-    model, ArgumentError for a gravity that is none, and MissingExtra for a `.xacro` without the `xacro` extra.
+    model, ArgumentError for a gravity or zero_limits that is none, and MissingExtra for a `.xacro` without the `xacro`
+    extra.
     """
     entry = find(str(name_or_path))
-    if lock is None:
-        lock = entry.lock
-    locked = (lock,) if isinstance(lock, str) else tuple(lock)
-    urdf = read_urdf(entry.path, lock=locked, zero_limits=entry.zero_limits)
+    zeros = entry.zero_limits if zero_limits is None else zero_limits
+    if zeros not in ZERO_LIMITS:
+        raise ArgumentError(f"zero_limits is {zero_limits!r}; give {' or '.join(ZERO_LIMITS)}.")
+    names = entry.lock if lock is None else lock
+    locked = (names,) if isinstance(names, str) else tuple(names)
+    urdf = read_urdf(entry.path, lock=locked, zero_limits=zeros)
     vector = _gravity_vector(entry.gravity if gravity is None else gravity)
     model = _build_model(urdf)
     model.gravity.linear = vector
-    return Robot(entry.name or urdf.name, str(name_or_path), urdf, model, vector)
+    told = {"gravity": gravity, "lock": lock, "zero_limits": zero_limits}
+    stored = {"gravity": vector.tolist(), "lock": list(locked), "zero_limits": zero_limits}
+    options = {key: stored[key] for key, value in told.items() if value is not None}
+    robot = Robot(entry.name or urdf.name, entry.name or str(entry.path), urdf, model, vector, options)
+    _check_mass_matrix(robot)
+    return robot
 
 
 def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
@@ -152,11 +189,16 @@ def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
 
 
 def _build_model(urdf: Urdf) -> pin.Model:
-    """Pinocchio's model of the arm, with our limits; raises RobotError unless M(q) is finite and positive definite."""
+    """Pinocchio's model of the arm, with our limits; raises RobotError when it cannot be built."""
     try:
         model = pin.buildModelFromXML(urdf.without_geometry().decode())
     except (ValueError, RuntimeError) as error:
         raise RobotError(f"{urdf.path}: Pinocchio cannot build it ({error}); simplify the file.") from error
+    return _with_limits(model, urdf)
+
+
+def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
+    """The model, carrying the limits of `urdf.joints`."""
     by_name = {joint.name: joint for joint in urdf.joints}
     joints = [by_name[name] for name in model.names[1:]]
     effort, velocity = (np.array([getattr(joint, key) for joint in joints]) for key in ("effort", "velocity"))
@@ -164,19 +206,17 @@ def _build_model(urdf: Urdf) -> pin.Model:
     model.upperPositionLimit = np.array([joint.upper for joint in joints])
     model.lowerEffortLimit, model.upperEffortLimit = -effort, effort
     model.lowerVelocityLimit, model.upperVelocityLimit = -velocity, velocity
-    _check_mass_matrix(model, urdf.path)
     return model
 
 
-def _check_mass_matrix(model: pin.Model, path: Path) -> None:
+def _check_mass_matrix(robot: Robot) -> None:
     """Raise RobotError unless M(q) ≻ 0 at zero and at five seeded configurations within the limits.
 
     The test is on M scaled to a unit diagonal, so that grams beside tonnes and metres beside radians do not matter.
     """
-    data = model.createData()
-    low = np.where(np.isfinite(model.lowerPositionLimit), model.lowerPositionLimit, -np.pi)
-    high = np.where(np.isfinite(model.upperPositionLimit), model.upperPositionLimit, np.pi)
-    for q in (np.clip(0.0, low, high), *np.random.default_rng(0).uniform(low, high, (5, model.nq))):
+    model, data = robot.model, robot.model.createData()
+    low, high = robot.sampling_range
+    for q in (np.clip(0.0, low, high), *np.random.default_rng(0).uniform(low, high, (5, robot.nv))):
         mass = pin.crba(model, data, q)
         inertia = np.diag(mass)
         weakest = int(np.argmin(inertia))
@@ -186,6 +226,6 @@ def _check_mass_matrix(model: pin.Model, path: Path) -> None:
                 continue
             weakest = int(np.argmax(np.abs(vectors[:, 0])))
         raise RobotError(
-            f"{path}: joint '{model.names[1 + weakest]}': M(q) is not finite and positive definite at "
+            f"{robot.urdf.path}: joint '{model.names[1 + weakest]}': M(q) is not finite and positive definite at "
             f"q = {np.round(q, 3).tolist()}; give the links behind it inertia about its axis."
         )

@@ -17,13 +17,7 @@ RUN_FORMAT = "nbs_pin run 1"
 """What the `format` entry of a run file says."""
 _PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
 _PER_JOINT = ("effort_limit", "continuous", "joint_names")
-
-
-class State(NamedTuple):
-    """Configuration q [rad] and velocity v [rad/s], shape (..., nv)."""
-
-    q: Array
-    v: Array
+_JSON = ("robot_options", "info")
 
 
 class Reference(NamedTuple):
@@ -34,7 +28,7 @@ class Reference(NamedTuple):
     a: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """One recorded simulation: row k of every array belongs to the time t[k], the control instant k.
 
@@ -69,9 +63,11 @@ class Run:
     period: float
     """Control period [s]."""
     robot: str = ""
-    """What `load_robot` was given for the arm, or empty."""
+    """`Robot.source` of the arm, or empty."""
     robot_sha256: str = ""
     """`Robot.sha256` of that arm, or empty."""
+    robot_options: dict[str, Any] = field(default_factory=dict)
+    """`Robot.options` of that arm."""
     info: dict[str, Any] = field(default_factory=dict)
     """Free notes (controller, plant, seed, versions), stored as JSON."""
 
@@ -81,18 +77,13 @@ class Run:
         return int(self.q.shape[-1])
 
     def save(self, path: str | Path) -> None:
-        """Write the run to an npz file; an older file of that name is replaced whole or left alone.
+        """Write the run to an npz file; missing folders are made, an older file is replaced whole or left alone.
 
         Raises ArgumentError when `info` holds something JSON cannot say.
         """
-        try:
-            info = json.dumps(self.info, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise ArgumentError(
-                f"run.info cannot be stored as JSON ({error}); keep numbers, text and lists."
-            ) from error
-        values = {entry.name: np.asarray(getattr(self, entry.name)) for entry in dataclasses.fields(self)}
-        write_npz(path, values | {"info": np.array(info), "format": np.array(RUN_FORMAT)})
+        values = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+        texts = {name: _dumped(name, values[name]) for name in _JSON} | {"format": RUN_FORMAT}
+        write_npz(path, {name: np.asarray(value) for name, value in (values | texts).items()})
 
     @classmethod
     def load(cls, path: str | Path) -> "Run":
@@ -100,9 +91,9 @@ class Run:
 
         Raises FileFormatError for a damaged file, a missing key, a wrong shape or a number that is not finite.
         """
-        data = read_npz(path)
+        data = {"robot_options": np.array("{}"), **read_npz(path)}  # which the first runs did not record
         require(data, path, {"format": "U", "t": "f", **dict.fromkeys(_PER_ROW, "f"), "effort_limit": "f"})
-        require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", "info"), "U")})
+        require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", *_JSON), "U")})
         require(data, path, {"period": "f"})
         if str(data["format"]) != RUN_FORMAT:
             raise FileFormatError(f"{path}: format '{data['format']}', expected '{RUN_FORMAT}'; record the run again.")
@@ -114,7 +105,8 @@ class Run:
             period=float(data["period"]),
             robot=str(data["robot"]),
             robot_sha256=str(data["robot_sha256"]),
-            info=_parsed(path, str(data["info"])),
+            robot_options=_parsed(path, data, "robot_options"),
+            info=_parsed(path, data, "info"),
         )
 
 
@@ -141,11 +133,20 @@ def _check_numbers(path: str | Path, data: dict[str, np.ndarray]) -> None:
         raise FileFormatError(f"{path}: '{name}' has {fault}; record the run again.")
 
 
-def _parsed(path: str | Path, text: str) -> dict[str, Any]:
+def _dumped(name: str, value: dict[str, Any]) -> str:
     try:
-        info = json.loads(text)
+        return json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"run.{name} cannot be stored as JSON ({error}); keep numbers, text and lists.") from error
+
+
+def _parsed(path: str | Path, data: dict[str, np.ndarray], name: str) -> dict[str, Any]:
+    try:
+        value = json.loads(str(data[name]))
     except json.JSONDecodeError as error:
-        raise FileFormatError(f"{path}: 'info' is not JSON ({error}); record the run again.") from error
-    if not isinstance(info, dict):
-        raise FileFormatError(f"{path}: 'info' is a {type(info).__name__}, expected an object; record the run again.")
-    return info
+        raise FileFormatError(f"{path}: '{name}' is not JSON ({error}); record the run again.") from error
+    if not isinstance(value, dict):
+        raise FileFormatError(
+            f"{path}: '{name}' is a {type(value).__name__}, expected an object; record the run again."
+        )
+    return value

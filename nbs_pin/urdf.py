@@ -5,14 +5,21 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
-from nbs_pin.exceptions import RobotError
-from nbs_pin.urdf_checks import Joint, Limits, check_axis, check_bodies, check_tree, read_friction, read_limits
+from nbs_pin.urdf_checks import (
+    Joint,
+    Limits,
+    ZeroLimits,
+    check_axis,
+    check_bodies,
+    check_tree,
+    read_friction,
+    read_limits,
+)
 from nbs_pin.urdf_source import read_source
 
 _UNLIMITED = 1e9
 """How an absent limit is written into the XML: no engine reads "inf"."""
 _DYNAMIC = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "dynamics")}
-_MESHES = (".stl", ".obj", ".dae")
 
 
 @dataclass(frozen=True)
@@ -54,41 +61,23 @@ class Urdf:
         return ET.tostring(robot)
 
 
-def read_urdf(path: Path, *, lock: tuple[str, ...] = (), zero_limits: str = "refuse") -> Urdf:
+def read_urdf(path: Path, *, lock: tuple[str, ...] = (), zero_limits: ZeroLimits = "refuse") -> Urdf:
     """The checked description in the `.urdf` or `.xacro` file `path`, with the joints in `lock` fixed at zero.
 
+    An arm without a name, which drawing tools refuse, takes its file's.
     zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range, or read zeros as "unlimited".
     Raises RobotError, naming file, line, element, value and remedy, for a description that would give a wrong model,
     RobotNotFound for a path without a file, MissingExtra for a `.xacro` file without the `xacro` extra.
     """
     robot = read_source(path)
+    robot.element.set("name", robot.element.get("name", path.stem))
     joints = check_tree(robot, lock)
     check_bodies(robot, joints)
     moving = tuple(_settle(joint, zero_limits) for joint in joints if joint.moves)
-    return Urdf(robot.element.get("name", path.stem), path, ET.tostring(robot.element), moving)
+    return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving)
 
 
-def mesh_file(uri: str, roots: tuple[Path, ...]) -> Path:
-    """The file of a mesh that a URDF names, which must lie inside one of the `roots`.
-
-    `package://name/rest` is looked up as name/rest under each root, a relative path as itself. Raises RobotError for
-    any other scheme, an absolute path, a path that leaves the roots, another kind than .stl, .obj or .dae, or no file.
-    """
-    relative = uri.removeprefix("package://")
-    if "://" in relative or Path(relative).is_absolute():
-        raise RobotError(f"mesh '{uri}' is no path inside the model directory; use a relative or package:// path.")
-    if Path(relative).suffix.lower() not in _MESHES:
-        raise RobotError(f"mesh '{uri}' is of an unknown kind; use one of {', '.join(_MESHES)}.")
-    for root in roots:
-        file = (root / relative).resolve()
-        if not file.is_relative_to(root.resolve()):
-            raise RobotError(f"mesh '{uri}' leaves the model directory {root}; move it inside.")
-        if file.is_file():
-            return file
-    raise RobotError(f"mesh '{uri}' does not exist under {', '.join(map(str, roots))}; add it.")
-
-
-def _settle(joint: Joint, zero_limits: str) -> JointData:
+def _settle(joint: Joint, zero_limits: ZeroLimits) -> JointData:
     """The data of a moving joint, written back into its element as a revolute or prismatic joint with all limits."""
     check_axis(joint)
     limits = read_limits(joint, zero_limits)

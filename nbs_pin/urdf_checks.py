@@ -8,7 +8,7 @@ import math
 import warnings
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -20,6 +20,9 @@ MAX_LINKS = 1000
 """Most links of an arm, tool frames included."""
 MAX_NAME = 128
 """Longest name of a link or joint."""
+ZeroLimits: TypeAlias = Literal["refuse", "unlimited"]
+"""What a zero effort, a zero velocity or an empty range at zero is taken for."""
+ZERO_LIMITS: tuple[ZeroLimits, ...] = get_args(ZeroLimits)
 MOVING = ("revolute", "continuous", "prismatic")
 """Joint types with one degree of freedom, which an arm may have."""
 
@@ -28,6 +31,7 @@ _ROUNDING = 1e-6
 """Relative slack for numbers that were rounded when the file was written."""
 _POINT = 1e-9
 """Radius of gyration below which a body is a point [m]."""
+_OPEN = ", or load it with zero_limits='unlimited' if 0 means that none is stated"
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -58,7 +62,7 @@ class Joint:
 
 def check_tree(robot: Node, lock: tuple[str, ...]) -> list[Joint]:
     """The joints of the arm in file order, those in `lock` fixed; one tree with one root, unique names, known types."""
-    _check_name(robot, robot.element.get("name", "robot"))
+    _check_name(robot, robot.text("name"))
     links = _unique(robot, "link")
     nodes = _unique(robot, "joint")
     unknown = [name for name in lock if name not in nodes]
@@ -114,7 +118,7 @@ def check_axis(joint: Joint) -> None:
         axis.element.set("xyz", " ".join(repr(x / length) for x in xyz))
 
 
-def read_limits(joint: Joint, zero_limits: str) -> Limits:
+def read_limits(joint: Joint, zero_limits: ZeroLimits) -> Limits:
     """The limits the joint states.
 
     A continuous joint has no position limits and may state none at all; every other moving joint states all four.
@@ -135,9 +139,8 @@ def read_limits(joint: Joint, zero_limits: str) -> Limits:
         return Limits(-math.inf, math.inf, *strength)
     if lower >= upper:
         sign = ">" if lower > upper else "="
-        raise limit.refuse(
-            f"limit lower {lower:g} {sign} upper {upper:g}", "give lower < upper or make the joint fixed"
-        )
+        remedy = "give lower < upper or make the joint fixed" + (_OPEN if lower == upper == 0.0 else "")
+        raise limit.refuse(f"limit lower {lower:g} {sign} upper {upper:g}", remedy)
     return Limits(lower, upper, *strength)
 
 
@@ -251,11 +254,12 @@ def _mass(link: Node) -> float:
     return mass
 
 
-def _strength(limit: Node, key: str, kind: str, zero_limits: str) -> float:
+def _strength(limit: Node, key: str, kind: str, zero_limits: ZeroLimits) -> float:
     """The effort or velocity limit: > 0, or inf where not stated."""
     value = limit.number(key, math.inf if kind == "continuous" else None)
     if value == 0.0 and zero_limits == "unlimited":
         return math.inf
     if value <= 0.0:
-        raise limit.refuse(f"limit {key} '{value:g}' is not > 0", f"state the drive's {key} in <limit {key}=…>")
+        remedy = f"state the drive's {key} in <limit {key}=…>" + (_OPEN if value == 0.0 else "")
+        raise limit.refuse(f"limit {key} '{value:g}' is not > 0", remedy)
     return value

@@ -112,6 +112,45 @@ def test_the_options_reach_the_run(tracked):
         assert "PinocchioDynamics" in run.info["plant"]
 
 
+PAPERS = (
+    "track two_link --plant pinocchio --controller nbs-paper --reference paper --period 0.01 --no-effort-limit "
+    "--integrator euler --plant-step 0.01 --lookahead 0 --start 0,0"
+)
+
+
+def test_the_papers_row_is_one_command(tmp_path, capsys):
+    for out, more in (("a", "--start=-0.5,1"), ("b", "")):
+        command = f"{PAPERS} --seed 3 --duration 0.5 --out {tmp_path / out} {more}"
+        assert cli.main(shlex.split(command)) == 0
+    far, run = (nbs.Run.load(tmp_path / out / "run.npz") for out in "ab")
+    assert far.q[0].tolist() == [-0.5, 1.0]
+    dynamics = nbs.PinocchioDynamics(nbs.load_robot("two_link"))
+    same = nbs.simulate(
+        nbs.DynamicsPlant(dynamics, integrator="euler"),
+        nbs.paper_controller(dynamics, seed=3),
+        nbs.paper_reference(2),
+        duration=0.5,
+        period=0.01,
+        q0=np.zeros(2),
+        plant_step=0.01,
+        lookahead=0.0,
+        effort_limit=np.inf,
+    )
+    np.testing.assert_array_equal(run.q, same.q)
+    assert np.isinf(run.effort_limit).all()
+
+
+def test_an_effort_limit_reaches_the_law(tmp_path, capsys):
+    command = f"track two_link --controller pid --duration 0.1 --start-error 1 --effort-limit 40 --out {tmp_path}/run"
+    assert cli.main(shlex.split(command)) == 0
+    run, arm = nbs.Run.load(tmp_path / "run" / "run.npz"), nbs.load_robot("two_link").with_effort_limit(40.0)
+    assert (run.effort_limit == 40.0).all()
+    motion = nbs.Sinusoid.for_robot(arm)
+    start = motion(0.0).q + np.array([1.0, -1.0])
+    same = nbs.simulate(nbs.MujocoPlant(arm), nbs.PID.for_robot(arm), motion, 0.1, 0.001, q0=start)
+    np.testing.assert_array_equal(run.q, same.q)
+
+
 def test_a_motion_from_a_file_is_followed_for_its_length(tmp_path, capsys):
     t = np.arange(0.0, 0.3, 0.01)
     q = np.column_stack([0.1 * t**2, 0.2 - 0.1 * t**2])
@@ -168,8 +207,12 @@ REFUSED = {
     "track panda --duration 90000 --period 1e-5": "GB",
     "track panda --bandwidth 600": "at most 500 rad/s",
     "track panda --frequency 50": "of joint 'panda_joint",
-    "track two_link --effort-limit 1": "beyond the effort limit 1 N·m",
+    "track two_link --effort-limit 1": "outside [-1, 1]",
     "track two_link --effort-limit 1 --no-effort-limit": "choose one",
+    "track two_link --start 0.1,0.2 --start-error 0.1": "choose one",
+    "track two_link --start 0.1": "1 numbers for 2 joints",
+    "track two_link --integrator semi_implicit_euler": "integrator 'semi_implicit_euler' is unknown",
+    "track two_link --plant-step 0.0007": "expected a whole number",
     "track two_link --reference sinus": "did you mean sinusoid?",
     "track two_link --reference none.csv": "'none.csv': no such file",
     "track two_link --disturbance constant:1,2,3": "3 torques for 2 joints",
@@ -185,6 +228,9 @@ REFUSED = {
             "--bandwidth": ("-8", "inf"),
             "--start-error": ("-0.1", "4", "nan"),
             "--effort-limit": ("0", "inf"),
+            "--start": ("nan,0", "0,", "0;1", "0,1_0"),
+            "--plant-step": ("0", "nan", "1"),
+            "--lookahead": ("-1", "inf"),
             "--seed": ("-1", "1.5", "1_0", "99999999999"),
             "--disturbance": (
                 "5",

@@ -1,15 +1,18 @@
 """Desired motions: v and a are the derivatives of q, files are read whole or refused with the place of the fault."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nbs_pin.catalogue import ROBOT_NAMES
+from nbs_pin.catalogue import ROBOT_NAMES, find
+from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
 from nbs_pin.exceptions import ArgumentError, FileFormatError
 from nbs_pin.npz import write_npz
 from nbs_pin.reference_files import Sampled, load_reference
-from nbs_pin.references import Hold, MinimumJerk, Sinusoid, check_reference, paper_reference
+from nbs_pin.references import Hold, MinimumJerk, Sinusoid, check_reference, paper_reference, resting_posture
 from nbs_pin.robot import load_robot
 
 T = np.linspace(0.0, 2.0, 21)
@@ -19,6 +22,12 @@ numbers = st.floats(-3.0, 3.0)
 
 def wave(t):
     return np.stack((np.sin(t), np.cos(2.0 * t)), axis=-1)
+
+
+def with_rest(q, t=T):
+    """The motion scaled in time so that it starts and ends at rest."""
+    s = t / t[-1]
+    return q(t[-1] * s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
 
 
 REFERENCES = {
@@ -121,11 +130,62 @@ def test_the_spline_passes_through_its_samples_and_follows_between_to_fourth_ord
         lambda: MinimumJerk([[0.0]], [0.0]),
         lambda: Sampled(T[:3], wave(T[:3])),
         lambda: Sampled(T[::-1].copy(), wave(T)),
+        lambda: Sampled([0.0, 1.0], [[0.0], [1.0, 2.0]]),
+        lambda: Sampled(T, 1.0),
+        lambda: Sampled("abcd", wave(T[:4])),
+        lambda: Hold("up"),
+        lambda: Hold([1.0, [2.0, 3.0]]),
+        lambda: MinimumJerk([[0.0], [1.0, 2.0]], [0.0, 1.0]),
+        lambda: ConstantTorque(None),
+        lambda: SinusoidalTorque([1.0, 2.0], [1.0, 2.0, 3.0]),
     ],
 )
 def test_motions_that_make_no_sense_are_refused(make):
     with pytest.raises(ArgumentError):
         make()
+
+
+def test_lists_are_samples_too():
+    np.testing.assert_array_equal(Sampled(T.tolist(), wave(T).tolist())(0.77), REFERENCES["sampled"](0.77))
+
+
+def test_numbers_alone_move_one_joint():
+    assert Sinusoid(0.5, 1.0)(0.0).q.shape == Hold(0.0)(0.0).q.shape == (1,)
+    assert Sinusoid([0.5, 0.1], 1.0)(0.0).q.shape == (2,)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (3, 1)])
+@pytest.mark.parametrize("size", [2, 3])
+@pytest.mark.parametrize("kind", [ConstantTorque, lambda x: SinusoidalTorque(x, 1.0), lambda x: SquareWave(1.0, x),
+                                  lambda x: TorqueNoise(x, 0.01)])  # fmt: skip
+def test_a_disturbance_for_another_arm_is_refused(kind, size, batch):
+    q = np.zeros((*batch, 6))
+    with pytest.raises(ArgumentError, match=f"{size} torques for 6 joints"):
+        kind([1.0] * size)(0.1, q, q)
+    for torque in (1.0, [1.0], [1.0] * 6):
+        assert kind(torque)(0.1, q, q).shape == q.shape
+
+
+def resting(name):
+    robot = load_robot(name)
+    lower, upper = robot.sampling_range
+    return robot, resting_posture(robot), lower, upper
+
+
+@pytest.mark.parametrize("name", ROBOT_NAMES)
+def test_the_resting_posture_is_in_the_middle_half_of_the_range(name):
+    _, posture, lower, upper = resting(name)
+    assert (np.abs(posture - 0.5 * (lower + upper)) <= 0.25 * (upper - lower) + 1e-12).all()
+
+
+def test_the_resting_posture_of_a_range_beyond_a_turn_is_its_middle(tmp_path):
+    text = find("two_link").path.read_text()
+    text = re.sub(r'lower="[^"]*" upper="[^"]*"', 'lower="3.5" upper="6"', text)
+    path = tmp_path / "far.urdf"
+    path.write_text(text)
+    robot = load_robot(path, gravity=0.0)
+    np.testing.assert_array_equal(resting_posture(robot), [4.75, 4.75])
+    check_reference(Sinusoid.for_robot(robot), robot, 7.0)
 
 
 def write_csv(path, header, rows):
@@ -138,11 +198,12 @@ def table(t=T):
 
 
 def test_csv_and_npz_give_the_motion_in_the_arms_order(tmp_path):
-    expected = REFERENCES["sampled"](0.77)
-    csv = write_csv(tmp_path / "a.csv", "t,elbow,shoulder", [[t, b, a] for t, a, b in table()])
-    plain = write_csv(tmp_path / "b.csv", "t, q1, q2", table())
-    write_npz(tmp_path / "c.npz", {"t": T, "q": wave(T)[:, ::-1], "joint_names": np.array(["elbow", "shoulder"])})
-    write_npz(tmp_path / "d.npz", {"t": T, "q": wave(T)})
+    q = with_rest(wave)
+    expected, rows = Sampled(T, q)(0.77), np.column_stack((T, q)).tolist()
+    csv = write_csv(tmp_path / "a.csv", "t,elbow,shoulder", [[t, b, a] for t, a, b in rows])
+    plain = write_csv(tmp_path / "b.csv", "t, q1, q2", rows)
+    write_npz(tmp_path / "c.npz", {"t": T, "q": q[:, ::-1], "joint_names": np.array(["elbow", "shoulder"])})
+    write_npz(tmp_path / "d.npz", {"t": T, "q": q})
     for path in (csv, plain, tmp_path / "c.npz", tmp_path / "d.npz"):
         np.testing.assert_allclose(load_reference(path, JOINTS)(0.77), expected, rtol=0, atol=1e-15)
 
@@ -208,6 +269,56 @@ def test_faults_in_an_npz_are_refused(tmp_path, arrays, reason):
         load_reference(tmp_path / "motion.npz", JOINTS)
 
 
+def ramp(t):
+    return np.stack((2.0 * np.abs(t - 1.0), 0.0 * t), axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("q", "reason"),
+    [
+        (lambda t: 0.5 * np.c_[t, (2.0 - t) ** 2], "velocity jump 2 .* of elbow at t = 0 s, where the motion starts and"),
+        (
+            lambda t: 1.5 * np.c_[t**2, t],
+            "velocity jump 6 rad/s of shoulder at t = 2 s, where the motion ends and beyond",
+        ),
+        (lambda t: ramp(with_rest(lambda s: s, t)), r"velocity jump .* rad/s of shoulder at t = 1 s \(row 11\); smooth"),
+        (ramp, r"velocity jump 4 rad/s of shoulder at t = 1 s \(row 11\); smooth"),
+        (lambda t: with_rest(wave, t) + 0.5 * (np.arange(21) == 7)[:, None], "velocity jump .* at t = 0.7"),
+        (lambda t: with_rest(wave, t) + 0.5 * (np.arange(21) > 11)[:, None], r"velocity jump .* at t = 1\.[12]"),
+    ],
+)
+def test_velocity_jumps_in_a_file_are_refused_with_their_place(tmp_path, q, reason):
+    write_npz(tmp_path / "motion.npz", {"t": T, "q": q(T)})
+    with pytest.raises(FileFormatError, match=reason):
+        load_reference(tmp_path / "motion.npz", JOINTS)
+
+
+@pytest.mark.parametrize("rows", [6, 8, 12, 21, 200, 2000])
+@pytest.mark.parametrize("duration", [0.1, 0.5, 2.0])
+def test_a_smooth_motion_is_none_however_fast_and_coarse(tmp_path, rows, duration):
+    """From rest to rest, with a rest of the same length at either side, 2 rad apart."""
+    t = np.linspace(0.0, 3.0 * duration, 3 * rows)
+    q = MinimumJerk([[0.0, 0.0], [2.0, -1.0]], [duration, 2.0 * duration])(t)
+    write_npz(tmp_path / "motion.npz", {"t": t, "q": q.q})
+    assert load_reference(tmp_path / "motion.npz", JOINTS).duration == t[-1]
+
+
+def test_a_stated_velocity_must_be_that_of_the_motion(tmp_path):
+    q = with_rest(wave)
+    exact = Sampled(T, q)(T).v
+    for stated in (exact, exact + 0.05):
+        write_npz(tmp_path / "motion.npz", {"t": T, "q": q, "v": stated})
+        load_reference(tmp_path / "motion.npz", JOINTS)
+    for stated, reason in (
+        (np.degrees(exact), "v of shoulder: .* rad/s, but q changes by"),
+        (np.where(T[:, None] == T[9], np.nan, exact), "row 10, v of shoulder: nan"),
+        (exact[1:], "'v' has shape"),
+    ):
+        write_npz(tmp_path / "motion.npz", {"t": T, "q": q, "v": stated})
+        with pytest.raises(FileFormatError, match=reason):
+            load_reference(tmp_path / "motion.npz", JOINTS)
+
+
 def test_a_missing_file_is_not_found(tmp_path):
     for suffix in ("csv", "npz"):
         with pytest.raises(FileNotFoundError):
@@ -224,13 +335,26 @@ def test_a_motion_beyond_the_arms_limits_is_refused_with_joint_and_time():
         check_reference(Sinusoid([0.1, 0, 0, 0, 0, 0, 0], 100.0, 0.0, q), robot, 3.0)
     with pytest.raises(ArgumentError, match=r"torque .* N·m of joint 'panda_joint"):
         check_reference(Sinusoid([0.05, 0, 0, 0, 0, 0, 0], 43.0, 0.0, q), robot, 3.0)
-    check_reference(Sinusoid([0.05, 0, 0, 0, 0, 0, 0], 43.0, 0.0, q), robot, 3.0, torque=False)
+    check_reference(Sinusoid([0.05, 0, 0, 0, 0, 0, 0], 43.0, 0.0, q), robot.with_effort_limit(np.inf), 3.0)
     with pytest.raises(ArgumentError, match="are these degrees"):
         check_reference(Hold(np.full(7, 45.0)), robot, 3.0)
     with pytest.raises(ArgumentError, match="2 joints, panda has 7"):
         check_reference(paper_reference(2), robot, 3.0)
     with pytest.raises(ArgumentError, match="duration"):
         check_reference(Hold(q), robot, -1.0)
+
+
+def test_any_callable_is_a_reference_and_what_it_lacks_is_said():
+    robot = load_robot("two_link")
+    still = np.zeros((2001, 2))
+    check_reference(lambda t: (still, still, still), robot, 1.0)
+    check_reference(lambda t: (still.tolist(), still.tolist(), still.tolist()), robot, 1.0)
+    with pytest.raises(ArgumentError, match=r"gave v of shape \(2,\), expected \(2001, 2\); let it take arrays"):
+        check_reference(lambda t: (still, np.zeros(2), still), robot, 1.0)
+    with pytest.raises(ArgumentError, match="3 joints, two_link has 2"):
+        check_reference(lambda t: (still, still, np.zeros((2001, 3))), robot, 1.0)
+    with pytest.raises(ArgumentError, match="the reference's q is up"):
+        check_reference(lambda t: ("up", still, still), robot, 1.0)
 
 
 @pytest.mark.parametrize("name", ROBOT_NAMES)

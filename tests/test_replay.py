@@ -48,7 +48,8 @@ def moving_run(robot, *, duration=2.0, period=0.004, batch=(), t0=0.0):
     return Run(
         t=t, q=q, v=zero, tau=zero, tau_command=zero, disturbance=zero, q_ref=q_ref, v_ref=zero, a_ref=zero,
         effort_limit=robot.effort_limit, continuous=robot.continuous, joint_names=robot.joint_names, period=period,
-        robot=robot.source, robot_sha256=robot.sha256, info={"controller": "</script>", "plant": "MuJoCo"},
+        robot=robot.source, robot_sha256=robot.sha256, robot_options=robot.options,
+        info={"controller": "</script>", "plant": "MuJoCo"},
     )  # fmt: skip
 
 
@@ -199,6 +200,8 @@ def test_the_chosen_start_of_a_batch_is_shown(tmp_path):
         ({"robot": ""}, "names no robot"),
         ({"robot_sha256": "0" * 64}, "not the arm that ran"),
         ({"robot": "three_link"}, "not the arm that ran"),
+        ({"robot_options": {"gravity": 1.62}}, "not the arm that ran"),
+        ({"robot_options": {"spin": 1}}, "loads its robot with spin"),
         ({"joint_names": ("a", "b")}, "moves joints a, b"),
         ({"q": np.full((501, 2), np.nan)}, "not finite"),
     ],
@@ -210,6 +213,19 @@ def test_runs_that_cannot_be_shown_are_refused_and_leave_the_file_alone(change, 
     with pytest.raises(ArgumentError, match=message):
         save(Run(**{**vars(run), **change}), tmp_path)
     assert page.read_bytes() == before
+
+
+@pytest.mark.parametrize("options", [{"gravity": 1.62}, {"gravity": [0.0, 3.0, -9.0]}, {"lock": ["wrist_3_joint"]}])
+def test_an_arm_loaded_in_another_way_is_found_again(options, tmp_path):
+    run = moving_run(load_robot("ur5", **options))
+    run.save(tmp_path / "run.npz")
+    assert save(Run.load(tmp_path / "run.npz"), tmp_path).is_file()
+
+
+def test_an_arm_without_a_name_is_shown(tmp_path):
+    path = tmp_path / "nameless.urdf"
+    path.write_text(BARE.format(visual="", more="").replace(' name="bare"', ""))
+    assert save(moving_run(load_robot(path)), tmp_path).is_file()
 
 
 def test_a_given_robot_needs_no_name_in_the_run(tmp_path):
@@ -308,6 +324,29 @@ def test_meshes_that_cannot_be_trusted_are_named_and_replaced(name, content, mes
         visuals = link_visuals(robot)
     assert all("a</script>" in str(warning.message) for warning in caught)
     assert STEEL in {visual.color for visual in visuals if visual.link == "a</script>"}
+
+
+def test_u22_meshes_stay_inside_their_roots(tmp_path):
+    folder = tmp_path / "pkg"
+    folder.mkdir()
+    (tmp_path / "outside.stl").touch()
+    (folder / "a.STL").touch()
+    (folder / "link.stl").symlink_to(tmp_path / "outside.stl")
+    urdf = folder / "x.urdf"
+    assert find_mesh("a.STL", urdf) == find_mesh("package://pkg/a.STL", urdf) == (folder / "a.STL").resolve()
+    for uri in (
+        "../outside.stl",
+        "package://../outside.stl",
+        "link.stl",
+        "file:///etc/a.stl",
+        f"{tmp_path}/outside.stl",
+    ):
+        with pytest.raises(MeshError, match="leaves the robot's folder"):
+            find_mesh(uri, urdf)
+    refused = {"http://x/a.stl": "not a file on", "package://file:///etc/a.stl": "not a file", "a.exe": "unknown kind"}
+    for uri, words in {**refused, "gone.stl": "not found"}.items():
+        with pytest.raises(MeshError, match=words):
+            find_mesh(uri, urdf)
 
 
 def test_meshes_are_scaled_and_found_where_they_may_be(tmp_path):

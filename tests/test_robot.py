@@ -1,5 +1,6 @@
 """Every arm by name is a sound model with n = nq = nv, and errors of configuration wrap where joints turn freely."""
 
+import json
 import pickle
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from nbs_pin.catalogue import ROBOT_NAMES, find
+from nbs_pin.controllers.pid import PID
 from nbs_pin.exceptions import ArgumentError, RobotError, RobotNotFound
 from nbs_pin.robot import configuration_difference, load_robot
 
@@ -18,9 +20,7 @@ def robot(request):
 
 
 def random_configurations(robot, count=10, seed=0):
-    low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
-    high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
-    return np.random.default_rng(seed).uniform(low, high, (count, robot.nv))
+    return np.random.default_rng(seed).uniform(*robot.sampling_range, (count, robot.nv))
 
 
 def test_one_number_per_joint(robot):
@@ -33,6 +33,67 @@ def test_one_number_per_joint(robot):
     assert np.isfinite(robot.lower).all() == (not robot.continuous.any() and robot.name != "double_pendulum")
     assert (robot.damping >= 0).all()
     assert (robot.friction >= 0).all()
+
+
+def test_only_missing_limits_are_replaced_for_sampling(robot):
+    for sampled, limit, turn in zip(robot.sampling_range, (robot.lower, robot.upper), (-np.pi, np.pi), strict=True):
+        stated = np.isfinite(limit)
+        np.testing.assert_array_equal(sampled[stated], limit[stated])
+        assert (sampled[~stated] == turn).all()
+
+
+def test_limits_beyond_a_turn_are_sampled_as_they_are():
+    lower, upper = load_robot("kinova").sampling_range
+    assert upper.max() > 5.0
+    assert (lower < upper).all()
+
+
+@pytest.mark.parametrize("limit", [3.0, np.inf, [5.0, np.inf], np.array([1.0, 2.0])])
+def test_other_effort_limits_make_the_same_arm(limit):
+    robot = load_robot("two_link")
+    weak = robot.with_effort_limit(limit)
+    np.testing.assert_array_equal(weak.effort_limit, np.full(2, limit))
+    test_pinocchio_carries_our_limits(weak)
+    np.testing.assert_array_equal(robot.effort_limit, robot.model.upperEffortLimit)
+    assert (robot.effort_limit == 100.0).all()
+    assert (weak.sha256, weak.source, weak.options) == (robot.sha256, robot.source, robot.options)
+    np.testing.assert_array_equal(weak.gravity_vector, weak.model.gravity.linear)
+    assert PID.for_robot(weak).effort_limit.tolist() == weak.effort_limit.tolist()
+
+
+def test_each_joint_gets_its_own_effort_limit():
+    np.testing.assert_array_equal(load_robot("panda").with_effort_limit(range(1, 8)).effort_limit, np.arange(1.0, 8.0))
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, [1.0], [1.0, 0.0], [1.0, np.nan], [[1.0, 2.0]], "strong"])
+def test_effort_limits_that_are_none_are_refused(limit):
+    with pytest.raises(ArgumentError, match="effort limit is"):
+        load_robot("two_link").with_effort_limit(limit)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("two_link", {}),
+        ("panda", {}),
+        ("ur5", {"gravity": 1.62}),
+        ("ur5", {"gravity": iter([0.0, 1.0, -9.0]), "lock": "wrist_3_joint"}),
+        ("three_link", {"lock": ["joint3"], "zero_limits": "unlimited"}),
+    ],
+)
+def test_an_arm_is_loaded_again_from_what_it_keeps(name, options):
+    robot = load_robot(name, **options)
+    stored = json.loads(json.dumps(robot.options))
+    assert stored.keys() == options.keys()
+    assert load_robot(robot.source, **stored).sha256 == robot.sha256
+
+
+def test_an_arm_from_a_file_is_found_from_anywhere(tmp_path, monkeypatch):
+    (tmp_path / "arm.urdf").write_bytes(find("three_link").path.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    robot = load_robot("arm.urdf")
+    monkeypatch.chdir("/")
+    assert load_robot(robot.source).sha256 == robot.sha256
 
 
 def test_pinocchio_carries_our_limits(robot):

@@ -34,6 +34,7 @@ def make_run(batch=(), rows=5, n=2):
         period=0.01,
         robot="two_link",
         robot_sha256="ab",
+        robot_options={"gravity": [0.0, 0.0, -1.62], "lock": ["wrist"]},
         info={"controller": "PID", "seeds": [1, 2]},
     )
 
@@ -48,6 +49,21 @@ def test_a_run_comes_back_bit_by_bit(tmp_path, batch):
         assert type(before) is type(after)
         np.testing.assert_array_equal(before, after)
     assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
+
+
+def test_missing_folders_are_made(tmp_path):
+    make_run().save(tmp_path / "new" / "deeper" / "run.npz")
+    assert Run.load(tmp_path / "new" / "deeper" / "run.npz").nv == 2
+
+
+def test_runs_are_compared_by_identity():
+    run = make_run()
+    assert run == run  # a comparison of arrays would raise
+    assert run != make_run()
+
+
+def test_a_run_without_robot_options_is_read(tmp_path):
+    assert Run.load(replaced(tmp_path / "run.npz", robot_options=None)).robot_options == {}
 
 
 def replaced(path, **arrays):
@@ -75,6 +91,8 @@ def replaced(path, **arrays):
         ({"q": np.zeros((5, 2), dtype=int)}, "'q' is int64, expected real numbers"),
         ({"info": np.array("{")}, "'info' is not JSON"),
         ({"info": np.array("[1]")}, "'info' is a list"),
+        ({"robot_options": np.array("[1]")}, "'robot_options' is a list"),
+        ({"robot_options": np.array(1.0)}, "'robot_options' is float64"),
     ],
 )
 def test_a_file_that_is_no_run_is_refused_by_key(tmp_path, arrays, reason):

@@ -13,7 +13,7 @@ import nbs_pin as nbs
 from nbs_pin.cli.track import Track
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.studies import tracking
-from nbs_pin.studies.motions import check_motion, motion_of
+from nbs_pin.studies.motions import motion_of
 
 STATE = {"q": [0.3, -0.2], "v": [0.1, 0.4], "q_ref": [0.0, 0.1], "v_ref": [0.2, 0.0], "a_ref": [0.0, 1.0]}
 
@@ -22,6 +22,7 @@ def test_the_command_line_offers_every_name_the_library_knows():
     hints = get_type_hints(Track)
     assert get_args(hints["controller"]) == get_args(tracking.ControllerName)
     assert get_args(hints["plant"]) == get_args(tracking.PlantName)
+    assert get_args(hints["integrator"])[0] == tracking.Integrator
 
 
 LAWS = """
@@ -46,11 +47,15 @@ def test_every_law_by_name_does_what_its_model_allows():
     assert all(late[name] < 1e-3 for name in late.keys() - lagging)
 
 
-def test_the_papers_law_is_its_own_on_two_link_and_tuned_elsewhere():
+def test_the_papers_law_is_its_own_on_two_link_and_tuned_elsewhere(tmp_path):
     robot = nbs.load_robot("two_link")
     paper = nbs.paper_controller(nbs.PinocchioDynamics(robot), seed=4)
     named = tracking.build_controller("nbs-paper", robot, seed=4, bandwidth=30.0)
     np.testing.assert_array_equal(named.torque(**STATE), paper.torque(**STATE))
+    (tmp_path / "mine.urdf").write_bytes(robot.urdf.path.read_bytes())
+    mine = nbs.load_robot(tmp_path / "mine.urdf")
+    assert (mine.name, mine.sha256 == robot.sha256) == ("two_link", False)
+    assert tracking.build_controller("nbs-paper", mine).potential.modulus != paper.potential.modulus
     panda = tracking.build_controller("nbs-paper", nbs.load_robot("panda"))
     assert (panda.potential.form, panda.damping.form, panda.inertial_rate) == ("paper", "paper", 0.0)
     assert panda.potential.modulus > 2.0
@@ -87,9 +92,10 @@ def test_the_pinocchio_plant_steps_finely_enough_for_its_friction():
 
 def test_seed_and_effort_limit_matter():
     robot = nbs.load_robot("two_link")
+    motion = nbs.Sinusoid.for_robot(robot)
     runs = [
-        tracking.track(robot, duration=0.1, start_error=0.3, seed=seed, effort_limit=limit).run
-        for seed, limit in ((0, None), (0, None), (1, None), (0, np.inf))
+        tracking.track(arm, reference=motion, duration=0.1, start_error=0.3, seed=seed).run
+        for seed, arm in ((0, robot), (0, robot), (1, robot), (0, robot.with_effort_limit(np.inf)))
     ]
     np.testing.assert_array_equal(runs[0].q, runs[1].q)
     assert (runs[0].q[-1] != runs[2].q[-1]).all()
@@ -102,16 +108,55 @@ def test_a_motion_beyond_the_limits_is_refused():
     t = np.linspace(0.0, 10.0, 2001)
     desired = motion(t)
     needed = np.abs(nbs.inverse_dynamics(nbs.PinocchioDynamics(robot), *desired)).max()
-    check_motion(motion, robot, 10.0, 1.001 * needed)
-    with pytest.raises(ArgumentError, match="beyond the effort limit"):
-        check_motion(motion, robot, 10.0, 0.999 * needed)
-    fast = nbs.Sinusoid(1.0, [1.0, 30.0])
+    nbs.check_reference(motion, robot.with_effort_limit(1.001 * needed), 10.0)
+    with pytest.raises(ArgumentError, match=r"torque .* raise the limit"):
+        tracking.track(robot.with_effort_limit(0.999 * needed), reference=motion)
+    free = robot.with_effort_limit(np.inf)
     with pytest.raises(ArgumentError, match=r"velocity .* of joint 'joint2'"):
-        check_motion(fast, robot, 10.0, np.inf)
+        tracking.track(free, reference=nbs.Sinusoid(1.0, [1.0, 30.0]))
     hard = nbs.Sinusoid(1.0, [1.0, 15.0])
-    check_motion(hard, robot, 10.0, np.inf)
+    nbs.check_reference(hard, free, 10.0)
     with pytest.raises(ArgumentError, match="torque"):
-        check_motion(hard, robot, 10.0, None)
+        tracking.track(robot, reference=hard)
+
+
+def test_effort_limits_reach_gains_anti_windup_and_torque_alike():
+    robot = nbs.load_robot("two_link")
+    weak = robot.with_effort_limit([60.0, 30.0])
+    law, free = (tracking.build_controller("pid", arm) for arm in (weak, robot))
+    assert law.effort_limit.tolist() == [60.0, 30.0]
+    assert (law.kp < free.kp).any()
+    run, _ = tracking.track(weak, duration=0.02, start_error=1.0)
+    assert run.effort_limit.tolist() == [60.0, 30.0]
+    assert (np.abs(run.tau) <= [60.0, 30.0]).all()
+
+
+def test_start_integrator_step_and_lookahead_reach_the_simulation():
+    robot = nbs.load_robot("two_link").with_effort_limit(np.inf)
+    settings = {"plant_step": 0.005, "lookahead": 0.0}
+    run, _ = tracking.track(
+        robot, plant="pinocchio", controller="nbs-paper", integrator="euler", reference=nbs.paper_reference(2),
+        duration=0.2, period=0.01, start=[0.2, -0.1], **settings,
+    )  # fmt: skip
+    dynamics = nbs.PinocchioDynamics(robot)
+    plant, law = nbs.DynamicsPlant(dynamics, "euler"), nbs.paper_controller(dynamics)
+    same = nbs.simulate(plant, law, nbs.paper_reference(2), 0.2, 0.01, q0=[0.2, -0.1], **settings)
+    np.testing.assert_array_equal(run.q, same.q)
+    assert run.q[0].tolist() == [0.2, -0.1]
+    assert tracking.build_plant("mujoco", robot, integrator="euler").integrator == "euler"
+    for plant, integrator in (("mujoco", "semi_implicit_euler"), ("pinocchio", "implicitfast")):
+        with pytest.raises(ArgumentError, match=f"integrator '{integrator}' is unknown"):
+            tracking.build_plant(plant, robot, integrator=integrator)
+
+
+def test_a_tuple_will_do_for_a_motion():
+    robot = nbs.load_robot("two_link")
+    motion = nbs.Sinusoid.for_robot(robot)
+    runs = [
+        tracking.track(robot, reference=reference, duration=0.01, start_error=0.1).run
+        for reference in (motion, lambda t: tuple(motion(t)))
+    ]
+    np.testing.assert_array_equal(runs[0].q, runs[1].q)
 
 
 def test_the_papers_motion_is_within_reach_of_the_bundled_arms():
@@ -119,7 +164,7 @@ def test_the_papers_motion_is_within_reach_of_the_bundled_arms():
         robot = nbs.load_robot(name)
         motion, length = motion_of("paper", robot, frequency=1.0, period=0.001)
         assert length == 10.0
-        check_motion(motion, robot, 100.0, None)
+        nbs.check_reference(motion, robot, 100.0)
         np.testing.assert_allclose(motion(7.0).q[:2], [np.sin(0.7), np.cos(0.7)], rtol=1e-14)
 
 

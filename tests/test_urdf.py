@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from nbs_pin.catalogue import ROBOT_NAMES
-from nbs_pin.exceptions import RobotError, RobotNotFound
+from nbs_pin.exceptions import ArgumentError, RobotError, RobotNotFound
 from nbs_pin.robot import load_robot
-from nbs_pin.urdf import mesh_file, read_urdf
+from nbs_pin.urdf import read_urdf
 from nbs_pin.urdf_source import MAX_BYTES
 
 ARM = """<?xml version="1.0"?>
@@ -204,8 +204,23 @@ def test_u11_zero_limits_read_as_unlimited(tmp_path):
     text = mutated(LIMIT1, '<limit lower="0" upper="0" effort="0" velocity="0"/>')
     joint = read_urdf(write(tmp_path, text), zero_limits="unlimited").joints[0]
     assert (joint.lower, joint.upper, joint.effort, joint.velocity) == (-np.inf, np.inf, np.inf, np.inf)
+    assert load_robot(write(tmp_path, text), zero_limits="unlimited").effort_limit.tolist() == [np.inf, 20.0]
+    for zero in ('lower="0" upper="0" effort="1"', 'lower="-1" upper="1" effort="0"'):
+        message = refusal(write(tmp_path, mutated(LIMIT1, f'<limit {zero} velocity="1"/>')))
+        assert "or load it with zero_limits='unlimited'" in message
     negative = write(tmp_path, mutated('effort="10"', 'effort="-1"'))
-    assert "limit effort '-1'" in refusal(negative, zero_limits="unlimited")
+    message = refusal(negative, zero_limits="unlimited")
+    assert "limit effort '-1'" in message
+    assert "or load it" not in message
+    with pytest.raises(ArgumentError, match="zero_limits is 'none'; give refuse or unlimited"):
+        load_robot("two_link", zero_limits="none")
+
+
+def test_an_arm_without_a_name_takes_that_of_its_file(tmp_path):
+    named, unnamed = mutated('name="arm"', 'name="lone"'), mutated(' name="arm"', "")
+    urdf = read_urdf(write(tmp_path, unnamed, "lone.urdf"))
+    assert urdf.name == "lone"
+    assert urdf.xml == read_urdf(write(tmp_path, named)).xml
 
 
 @pytest.mark.parametrize("limit", ["", '<limit effort="7" velocity="5"/>', LIMIT1])
@@ -277,24 +292,6 @@ def test_u21_only_utf8(tmp_path):
 def test_a_default_namespace_is_no_obstacle(tmp_path):
     spaced = read_urdf(write(tmp_path, mutated('<robot name="arm"', '<robot xmlns="http://example.com" name="arm"')))
     assert spaced.without_geometry() == read_urdf(write(tmp_path, ARM)).without_geometry()
-
-
-def test_u22_meshes_stay_inside_their_roots(tmp_path):
-    (tmp_path / "pkg").mkdir()
-    (tmp_path / "outside.stl").touch()
-    mesh = write(tmp_path / "pkg", b"", "a.STL")
-    assert mesh_file("package://pkg/a.STL", (tmp_path / "none", tmp_path)) == mesh.resolve()
-    assert mesh_file("a.STL", (tmp_path / "pkg",)) == mesh.resolve()
-    (tmp_path / "pkg" / "link.stl").symlink_to(tmp_path / "outside.stl")
-    for uri in ["../outside.stl", "package://../outside.stl", "link.stl"]:
-        with pytest.raises(RobotError, match="leaves the model directory"):
-            mesh_file(uri, (tmp_path / "pkg",))
-    for uri in [f"{tmp_path}/outside.stl", "file:///etc/a.stl", "http://x/a.stl", "package://file:///etc/a.stl"]:
-        with pytest.raises(RobotError, match="no path inside"):
-            mesh_file(uri, (tmp_path,))
-    for uri, words in {"a.exe": "unknown kind", "gone.stl": "does not exist"}.items():
-        with pytest.raises(RobotError, match=words):
-            mesh_file(uri, (tmp_path,))
 
 
 def test_what_engines_read_is_what_was_checked(tmp_path):

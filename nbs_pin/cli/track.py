@@ -15,7 +15,15 @@ import tyro
 from rich.console import Console
 
 from nbs_pin.cli.tables import print_tracking
-from nbs_pin.cli.values import OptionError, disturbance_text, integer, number, parse_disturbance
+from nbs_pin.cli.values import (
+    OptionError,
+    configuration,
+    disturbance_text,
+    integer,
+    number,
+    parse_disturbance,
+    plain_numbers,
+)
 
 
 def _default(hint: str) -> Any:
@@ -49,6 +57,8 @@ class Track:
     """Rate at which errors decay [rad/s]; the paper's own law on two_link has none."""
     start_error: Annotated[float, number("--start-error", least=0.0, most=math.pi, unit="rad")] = 0.0
     """Added to every joint with alternating sign, the arm then starting at rest [rad]; 0 starts on the motion."""
+    start: Annotated[str | None, configuration("--start"), _default("on the motion")] = None
+    """Where the arm starts at rest [rad], one number per joint: --start=-0.1,0.2."""
     disturbance: Annotated[str, disturbance_text()] = "none"
     """Torque on every joint [N·m]: none, constant:5, square:5@8, sine:5@8 (@ rad/s) or noise:0.5 (standard deviation).
     A comma list gives one per joint: constant:5,5,3."""
@@ -60,6 +70,21 @@ class Track:
     """Largest torque of every joint [N·m]."""
     no_effort_limit: bool = False
     """Let torques grow without limit."""
+    integrator: Annotated[
+        Literal["rk4", "euler", "implicitfast", "semi_implicit_euler"] | None,
+        tyro.conf.arg(metavar="{rk4,euler,implicitfast,semi_implicit_euler}"),
+        _default("the plant's usual one"),
+    ] = None
+    """How the plant is integrated. mujoco: rk4, euler (semi-implicit), implicitfast; pinocchio: rk4, euler (explicit),
+    semi_implicit_euler."""
+    plant_step: Annotated[
+        float | None, number("--plant-step", least=1e-6, most=0.1, unit="s"), _default("at most 0.001")
+    ] = None
+    """Step of the plant, of which a period is a whole number [s]."""
+    lookahead: Annotated[
+        float | None, number("--lookahead", least=0.0, most=0.1, unit="s"), _default("half a period")
+    ] = None
+    """How far ahead of the measured state the law is evaluated [s]; 0 is the plain sampled law."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
     """Of network weights and noise."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), _default("out/track-ROBOT")] = None
@@ -71,14 +96,17 @@ class Track:
         """Tracks, writes and prints; raises NbsPinError or OSError."""
         if self.no_effort_limit and self.effort_limit is not None:
             raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
+        if self.start is not None and self.start_error:
+            raise OptionError("--start and --start-error were both given; choose one.")
         with notes.status(f"loading {self.robot}"):
-            from nbs_pin.catalogue import ROBOT_NAMES
             from nbs_pin.robot import load_robot
             from nbs_pin.studies import motions, tracking
 
-            named = self.robot in ROBOT_NAMES or not Path(self.robot).is_file()
-            robot = load_robot(self.robot if named else Path(self.robot).resolve())  # the replay finds it from anywhere
+            robot = load_robot(self.robot)
+        if self.no_effort_limit or self.effort_limit is not None:
+            robot = robot.with_effort_limit(self.effort_limit or math.inf)
         motion, length = motions.motion_of(self.reference, robot, frequency=self.frequency, period=self.period)
+        start = self._start(robot.nv)
         settings = self._settings(robot.source, self.duration or length)
         folder = self.out or Path("out") / f"track-{re.sub(r'[^A-Za-z0-9_.-]', '_', robot.name)}"
         facts = {"settings": settings, "versions": tracking.versions(), "robot_sha256": robot.sha256}
@@ -93,9 +121,12 @@ class Track:
                 period=self.period,
                 bandwidth=self.bandwidth,
                 start_error=self.start_error,
+                start=start,
                 disturbance=parse_disturbance(self.disturbance).build(robot.nv, self.period, self.seed),
                 joint_friction=self.joint_friction,
-                effort_limit=math.inf if self.no_effort_limit else self.effort_limit,
+                integrator=self.integrator,
+                plant_step=self.plant_step,
+                lookahead=self.lookahead,
                 seed=self.seed,
                 progress=True,
             )
@@ -107,6 +138,13 @@ class Track:
         print_tracking(console, f"{robot.name}, {self.controller} in {self.plant}", figures, wall_time)
         for name in tracking.FILES:
             console.print(str(folder / name), soft_wrap=True, highlight=False, markup=False)
+
+    def _start(self, nv: int) -> list[float] | None:
+        """The configuration to start from [rad], or None; raises OptionError for another number of joints."""
+        start = None if self.start is None else plain_numbers(self.start)
+        if start is not None and len(start) != nv:
+            raise OptionError(f"--start '{self.start}' has {len(start)} numbers for {nv} joints; give one for each.")
+        return start
 
     def _settings(self, robot: str, duration: float) -> dict[str, Any]:
         """Everything that decides the run, as JSON can store it."""

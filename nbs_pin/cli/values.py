@@ -34,6 +34,17 @@ def number(
     return _spec("NUMBER", parse, "{:g}".format)
 
 
+def configuration(flag: str) -> PrimitiveConstructorSpec[str]:
+    """The text of numbers split by commas for tyro, read by `plain_numbers`; raises OptionError for any other."""
+
+    def parse(words: list[str]) -> str:
+        if plain_numbers(words[0]) is None:
+            raise OptionError(f"{flag} is '{words[0]}'; give one number per joint, split by commas: {flag}=0.1,-0.2.")
+        return words[0]
+
+    return _spec("Q1,Q2,…", parse, str)
+
+
 def integer(flag: str, most: int) -> PrimitiveConstructorSpec[int]:
     """A whole number in [0, most] for tyro; raises OptionError for any other text."""
 
@@ -49,6 +60,12 @@ def plain_number(text: str) -> float | None:
     """The finite number that plain ASCII digits spell, else None: float() would also read nan, 1_0 and ٣."""
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
     return value if math.isfinite(value) else None
+
+
+def plain_numbers(text: str) -> list[float] | None:
+    """The plain numbers that a comma list spells, else None."""
+    values = [plain_number(word) for word in text.split(",")]
+    return None if None in values else [value for value in values if value is not None]
 
 
 @dataclass(frozen=True)

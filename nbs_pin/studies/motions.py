@@ -1,14 +1,11 @@
-"""The motion a study follows, by name or from a file, and whether the arm can follow it."""
+"""The motion a study follows, by name or from a file."""
 
 import difflib
 import math
 from pathlib import Path
 
-import numpy as np
-
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
-from nbs_pin.references import DesiredMotion, Sinusoid, check_reference, paper_reference
+from nbs_pin.references import DesiredMotion, Sinusoid, paper_reference
 from nbs_pin.robot import Robot
 
 NAMED = ("sinusoid", "paper")
@@ -35,22 +32,3 @@ def motion_of(text: str, robot: Robot, *, frequency: float, period: float) -> tu
 
     motion = load_reference(text, robot.joint_names)
     return motion, max(1, math.floor(motion.duration / period + 1e-9)) * period
-
-
-def check_motion(reference: DesiredMotion, robot: Robot, duration: float, effort_limit: float | None) -> None:
-    """`check_reference`, against the effort limit [N·m] that will act: None for the arm's, inf for none.
-
-    Raises ArgumentError naming joint, time, value, limit and remedy.
-    """
-    check_reference(reference, robot, duration, torque=effort_limit is None)
-    if effort_limit is None:
-        return
-    t = np.linspace(0.0, duration, 2001)
-    q, v, a = reference(t)
-    tau = PinocchioDynamics(robot).reference_torque(q, v, v, a)
-    row, joint = np.unravel_index(np.argmax(np.abs(tau)), tau.shape)
-    if abs(tau[row, joint]) > effort_limit:
-        raise ArgumentError(
-            f"the reference needs the torque {tau[row, joint]:.4g} N·m of joint '{robot.joint_names[joint]}' at "
-            f"t = {t[row]:.4g} s, beyond the effort limit {effort_limit:g} N·m; slow it down or raise the limit."
-        )

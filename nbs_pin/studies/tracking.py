@@ -5,10 +5,10 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
@@ -27,17 +27,19 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.npz import LARGEST
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
+from nbs_pin.plants.integrators import IntegratorName
 from nbs_pin.plants.plant import Plant
-from nbs_pin.references import DesiredMotion, Sinusoid
+from nbs_pin.references import DesiredMotion, Sinusoid, check_reference
 from nbs_pin.robot import Robot
 from nbs_pin.simulation import LONGEST_PLANT_STEP, simulate
-from nbs_pin.state import Run
-from nbs_pin.studies.motions import check_motion
+from nbs_pin.state import Reference, Run
 
 PlantName: TypeAlias = Literal["mujoco", "pinocchio"]
 """What `build_plant` knows."""
 ControllerName: TypeAlias = Literal["nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid"]
 """What `build_controller` knows."""
+Integrator: TypeAlias = Literal["rk4", "euler", "implicitfast", "semi_implicit_euler"]
+"""What one plant or the other knows."""
 FILES = ("run.npz", "tracking.png", "replay.html", "summary.json")
 """What `write_results` writes, the summary last."""
 _ROWS_OF_ARRAYS = 8  # the arrays of a Run with a number per row and joint
@@ -60,45 +62,52 @@ def track(
     period: float = 0.001,
     bandwidth: float = 8.0,
     start_error: float = 0.0,
+    start: Sequence[float] | None = None,
     disturbance: Disturbance | None = None,
     joint_friction: Literal["drop", "keep"] = "drop",
-    effort_limit: float | None = None,
+    integrator: Integrator | None = None,
+    plant_step: float | None = None,
+    lookahead: float | None = None,
     seed: int = 0,
     progress: bool = False,
 ) -> Tracked:
-    """The arm following a motion it is able to follow, started `start_error` [rad] off it.
+    """The arm following a motion it is able to follow; `Robot.with_effort_limit` gives its drives other limits.
 
     plant, controller: by name (`build_plant`, `build_controller`) or built. reference: None takes
     `Sinusoid.for_robot(robot)`. start_error: added to every joint with alternating sign, the arm then starting at rest;
-    0 starts on the reference. joint_friction: "keep" lets the URDF's friction act, fed forward by laws that model it.
-    effort_limit: None takes the arm's [N·m], inf none. seed: of the network weights.
+    0 starts on the reference. start: the configuration [rad] to start from at rest, in place of `start_error`.
+    joint_friction: "keep" lets the URDF's friction act, fed forward by laws that model it. integrator: of a plant by
+    name, None its usual one. plant_step, lookahead [s]: as in `simulate`. seed: of the network weights.
     Raises ArgumentError for a motion outside the arm's position, velocity or effort limits, or settings that do not
     fit, and SimulationDiverged when the arm leaves the finite numbers.
     """
     friction = JointFriction.of(robot) if joint_friction == "keep" else None
     reference = Sinusoid.for_robot(robot) if reference is None else reference
     _check_size(robot.nv, duration, period)
-    check_motion(reference, robot, duration, effort_limit)
+    check_reference(reference, robot, duration)
     if not isinstance(controller, Controller):
         controller = build_controller(
             controller, robot, bandwidth=bandwidth, period=period, friction=friction, seed=seed
         )
     if not isinstance(plant, Plant):
-        plant = build_plant(plant, robot, friction)
-    start = time.perf_counter()
+        plant = build_plant(plant, robot, friction, integrator)
+    if start is None and start_error:
+        start = Reference(*reference(0.0)).q + start_error * (-1.0) ** np.arange(robot.nv)
+    before = time.perf_counter()
     run = simulate(
         plant,
         controller,
         reference,
         duration,
         period,
-        q0=reference(0.0).q + start_error * (-1.0) ** np.arange(robot.nv) if start_error else None,
-        plant_step=_plant_step(plant, robot, period),
-        effort_limit=effort_limit,
+        q0=start,
+        plant_step=_plant_step(plant, robot, period) if plant_step is None else plant_step,
+        effort_limit=robot.effort_limit,
+        lookahead=lookahead,
         disturbance=disturbance,
         progress=progress,
     )
-    return Tracked(run, time.perf_counter() - start)
+    return Tracked(run, time.perf_counter() - before)
 
 
 def build_controller(
@@ -113,14 +122,14 @@ def build_controller(
     """The law of that name, tuned for the arm by its own `for_robot`.
 
     bandwidth [rad/s], period [s]. friction: fed forward by every law with a model. seed: of the network weights.
-    "nbs-paper" is the paper's own law (`paper_controller`) on two_link, and its networks with this arm's gains on
-    every other. Raises ArgumentError for an unknown name or numbers out of range.
+    "nbs-paper" is the paper's own law (`paper_controller`) on the bundled two_link, and its networks with this arm's
+    gains on every other. Raises ArgumentError for an unknown name or numbers out of range.
     """
     if name not in get_args(ControllerName):
         raise ArgumentError(
             f"controller '{name}' is unknown; choose one of {', '.join(get_args(ControllerName))}, or build one."
         )
-    if name == "nbs-paper" and robot.name == "two_link":
+    if name == "nbs-paper" and robot.source == "two_link":
         return paper_controller(PinocchioDynamics(robot), seed=seed)
     tuned: dict[str, Any] = {"bandwidth": bandwidth, "period": period}
     modelled = {**tuned, "friction": friction}
@@ -138,19 +147,24 @@ def build_controller(
     return make[name]()
 
 
-def build_plant(name: str, robot: Robot, friction: JointFriction | None = None) -> Plant:
-    """The arm in MuJoCo, or Pinocchio's dynamics integrated by RK4; with `friction` the joints have it.
+def build_plant(
+    name: str, robot: Robot, friction: JointFriction | None = None, integrator: Integrator | None = None
+) -> Plant:
+    """The arm in MuJoCo, or Pinocchio's dynamics integrated in time; with `friction` the joints have it.
 
-    MuJoCo takes the friction of the URDF, whatever `friction` says beyond being there.
-    Raises ArgumentError for an unknown name and RobotError for an arm that MuJoCo cannot build.
+    MuJoCo takes the friction of the URDF, whatever `friction` says beyond being there. integrator: None is Pinocchio's
+    RK4 and the choice of `MujocoPlant`.
+    Raises ArgumentError for an unknown name or integrator and RobotError for an arm that MuJoCo cannot build.
     """
     if name not in get_args(PlantName):
         raise ArgumentError(f"plant '{name}' is unknown; choose one of {', '.join(get_args(PlantName))}, or build one.")
     if name == "pinocchio":
-        return DynamicsPlant(PinocchioDynamics(robot), friction=friction)
-    from nbs_pin.plants.mujoco_plant import MujocoPlant
+        _check_integrator(integrator, get_args(IntegratorName))
+        return DynamicsPlant(PinocchioDynamics(robot), cast(Any, integrator or "rk4"), friction)
+    from nbs_pin.plants.mujoco_plant import MujocoIntegrator, MujocoPlant
 
-    return MujocoPlant(robot, joint_friction="drop" if friction is None else "keep")
+    _check_integrator(integrator, get_args(MujocoIntegrator))
+    return MujocoPlant(robot, cast(Any, integrator), "drop" if friction is None else "keep")
 
 
 def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
@@ -192,6 +206,11 @@ def write_results(run: Run, folder: str | Path, robot: Robot, summary: dict[str,
         for name in FILES:
             os.replace(draft / name, folder / name)
     return folder
+
+
+def _check_integrator(integrator: str | None, known: tuple[str, ...]) -> None:
+    if integrator is not None and integrator not in known:
+        raise ArgumentError(f"integrator '{integrator}' is unknown to this plant; choose one of {', '.join(known)}.")
 
 
 def _check_size(nv: int, duration: float, period: float) -> None:
