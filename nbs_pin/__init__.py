@@ -49,7 +49,7 @@ _HOMES = {
     "nbs_pin.references": ("Hold", "MinimumJerk", "Sinusoid", "check_reference", "paper_reference"),
     "nbs_pin.replay_page": ("replay",),
     "nbs_pin.robot": ("Robot", "load_robot"),
-    "nbs_pin.simulation": ("simulate",),
+    "nbs_pin.simulation": ("simulate", "stream"),
     "nbs_pin.state": ("Reference", "Run"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}

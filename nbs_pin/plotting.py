@@ -1,6 +1,7 @@
 """Figures of runs, drawn without any global plotting state."""
 
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,21 @@ _STYLE: Any = {
     "xtick.color": "#4a5562",
     "ytick.color": "#4a5562",
 }
+
+
+def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]], path: str | Path) -> Path:
+    """Draws cost [µs] against number of joints, a line per series, and writes the picture (PNG); returns its path."""
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(6.4, 4.0), dpi=120, layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        for (name, values), colour in zip(series.items(), (ACTUAL, REFERENCE, TORQUE, ERROR), strict=False):
+            axes.plot(joints, values, "o-", color=colour, markersize=3.5, label=name)
+        axes.set(xlabel="joints", ylabel="one control step, median [µs]", xlim=(0, None), ylim=(0, None))
+        axes.legend(frameon=False, loc="upper left")
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png")
+    return write_whole(path, buffer.getvalue())
 
 
 def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:

@@ -16,6 +16,7 @@ import tyro
 from rich.console import Console
 
 from nbs_pin import __version__
+from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.robots import Robots
 from nbs_pin.cli.track import Track
@@ -25,9 +26,10 @@ from nbs_pin.exceptions import NbsPinError
 Command: TypeAlias = (
     Annotated[Track, tyro.conf.subcommand("track")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Robots, tyro.conf.subcommand("robots")]
 )
-NAMES = ("track", "replay", "robots")
+NAMES = ("track", "replay", "bench", "robots")
 BAD_INPUT, INTERRUPTED = 2, 130
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` shows the options of a command; "
