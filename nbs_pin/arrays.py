@@ -26,6 +26,14 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
     Raises ArgumentError when kinds are mixed, a tensor is not float64, a last axis is not nv, or batches do not
     broadcast.
     """
+    given = tuple(vectors.values())
+    shape = np.shape(given[0])
+    if (
+        shape
+        and shape[-1] == nv
+        and all(type(x) is np.ndarray and x.shape == shape and x.dtype == float for x in given)
+    ):
+        return given  # the common case, without a detour
     arrays = [x if is_torch_array(x) else np.asarray(x, dtype=float) for x in vectors.values()]
     if len({is_torch_array(x) for x in arrays}) > 1:
         kinds = ", ".join(f"{k} {type(x).__name__}" for k, x in vectors.items())

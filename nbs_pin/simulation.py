@@ -1,8 +1,10 @@
 """The one time loop: a controller, a reference and a plant make a Run."""
 
 import math
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import joblib
@@ -17,6 +19,7 @@ from nbs_pin.progress import tracked
 from nbs_pin.references import DesiredMotion
 from nbs_pin.state import Reference, Run
 
+_RECORDED = ("q", "v", "tau", "tau_command", "disturbance")
 LONGEST_PLANT_STEP = 1e-3
 """Plant step taken when none is given, or the nearest shorter one that divides the period [s]."""
 
@@ -74,14 +77,32 @@ def _shared(workers: int, q0: Any, v0: Any, *given: Any, **options: Any) -> Run:
             f"workers share starts, and q0 has shape {starts.shape}; give q0 of shape (starts, ..., nv)."
         )
     speeds = np.zeros_like(starts) if v0 is None else np.broadcast_to(np.asarray(v0, dtype=float), starts.shape)
-    shares = zip(np.array_split(starts, workers), np.array_split(speeds, workers), strict=True)
-    jobs = [joblib.delayed(simulate)(*given, q0=q, v0=v, **options) for q, v in shares if len(q)]
-    runs = joblib.Parallel(n_jobs=workers)(jobs)
-    joined = {
-        name: np.concatenate([getattr(run, name) for run in runs], axis=1)
-        for name in ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
-    }
-    return replace(runs[0], **joined)
+    shares = [
+        x for x in zip(np.array_split(starts, workers), np.array_split(speeds, workers), strict=True) if len(x[0])
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        files = [str(Path(folder) / f"{k}.npy") for k in range(len(shares))]
+        jobs = (
+            joblib.delayed(_share)(file, *given, q0=q, v0=v, **options)
+            for file, (q, v) in zip(files, shares, strict=True)
+        )
+        runs = joblib.Parallel(n_jobs=workers)(jobs)
+        rows = np.concatenate([np.load(file, mmap_mode="r") for file in files], axis=2)
+    references = {name: _tiled(getattr(runs[0], name), rows[0].shape) for name in ("q_ref", "v_ref", "a_ref")}
+    return replace(runs[0], **dict(zip(_RECORDED, rows, strict=True)), **references)
+
+
+def _share(file: str, *given: Any, **options: Any) -> Run:
+    """One worker's simulation: what differs from start to start goes into a file, the first start comes back."""
+    run = simulate(*given, **options)
+    rows = np.lib.format.open_memmap(file, mode="w+", dtype=float, shape=(len(_RECORDED), *run.q.shape))
+    for row, name in zip(rows, _RECORDED, strict=True):
+        row[:] = getattr(run, name)
+    return replace(run, **{name: getattr(run, name)[:, :1] for name in (*_RECORDED, "q_ref", "v_ref", "a_ref")})
+
+
+def _tiled(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return np.array(np.broadcast_to(x, shape))
 
 
 def stream(

@@ -14,10 +14,24 @@ from rich.text import Text
 from nbs_pin.cli.values import OptionError, integer
 
 _COLUMNS = {
-    "control step": ("p50_us", "p99_us", "p99.9_us", "max_us", "over_two_rnea", "torch_over_compiled"),
-    "plant step": ("p50_us",),
-    "simulate": ("steps_per_s", "peak_MB"),
-    "joints": ("joints", "p50_us", "over_two_rnea"),
+    "control step": {
+        "p50\n[µs]": "p50_us",
+        "p99\n[µs]": "p99_us",
+        "p99.9\n[µs]": "p99.9_us",
+        "max\n[µs]": "max_us",
+        "÷ two\nRNEA": "over_two_rnea",
+        "torch\n÷ it": "torch_over_compiled",
+    },
+    "plant step": {"p50\n[µs]": "p50_us"},
+    "simulate": {"steps\nper s": "steps_per_s", "memory\n[MB]": "peak_MB"},
+    "joints": {"joints": "joints", "p50\n[µs]": "p50_us", "÷ two\nRNEA": "over_two_rnea"},
+    "endurance": {
+        "motion\n[s]": "duration_s",
+        "wall\n[s]": "wall_s",
+        "memory\ngrowth [MB]": "memory_growth_MB",
+        "error, last\n÷ first": "last_over_first_error",
+    },
+    "workers": {"starts": "starts", "1 process\n[s]": "one_s", "2 processes\n[s]": "two_s", "speed-up": "speed_up"},
 }
 
 
@@ -32,6 +46,8 @@ class Bench:
     """Arms by name or path."""
     calls: Annotated[int, integer("--calls", most=10_000_000)] = 20_000
     """How often each control step is timed."""
+    long: bool = False
+    """Also an hour of motion and a thousand starts; a few minutes."""
     compare: Annotated[Path | None, tyro.conf.arg(metavar="SUMMARY")] = None
     """summary.json of an earlier bench: also print what moved by more than a tenth."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
@@ -47,7 +63,7 @@ class Bench:
 
         rows = []
         with notes.status("measuring; leave the machine alone") as status:
-            for row in bench.bench(self.arms, calls=self.calls):
+            for row in bench.bench(self.arms, calls=self.calls, long=self.long):
                 rows.append(row)
                 status.update(f"measured {row.key}")
         self.out.mkdir(parents=True, exist_ok=True)
@@ -58,7 +74,8 @@ class Bench:
         series = {name: [figures[key] for figures in chain] for name, key in lines.items()}
         plot_scaling([figures["joints"] for figures in chain], series, self.out / "joints.png")
         for what, columns in _COLUMNS.items():
-            console.print(_table(what, columns, [row for row in rows if row.what == what]))
+            if any(row.what == what for row in rows):
+                console.print(_table(what, columns, [row for row in rows if row.what == what]))
         if old is not None:
             console.print(_moved(bench.compare(rows, old)))
         console.print(str(self.out / "summary.json"), str(self.out / "joints.png"), sep="\n", highlight=False)
@@ -71,14 +88,14 @@ def _read(path: Path) -> Any:
         raise OptionError(f"--compare '{path}' is no JSON ({error}); give the summary.json of another bench.") from None
 
 
-def _table(what: str, columns: tuple[str, ...], rows: list[Any]) -> Table:
+def _table(what: str, columns: dict[str, str], rows: list[Any]) -> Table:
     table = Table(title=Text(what), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
     for heading in ("arm", "law or plant"):
         table.add_column(heading, no_wrap=True)
     for heading in columns:
-        table.add_column(heading, justify="right")
+        table.add_column(Text(heading), justify="right", no_wrap=True)
     for row in rows:
-        values = (row.figures.get(column) for column in columns)
+        values = (row.figures.get(column) for column in columns.values())
         table.add_row(row.arm, row.how, *("" if value is None else f"{value:.4g}" for value in values))
     return table
 

@@ -9,18 +9,21 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pinocchio as pin
 import torch
 
+from nbs_pin import metrics
 from nbs_pin.controllers.controller import Controller
+from nbs_pin.disturbances import SquareWave, TorqueNoise
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.plants.mujoco_plant import MujocoPlant
 from nbs_pin.references import Sinusoid
 from nbs_pin.robot import Robot, load_robot
-from nbs_pin.simulation import simulate
+from nbs_pin.simulation import simulate, stream
 from nbs_pin.state import Reference
 from nbs_pin.studies.chains import serial_chain
 from nbs_pin.studies.tracking import ControllerName, build_controller, versions
@@ -46,10 +49,18 @@ class Row:
         return f"{self.what}/{self.arm}/{self.how}"
 
 
-def bench(arms: tuple[str, ...] = ("two_link", "panda", "ur5"), *, calls: int = 20_000) -> Iterator[Row]:
+def bench(
+    arms: tuple[str, ...] = ("two_link", "panda", "ur5"),
+    *,
+    calls: int = 20_000,
+    chains: tuple[int, ...] = CHAINS,
+    long: bool = False,
+) -> Iterator[Row]:
     """Rows as they are measured: control steps, plant steps, simulation, and cost against the number of joints.
 
     calls: how often a control step is timed. A step is timed alone, with the garbage collector off, on one core.
+    chains: numbers of joints of the generated arms. long: also an hour of motion and a thousand starts, a few minutes.
+    Raises ArgumentError for fewer than 1000 calls.
     """
     if calls < 1000:
         raise ArgumentError(f"calls is {calls}, expected at least 1000 for a p99.9.")
@@ -59,8 +70,11 @@ def bench(arms: tuple[str, ...] = ("two_link", "panda", "ur5"), *, calls: int = 
             yield control_row(robot, law, calls, against_torch=law == "nbs")
         yield from plant_rows(robot)
         yield simulation_row(robot)
-    for joints in CHAINS:
+    for joints in chains:
         yield control_row(serial_chain(joints), "nbs", max(1000, calls // 4), what="joints")
+    if long:
+        yield endurance_row(load_robot("panda"))
+        yield workers_row(load_robot("panda"))
 
 
 def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step", against_torch: bool = False) -> Row:
@@ -124,6 +138,53 @@ def simulation_row(robot: Robot, duration: float = 5.0) -> Row:
     return Row("simulate", robot.name, "nbs mujoco euler", {"steps_per_s": rate, "peak_MB": _peak_memory() - before})
 
 
+def endurance_row(robot: Robot, duration: float = 3600.0) -> Row:
+    """An hour at 1 kHz under square-wave and noise torques, streamed: time, memory growth, and whether errors grow."""
+    controller = build_controller("nbs", robot, period=PERIOD)
+    square, noise = SquareWave(1.0, 5.0), TorqueNoise(0.1, PERIOD)
+    blocks = stream(
+        MujocoPlant(robot, "euler"),
+        controller,
+        Sinusoid.for_robot(robot),
+        duration,
+        PERIOD,
+        block=10_000,
+        disturbance=lambda t, q, v: square(t, q, v) + noise(t, q, v),
+    )
+    start, errors, memory = time.perf_counter(), [], []
+    for run in blocks:
+        errors.append(metrics.rms_error(run) ** 2)
+        memory.append(_memory())
+    sixth = len(errors) // 6
+    first, last = (float(np.sqrt(np.mean(part, axis=0)).max()) for part in (errors[:sixth], errors[-sixth:]))
+    figures = {
+        "duration_s": duration,
+        "wall_s": time.perf_counter() - start,
+        "memory_growth_MB": memory[-1] - memory[len(memory) // 10],
+        "last_over_first_error": last / first,
+    }
+    return Row("endurance", robot.name, "nbs mujoco euler", figures)
+
+
+def workers_row(robot: Robot, starts: int = 1000, duration: float = 1.0) -> Row:
+    """A thousand starts on one core and on two: a process each, without threads of their own."""
+    controller, reference = build_controller("nbs", robot, period=PERIOD), Sinusoid.for_robot(robot)
+    plant = MujocoPlant(robot, "euler")
+    q0 = reference(0.0).q + 0.1 * np.random.default_rng(0).normal(size=(starts, robot.nv))
+    simulate(plant, controller, reference, 0.01, PERIOD, q0=q0, workers=2)  # starts the processes
+    walls = []
+    threads, numba.config.NUMBA_NUM_THREADS = numba.config.NUMBA_NUM_THREADS, 1  # type: ignore[attr-defined]
+    try:
+        for workers in (1, 2):
+            start = time.perf_counter()
+            simulate(plant, controller, reference, duration, PERIOD, q0=q0, workers=workers)
+            walls.append(time.perf_counter() - start)
+    finally:
+        numba.config.NUMBA_NUM_THREADS = threads  # type: ignore[attr-defined]
+    figures = {"starts": float(starts), "one_s": walls[0], "two_s": walls[1], "speed_up": walls[0] / walls[1]}
+    return Row("workers", robot.name, "nbs mujoco euler", figures)
+
+
 def compare(rows: list[Row], old: dict[str, Any]) -> list[tuple[str, str, float, float]]:
     """(row, figure, old, new) of every figure that both benches have and that moved by more than a tenth.
 
@@ -177,6 +238,12 @@ def _times(function: Callable[..., Any], arguments: list[Any], calls: int) -> np
 def _peak_memory() -> float:
     """Largest resident memory of this process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def _memory() -> float:
+    """Resident memory of this process now [MB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
 
 
 def _processor() -> str:
