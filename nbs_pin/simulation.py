@@ -306,6 +306,7 @@ def _prepared(loop: _Loop, t: np.ndarray, desired: Reference, q0: np.ndarray, v0
         period=loop.period,
         robot="" if robot is None else robot.source,
         robot_sha256="" if robot is None else robot.sha256,
+        robot_options={} if robot is None else robot.options,
         info={
             "controller": loop.name,
             "plant": repr(loop.plant),
