@@ -276,26 +276,12 @@ def ramp(t):
 @pytest.mark.parametrize(
     ("q", "reason"),
     [
-<<<<<<< HEAD
-        (
-            lambda t: 0.5 * np.c_[t, (2.0 - t) ** 2],
-            "velocity jump 2 .* of elbow at t = 0 s, where the motion starts and",
-        ),
-=======
         (lambda t: 0.5 * np.c_[t, (2.0 - t) ** 2], "velocity jump 2 .* of elbow at t = 0 s, where the motion starts"),
->>>>>>> main
         (
             lambda t: 1.5 * np.c_[t**2, t],
             "velocity jump 6 rad/s of shoulder at t = 2 s, where the motion ends",
         ),
-<<<<<<< HEAD
-        (
-            lambda t: ramp(with_rest(lambda s: s, t)),
-            r"velocity jump .* rad/s of shoulder at t = 1 s \(row 11\); smooth",
-        ),
-=======
         (lambda t: ramp(with_rest(lambda s: s, t)), r"velocity jump .* of shoulder at t = 1 s \(row 11\); smooth"),
->>>>>>> main
         (ramp, r"velocity jump 4 rad/s of shoulder at t = 1 s \(row 11\); smooth"),
         (lambda t: with_rest(wave, t) + 0.5 * (np.arange(21) == 7)[:, None], "velocity jump .* at t = 0.7"),
         (lambda t: with_rest(wave, t) + 0.5 * (np.arange(21) > 11)[:, None], r"velocity jump .* at t = 1\.[12]"),
