@@ -34,7 +34,7 @@ HOMES = {
     "trimesh": {"meshes", "visuals", "replay_page"},
     "scipy": {"reference_files", "visuals"},
     "xacrodoc": {"urdf_source"},
-    "numba": {"runtime.jit", "runtime.laws", "runtime.threads"},
+    "numba": {"studies.bench", "runtime.jit", "runtime.laws", "runtime.threads"},
 }
 
 

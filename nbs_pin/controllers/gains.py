@@ -103,15 +103,15 @@ def check_sampling(bandwidth: float, period: float) -> None:
 def warn_if_too_fast(robot: Robot, dynamics: DynamicsProvider, bandwidth: float, start_error: float = 0.3) -> None:
     """Warns when ω asks a joint for several times its effort limit from `start_error` [rad]: ω²M_ii of it alone.
 
-    A law that saturates for long has no proof left, and from about four times the limit some arms no longer converge.
+    A law that saturates for long has no proof left, and from about six times the limit some arms no longer converge.
     """
     asked = bandwidth**2 * largest_inertia(robot, dynamics) * start_error / robot.effort_limit
     worst = int(np.argmax(asked))
-    if asked[worst] > 4.0:
+    if asked[worst] > 6.0:
         warnings.warn(
             f"a bandwidth of {bandwidth:g} rad/s asks joint '{robot.joint_names[worst]}' of {robot.name} for"
             f" {asked[worst]:.1f} times its effort limit from an error of {start_error} rad and may not converge from"
-            f" there; take at most {bandwidth * np.sqrt(4.0 / asked[worst]):.3g} rad/s, or start on the reference.",
+            f" there; take at most {bandwidth * np.sqrt(6.0 / asked[worst]):.3g} rad/s, or start on the reference.",
             stacklevel=3,
         )
 
