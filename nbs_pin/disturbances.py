@@ -80,6 +80,8 @@ class TorqueNoise:
     std: PerJoint
     period: float
     seed: int = 0
+    share: tuple[int, int, int] | None = None
+    """(first, last + 1, all): the starts of a larger batch that q stands for; the noise is theirs in that batch."""
 
     def __post_init__(self) -> None:
         per_joint(self, "std")
@@ -92,7 +94,11 @@ class TorqueNoise:
     ) -> Float[np.ndarray, "*batch n"]:
         """Torque at time t [s] in the state (q, v) [N·m]."""
         interval = math.floor(t / self.period + 1e-9)  # t = k·period may round to just below its interval
-        return _on_joints(self.std, q) * np.random.default_rng((self.seed, interval)).standard_normal(q.shape)
+        rng = np.random.default_rng((self.seed, interval))
+        if self.share is None:
+            return _on_joints(self.std, q) * rng.standard_normal(q.shape)
+        first, end, count = self.share
+        return _on_joints(self.std, q) * rng.standard_normal((count, *q.shape[1:]))[first:end]
 
 
 def _on_joints(torque: Any, q: np.ndarray) -> np.ndarray:

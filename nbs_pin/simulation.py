@@ -4,6 +4,7 @@ import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from nbs_pin.checks import all_finite, positive, whole
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.disturbances import Disturbance
+from nbs_pin.disturbances import Disturbance, TorqueNoise
 from nbs_pin.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.plants.plant import Plant
 from nbs_pin.progress import tracked
@@ -54,47 +55,49 @@ def simulate(
     lookahead: how far [s] ahead the controller is evaluated, on the reference of that time and the state predicted with
     the reference's acceleration. A held torque acts half a period late on average, so None takes half a period, which
     removes that lag (the tracking error of a panda at 1 kHz falls tenfold); 0 is the plain sampled law.
-    workers: processes that share the starts along the first axis of q0; a disturbance sees those of its own share.
+    workers: processes that share the starts along the first axis of q0. `TorqueNoise` is then the one of all starts
+    together; any other disturbance is called with the starts of its own process.
     progress: show a progress bar when it takes longer than 2 s at a terminal.
 
     Raises ArgumentError for arguments that do not fit each other, and SimulationDiverged, naming the time, when the
     controller's torque or the state is not finite or the engine warns.
     """
-    if workers > 1:
-        given = (plant, controller.compile(), reference, duration, period)
-        options = {"plant_step": plant_step, "effort_limit": effort_limit, "disturbance": disturbance}
-        return _shared(workers, q0, v0, *given, **options, lookahead=lookahead)
+    if workers < 1 or workers != int(workers):
+        raise ArgumentError(f"workers is {workers}, expected a whole number of processes ≥ 1; correct it.")
     loop = _loop(plant, controller, period, plant_step, effort_limit, disturbance, lookahead, duration)
-    run, _ = _block(loop, reference, 0, loop.steps, loop.start(reference, q0, v0), None, progress)
-    return run
+    start = loop.start(reference, q0, v0)
+    if workers > 1:
+        return _shared(loop, reference, start, int(workers))
+    return _block(loop, reference, 0, loop.steps, start, None, progress)[0]
 
 
-def _shared(workers: int, q0: Any, v0: Any, *given: Any, **options: Any) -> Run:
-    """`simulate` of slices of the starts in processes of their own, joined along the first batch axis."""
-    starts = np.asarray(q0, dtype=float)
-    if starts.ndim < 2:
-        raise ArgumentError(
-            f"workers share starts, and q0 has shape {starts.shape}; give q0 of shape (starts, ..., nv)."
-        )
-    speeds = np.zeros_like(starts) if v0 is None else np.broadcast_to(np.asarray(v0, dtype=float), starts.shape)
-    shares = [
-        x for x in zip(np.array_split(starts, workers), np.array_split(speeds, workers), strict=True) if len(x[0])
-    ]
-    with tempfile.TemporaryDirectory() as folder:
-        files = [str(Path(folder) / f"{k}.npy") for k in range(len(shares))]
-        jobs = (
-            joblib.delayed(_share)(file, *given, q0=q, v0=v, **options)
-            for file, (q, v) in zip(files, shares, strict=True)
-        )
+def _shared(loop: "_Loop", reference: DesiredMotion, start: tuple[np.ndarray, np.ndarray], workers: int) -> Run:
+    """The run of slices of the starts in processes of their own, joined along the first batch axis."""
+    q0, v0 = start
+    if q0.ndim < 2:
+        raise ArgumentError(f"workers share starts, and q0 has shape {q0.shape}; give q0 of shape (starts, ..., nv).")
+    bounds = np.linspace(0, len(q0), min(workers, len(q0)) + 1).astype(int).tolist()
+    with tempfile.TemporaryDirectory() as folder, joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        files = [str(Path(folder) / f"{first}.npy") for first in bounds[:-1]]
+        shares = list(pairwise(bounds))
+        loops = [_of_starts(loop, first, end, len(q0)) for first, end in shares]
+        starts = [(q0[first:end], v0[first:end]) for first, end in shares]
+        jobs = [joblib.delayed(_share)(*job, reference) for job in zip(files, loops, starts, strict=True)]
         runs = joblib.Parallel(n_jobs=workers)(jobs)
         rows = np.concatenate([np.load(file, mmap_mode="r") for file in files], axis=2)
     references = {name: _tiled(getattr(runs[0], name), rows[0].shape) for name in ("q_ref", "v_ref", "a_ref")}
     return replace(runs[0], **dict(zip(_RECORDED, rows, strict=True)), **references)
 
 
-def _share(file: str, *given: Any, **options: Any) -> Run:
+def _of_starts(loop: "_Loop", first: int, end: int, count: int) -> "_Loop":
+    """The loop for some of `count` starts: noise is the one those starts have among all of them."""
+    noise = loop.disturbance
+    return replace(loop, disturbance=replace(noise, share=(first, end, count))) if type(noise) is TorqueNoise else loop
+
+
+def _share(file: str, loop: "_Loop", start: tuple[np.ndarray, np.ndarray], reference: DesiredMotion) -> Run:
     """One worker's simulation: what differs from start to start goes into a file, the first start comes back."""
-    run = simulate(*given, **options)
+    run, _ = _block(loop, reference, 0, loop.steps, start, None, False)
     rows = np.lib.format.open_memmap(file, mode="w+", dtype=float, shape=(len(_RECORDED), *run.q.shape))
     for row, name in zip(rows, _RECORDED, strict=True):
         row[:] = getattr(run, name)
@@ -124,15 +127,22 @@ def stream(
     """`simulate` without keeping what is past: one Run per `block` control periods, for hours of motion.
 
     Each run begins at the instant and in the state in which the one before ended, and all of them together are the run
-    that `simulate` gives. Arguments and errors are those of `simulate`.
+    that `simulate` gives, for a controller whose `step` depends on its arguments alone: at the border of two blocks it
+    is asked twice. Arguments and errors are those of `simulate`.
     """
     loop = _loop(plant, controller, period, plant_step, effort_limit, disturbance, lookahead, duration)
     if block < 1:
         raise ArgumentError(f"block is {block} periods, expected at least one; 1000 is usual.")
-    state, memory = loop.start(reference, q0, v0), None
+    return _blocks(loop, reference, loop.start(reference, q0, v0), block, progress)
+
+
+def _blocks(
+    loop: "_Loop", reference: DesiredMotion, state: tuple[np.ndarray, np.ndarray], block: int, progress: bool
+) -> Iterator[Run]:
+    memory = None
     for first in tracked(range(0, loop.steps, block), "simulating", progress):
         run, memory = _block(loop, reference, first, min(block, loop.steps - first), state, memory, False)
-        state = (run.q[-1], run.v[-1])
+        state = run.q[-1].copy(), run.v[-1].copy()  # the run itself is its reader's
         yield run
 
 
@@ -171,7 +181,7 @@ def _loop(
         )
     return _Loop(
         plant=plant,
-        law=controller.compile(),
+        law=_compiled(controller),
         name=type(controller).__name__,
         period=period,
         steps=whole(duration, period, "duration", "period"),
@@ -180,6 +190,12 @@ def _loop(
         limit=_effort_limit(plant, effort_limit),
         disturbance=disturbance,
     )
+
+
+def _compiled(controller: Controller) -> Controller:
+    """The compiled form; the controller itself where `compile` is another base's method, as torch.nn.Module's."""
+    law = controller.compile()
+    return law if isinstance(law, Controller) else controller
 
 
 def _block(

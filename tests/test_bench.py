@@ -40,9 +40,10 @@ def test_compare_names_what_moved_by_more_than_a_tenth():
     old = {
         "rows": [{"what": "control step", "arm": "panda", "how": "nbs", "figures": {"p50_us": 10.0, "max_us": 100.0}}]
     }
-    assert bench.compare(new, old) == [("control step/panda/nbs", "p50_us", 10.0, 12.0)]
-    with pytest.raises(ArgumentError, match="has no 'rows'"):
-        bench.compare(new, {})
+    assert bench.compare(new, bench.rows_of(old)) == [("control step/panda/nbs", "p50_us", 10.0, 12.0)]
+    for wrong in ({}, [], {"rows": [{}]}, {"rows": 1}):
+        with pytest.raises(ArgumentError, match=r"is no summary\.json of a bench"):
+            bench.rows_of(wrong)
 
 
 def test_an_hour_in_short_keeps_its_memory_and_its_error():

@@ -331,11 +331,12 @@ def test_a_compiled_controller_is_a_snapshot():
 def test_compiled_controllers_pickle_and_compile_to_themselves(law, robot):
     compiled = law(robot).compile()
     assert isinstance(compiled, CompiledController)
-    assert compiled.compile() is compiled
     assert compiled.nv == robot.nv
     copy = pickle.loads(pickle.dumps(compiled))
     given = states(robot.nv)
-    np.testing.assert_array_equal(copy.torque(*given), compiled.torque(*given))
+    for other in (copy, compiled.compile()):  # each with scratch space of its own
+        assert other is not compiled
+        np.testing.assert_array_equal(other.torque(*given), compiled.torque(*given))
 
 
 class Softplus(Activation):
@@ -391,6 +392,21 @@ class Stiction(JointFriction):
         return 3.0 + super().torque(v)
 
 
+class Leaky(SmoothedReLU):
+    """A user's variation of an activation that has a kernel."""
+
+    def derivatives(self, x):
+        value, slope, bend = super().derivatives(x)
+        return value + 0.3 * x, slope + 0.3, bend
+
+
+def test_an_empty_batch_is_empty():
+    robot = load_robot("two_link")
+    empty = np.zeros((0, 2))
+    for law in (NeuralBackstepping, SlotineLi, ComputedTorque, PD):
+        assert law.for_robot(robot).compile().torque(*[empty] * 5).shape == (0, 2)
+
+
 def test_what_a_subclass_overrides_is_not_lost():
     robot = load_robot("two_link")
     for controller in (
@@ -401,6 +417,7 @@ def test_what_a_subclass_overrides_is_not_lost():
         SlotineLi.for_robot(robot, friction=Stiction(np.ones(2), np.ones(2))),
         SlotineLi(Shifted(), rate=1.0, gain=1.0),
         paper_controller(Shifted()),
+        NeuralBackstepping(AnalyticDynamics(), Potential(np.eye(2), activation=Leaky()), Damping(2, form="paper")),
     ):
         assert_one_law(controller, *states(2))
 

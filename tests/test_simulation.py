@@ -2,9 +2,11 @@
 
 import io
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import torch
 
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -212,17 +214,83 @@ def test_a_stream_is_the_run_in_pieces(law):
         next(stream(PLANT, controller, reference, 1.0, 0.01, block=0))
 
 
-def test_workers_share_the_starts():
+class Payload(MujocoPlant):
+    """A plant of the user's own: the base class and a constant torque."""
+
+    def step(self, q, v, tau, duration):
+        return super().step(q, v, tau + 0.5, duration)
+
+
+@pytest.mark.parametrize("law", ["nbs", "pid"])
+def test_workers_share_the_starts(law):
+    """Any number of processes gives the run of one: same plant, same noise for each start, same notes."""
     robot = load_robot("three_link")
-    plant, controller = MujocoPlant(robot), NeuralBackstepping.for_robot(robot)
-    reference = Sinusoid.for_robot(robot)
-    starts = np.random.default_rng(0).normal(size=(5, 3))
-    alone = simulate(plant, controller, reference, 0.05, 0.001, q0=starts, disturbance=SquareWave(1.0, 9.0))
-    shared = simulate(plant, controller, reference, 0.05, 0.001, q0=starts, disturbance=SquareWave(1.0, 9.0), workers=2)
-    for name in ("q", "v", "tau", "tau_command", "disturbance", "q_ref"):
-        np.testing.assert_allclose(getattr(shared, name), getattr(alone, name), rtol=1e-12, atol=1e-12)
-    with pytest.raises(ArgumentError, match=r"q0 has shape \(3,\); give q0 of shape \(starts, \.\.\., nv\)"):
-        simulate(plant, controller, reference, 0.05, 0.001, q0=starts[0], workers=2)
+    controller = NeuralBackstepping.for_robot(robot) if law == "nbs" else PID.for_robot(robot)
+    plant, reference = Payload(robot), Sinusoid.for_robot(robot)
+    plant.model.body_mass[:] *= 2.0
+    rng = np.random.default_rng(0)
+    options = {"q0": rng.normal(size=(5, 2, 3)), "v0": rng.normal(size=(2, 3)), "disturbance": TorqueNoise(1.0, 0.002)}
+    alone = simulate(plant, controller, reference, 0.02, 0.001, **options)
+    shared = simulate(plant, controller, reference, 0.02, 0.001, **options, workers=2)
+    for name in ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "a_ref"):
+        np.testing.assert_allclose(getattr(shared, name), getattr(alone, name), rtol=1e-9, atol=1e-9)
+    assert shared.info == alone.info
+    assert np.ptp(alone.disturbance[:-1], axis=1).min() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"q0": np.zeros(2), "workers": 2}, r"q0 has shape \(2,\); give q0 of shape \(starts, \.\.\., nv\)"),
+        ({"q0": np.zeros((4, 2)), "v0": np.zeros((3, 2)), "workers": 2}, "the starts do not broadcast"),
+        ({"q0": np.zeros((4, 2)), "workers": 0}, "workers is 0, expected a whole number"),
+    ],
+)
+def test_workers_that_cannot_share_are_refused(options, words):
+    with pytest.raises(ArgumentError, match=words):
+        simulate(PLANT, PD, STILL, 0.1, 0.01, **options)
+
+
+def test_a_stream_does_not_depend_on_what_its_reader_does_with_a_run():
+    whole = simulate(PLANT, PD, Sinusoid([1.0, 0.5], 2.0), 0.2, 0.01, q0=np.ones(2))
+    for run in stream(PLANT, PD, Sinusoid([1.0, 0.5], 2.0), 0.2, 0.01, q0=np.ones(2), block=5):
+        last = run.q[-1].copy()
+        run.q[:] = 1e6
+    np.testing.assert_array_equal(last, whole.q[-1])
+
+
+def test_a_stream_is_refused_before_it_begins():
+    with pytest.raises(ArgumentError, match="duration is -1"):
+        stream(PLANT, PD, STILL, -1.0, 0.01)
+
+
+def test_threads_may_share_a_compiled_controller():
+    """Each simulation takes scratch space of its own."""
+    robot = load_robot("three_link")
+    fast, reference = NeuralBackstepping.for_robot(robot).compile(), Sinusoid.for_robot(robot)
+
+    def run(shift: float) -> np.ndarray:
+        start = reference(0.0).q + shift
+        return simulate(MujocoPlant(robot), fast, reference, 0.2, 0.001, q0=start).q
+
+    shifts = [0.1, 0.2, 0.3]
+    with ThreadPoolExecutor(3) as pool:
+        together = list(pool.map(run, shifts))
+    for shift, q in zip(shifts, together, strict=True):
+        np.testing.assert_array_equal(q, run(shift))
+
+
+def test_a_law_that_is_also_a_torch_module_is_simulated():
+    """torch.nn.Module has a `compile` of its own, which is not a law's."""
+
+    class Mine(torch.nn.Module, MemorylessController):
+        nv = 2
+
+        def torque(self, q, v, q_ref, v_ref, a_ref):
+            return -q - v
+
+    run = simulate(PLANT, Mine(), STILL, 0.1, 0.01, q0=np.ones(2))
+    assert run.info["controller"] == "Mine"
 
 
 def test_a_motion_is_not_asked_for_what_comes_after_its_end():

@@ -23,7 +23,7 @@ _COLUMNS = {
         "torch\n÷ it": "torch_over_compiled",
     },
     "plant step": {"p50\n[µs]": "p50_us"},
-    "simulate": {"steps\nper s": "steps_per_s", "memory\n[MB]": "peak_MB"},
+    "simulate": {"steps\nper s": "steps_per_s", "recorded\n[MB]": "recorded_MB"},
     "joints": {"joints": "joints", "p50\n[µs]": "p50_us", "÷ two\nRNEA": "over_two_rnea"},
     "endurance": {
         "motion\n[s]": "duration_s",
@@ -61,6 +61,7 @@ class Bench:
             from nbs_pin.plotting import plot_scaling
             from nbs_pin.studies import bench
 
+        known = None if old is None else bench.rows_of(old)
         rows = []
         with notes.status("measuring; leave the machine alone") as status:
             for row in bench.bench(self.arms, calls=self.calls, long=self.long):
@@ -76,8 +77,8 @@ class Bench:
         for what, columns in _COLUMNS.items():
             if any(row.what == what for row in rows):
                 console.print(_table(what, columns, [row for row in rows if row.what == what]))
-        if old is not None:
-            console.print(_moved(bench.compare(rows, old)))
+        if known is not None:
+            console.print(_moved(bench.compare(rows, known)))
         console.print(str(self.out / "summary.json"), str(self.out / "joints.png"), sep="\n", highlight=False)
 
 

@@ -50,7 +50,11 @@ class CompiledController(MemorylessController):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled as the arguments it is rebuilt from."""
-        return CompiledController, (self.law, self.dynamics)
+        return type(self), (self.law, self.dynamics)
+
+    def compile(self) -> "CompiledController":
+        """The same law with scratch space of its own, so that each `simulate` and each thread may have one."""
+        return type(self)(self.law, self.dynamics)
 
     @property
     def nv(self) -> int:
@@ -95,11 +99,16 @@ def is_packable(dynamics: DynamicsProvider, friction: JointFriction | None) -> b
     return type(dynamics).difference is DynamicsProvider.difference and type(friction) in (JointFriction, type(None))
 
 
+def _gravity(route: Any, q: np.ndarray) -> np.ndarray:
+    zero = np.zeros(q.shape)
+    return route(q, zero, zero, zero)
+
+
 def _model_route(law: int, dynamics: DynamicsProvider) -> Any:
     """(q, v, v_r, a_r) -> M a_r + C v_r + G by the shortest way that this law allows."""
-    if law == PD_GRAVITY:
-        return lambda q, v, v_r, a_r: dynamics.gravity(q)
     route = dynamics.compiled_reference_torque()
+    if law == PD_GRAVITY:
+        return lambda q, v, v_r, a_r: _gravity(route, q)
     if law == COMPUTED_TORQUE:  # v_r is v, and the provider may see it
         return lambda q, v, v_r, a_r: route(q, v, v, a_r)
     return route

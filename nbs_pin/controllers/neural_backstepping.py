@@ -143,8 +143,8 @@ class NeuralBackstepping(MemorylessController, nn.Module):
 
     def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
         """The law as machine code (`Controller.compile`)."""
-        known = (type(self), type(self.potential), type(self.damping)) == (NeuralBackstepping, Potential, Damping)
-        if not (known and self.potential.network.activation.kernel and is_packable(self.dynamics, self.friction)):
+        known = type(self) is NeuralBackstepping and self.potential.is_packable and self.damping.is_packable
+        if not (known and is_packable(self.dynamics, self.friction)):
             return self
         rate = self.rate.double().numpy()
         return CompiledController.of(

@@ -130,7 +130,7 @@ class CompiledPID(Controller):
         if isinstance(q, np.ndarray) and q.ndim == 1:
             out = np.empty((3, self.nv))
             try:
-                fits = pid(*memory, q, v, reference.q, reference.v, period, self.gains, out)
+                fits = pid(*memory, q, v, reference.q, reference.v, float(period), self.gains, out)
             except TypeError:  # not all contiguous float64 vectors: converted and checked below
                 fits = False
             if fits:
@@ -152,6 +152,6 @@ class CompiledPID(Controller):
         if is_torch_array(given[0]):
             raise ArgumentError("a compiled PID was given torch tensors, expected numpy arrays; convert them.")
         out = np.empty((3, given[0].size))
-        pid(*(np.array(x, dtype=float).ravel() for x in given), period, self.gains, out)
+        pid(*(np.array(x, dtype=float).ravel() for x in given), float(period), self.gains, out)
         tau, integral, derivative = out.reshape(3, *given[0].shape)
         return tau, PIDMemory(integral, derivative)

@@ -180,7 +180,7 @@ class _TwoRnea:
         if q.ndim > 1:
             same = v_r is v
             rows = zip(q, v, v if same else v_r, a_r, strict=True)
-            return np.stack([self(x, w, w if same else w_r, b) for x, w, w_r, b in rows])
+            return np.array([self(x, w, w if same else w_r, b) for x, w, w_r, b in rows]).reshape(q.shape)
         if v_r is v:
             return pin.rnea(self._model, self._data, q, v, a_r)
         self._halves(v, v_r, self._mean, self._half)

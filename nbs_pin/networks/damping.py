@@ -91,6 +91,11 @@ class Damping(nn.Module):
         t = self.factor(r * z)
         return matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
 
+    @property
+    def is_packable(self) -> bool:
+        """Whether all parts are the ones the kernels know, and not those of a subclass."""
+        return (type(self), type(self.diagonal), type(self.lower)) == (Damping, _FCNN, _FCNN)
+
     def packed(self) -> Packed:
         """The weights as the compiled form of `force` takes them (`runtime/damping.py`)."""
         networks = self.diagonal.layers(), self.lower.layers()

@@ -76,6 +76,12 @@ class Potential(nn.Module):
         force, force_rate = 2.0 * matvec(s, z), 2.0 * matvec(s, dz)
         return value + 0.5 * xp.sum(z * force, axis=-1), r * gradient + force, r * product + force_rate
 
+    @property
+    def is_packable(self) -> bool:
+        """Whether all parts are the ones the kernels know, and not those of a subclass."""
+        parts = (type(self), type(self.network), type(self.network.activation))
+        return parts[:2] == (Potential, FICNN) and parts[2] in (SmoothedReLU, Squareplus)
+
     def packed(self) -> Packed:
         """The weights as the compiled form of `terms` takes them (`runtime/convex.py`).
 

@@ -13,6 +13,7 @@ from nbs_pin.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.plants.plant import Plant
 from nbs_pin.robot import Robot
 
+_SCRATCH = ("_data", "_qpos", "_qvel", "_torque", "_warnings")
 _LOGGER = logging.getLogger("nbs_pin.mujoco")
 MujocoIntegrator: TypeAlias = Literal["rk4", "euler", "implicitfast"]
 JointFrictionChoice: TypeAlias = Literal["drop", "keep"]
@@ -64,17 +65,26 @@ class MujocoPlant(Plant):
         self.integrator = integrator
         self.joint_friction = joint_friction
         self.model = build_model(robot, integrator, joint_friction)
+        ids = [self.model.joint(name).id for name in robot.joint_names]
+        self._at_q = _in_order(self.model.jnt_qposadr[ids])
+        self._at_v = _in_order(self.model.jnt_dofadr[ids])
+        self._bind()
+
+    def _bind(self) -> None:
         self._data = mujoco.MjData(self.model)
         # Live arrays, fetched once: every access through the data would make them anew.
         self._qpos, self._qvel, self._torque = self._data.qpos, self._data.qvel, self._data.qfrc_applied
         self._warnings = self._data.warning.number
-        ids = [self.model.joint(name).id for name in robot.joint_names]
-        self._at_q = _in_order(self.model.jnt_qposadr[ids])
-        self._at_v = _in_order(self.model.jnt_dofadr[ids])
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied as the arguments it is rebuilt from: MuJoCo's scratch data is no part of its value."""
-        return MujocoPlant, (self._robot, self.integrator, self.joint_friction)
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled and copied: everything but MuJoCo's scratch data, which is no part of the plant's value."""
+        return {name: value for name, value in self.__dict__.items() if name not in _SCRATCH}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Back from a pickle, with scratch data of its own."""
+        self.__dict__.update(state)
+        mujoco.set_mju_user_warning(_LOGGER.info)
+        self._bind()
 
     def __repr__(self) -> str:
         return f"MujocoPlant({self._robot.name}, {self.integrator}, joint_friction={self.joint_friction})"

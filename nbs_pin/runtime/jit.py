@@ -8,7 +8,7 @@ from typing import Any
 
 import numba
 
-_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -17,14 +17,14 @@ def kernel(function: Callable[..., Any]) -> Any:
     Arguments: contiguous float64 vectors and the parts of `layout.py`; results go into the vectors named last, and
     `work` is scratch space (`layout.workspace`). Kernels allocate nothing and hold no state, so any number of threads
     may run them, each with its own scratch space. The machine code is kept beside the source, or in the user's cache
-    directory where that is read-only.
+    directory where that is read-only (NUMBA_CACHE_DIR names another), or nowhere where neither can be written.
     """
-    return _cached(numba.njit(inspect.unwrap(function), fastmath={"reassoc", "contract"}, **_OPTIONS))
+    return _compiled(function, {"reassoc", "contract"})
 
 
 def exact_kernel(function: Callable[..., Any]) -> Any:
     """Like `kernel`, in the order of operations that is written, even where a kernel that may reorder calls it."""
-    return _cached(numba.njit(inspect.unwrap(function), fastmath=False, **_OPTIONS))
+    return _compiled(function, False)
 
 
 def compile_for(dispatcher: Any, signature: Any) -> None:
@@ -39,6 +39,14 @@ def _sources() -> str:
     """Fingerprint of this folder."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+def _compiled(function: Callable[..., Any], fastmath: Any) -> Any:
+    plain = inspect.unwrap(function)
+    try:
+        return _cached(numba.njit(plain, fastmath=fastmath, cache=True, **_OPTIONS))
+    except RuntimeError:  # nowhere to keep machine code: neither this folder nor the user's can be written
+        return numba.njit(plain, fastmath=fastmath, **_OPTIONS)
 
 
 def _cached(dispatcher: Any) -> Any:

@@ -2,7 +2,6 @@
 
 import gc
 import platform
-import resource
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -12,6 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 import pinocchio as pin
+import psutil
 import torch
 
 from nbs_pin import metrics
@@ -106,8 +106,14 @@ def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step
     }
     if against_torch:
         tensors = [tuple(torch.as_tensor(x) for x in state) for state in states]
-        eager = np.median(_times(plain.torque, tensors, 200))  # type: ignore[attr-defined]
-        figures |= {"torch_us": float(eager), "torch_over_compiled": float(eager / np.median(times))}
+        with_graph = np.median(_times(plain.torque, tensors, 200))  # type: ignore[attr-defined]
+        with torch.no_grad():
+            eager = np.median(_times(plain.torque, tensors, 200))  # type: ignore[attr-defined]
+        figures |= {
+            "torch_us": float(eager),
+            "torch_graph_us": float(with_graph),
+            "torch_over_compiled": float(eager / np.median(times)),
+        }
     return Row(what, robot.name, law, figures)
 
 
@@ -130,12 +136,12 @@ def simulation_row(robot: Robot, duration: float = 5.0) -> Row:
     reference = Sinusoid.for_robot(robot)
     plant = MujocoPlant(robot, "euler")
     simulate(plant, controller, reference, 0.1, PERIOD)
-    before = _peak_memory()
     start = time.perf_counter()
-    simulate(plant, controller, reference, duration, PERIOD)
+    run = simulate(plant, controller, reference, duration, PERIOD)
     wall = time.perf_counter() - start
-    rate = duration / PERIOD / wall
-    return Row("simulate", robot.name, "nbs mujoco euler", {"steps_per_s": rate, "peak_MB": _peak_memory() - before})
+    arrays = [value for value in vars(run).values() if isinstance(value, np.ndarray)]
+    figures = {"steps_per_s": duration / PERIOD / wall, "recorded_MB": sum(x.nbytes for x in arrays) / 2**20}
+    return Row("simulate", robot.name, "nbs mujoco euler", figures)
 
 
 def endurance_row(robot: Robot, duration: float = 3600.0) -> Row:
@@ -185,21 +191,26 @@ def workers_row(robot: Robot, starts: int = 1000, duration: float = 1.0) -> Row:
     return Row("workers", robot.name, "nbs mujoco euler", figures)
 
 
-def compare(rows: list[Row], old: dict[str, Any]) -> list[tuple[str, str, float, float]]:
+def compare(rows: list[Row], old: dict[str, dict[str, float]]) -> list[tuple[str, str, float, float]]:
     """(row, figure, old, new) of every figure that both benches have and that moved by more than a tenth.
 
-    old: a bench's summary.json. Raises ArgumentError when it is none.
+    old: `rows_of` the other bench's summary.json.
     """
-    if not isinstance(old.get("rows"), list):
-        raise ArgumentError("the file to compare with has no 'rows'; give the summary.json of another bench.")
-    known = {f"{r['what']}/{r['arm']}/{r['how']}": r["figures"] for r in old["rows"]}
     moved = []
     for row in rows:
         for name, new in row.figures.items():
-            before = known.get(row.key, {}).get(name)
+            before = old.get(row.key, {}).get(name)
             if before is not None and abs(new - before) > 0.1 * abs(before):
                 moved.append((row.key, name, before, new))
     return moved
+
+
+def rows_of(summary: Any) -> dict[str, dict[str, float]]:
+    """The figures of each row of a summary.json, by `Row.key`; raises ArgumentError when it is none."""
+    try:
+        return {Row(r["what"], r["arm"], r["how"]).key: dict(r["figures"]) for r in summary["rows"]}
+    except (TypeError, KeyError, ValueError) as error:
+        raise ArgumentError("the file to compare with is no summary.json of a bench; give one.") from error
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
@@ -235,15 +246,9 @@ def _times(function: Callable[..., Any], arguments: list[Any], calls: int) -> np
     return 1e-3 * times
 
 
-def _peak_memory() -> float:
-    """Largest resident memory of this process so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-
-
 def _memory() -> float:
     """Resident memory of this process now [MB]."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
+    return psutil.Process().memory_info().rss / 2**20
 
 
 def _processor() -> str:
