@@ -1,6 +1,8 @@
 """The one time loop: a controller, a reference and a plant make a Run."""
 
 import math
+import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,6 +22,7 @@ from nbs_pin.progress import tracked
 from nbs_pin.references import DesiredMotion
 from nbs_pin.state import Reference, Run
 
+_MEMORY = "/dev/shm"
 _RECORDED = ("q", "v", "tau", "tau_command", "disturbance")
 LONGEST_PLANT_STEP = 1e-3
 """Plant step taken when none is given, or the nearest shorter one that divides the period [s]."""
@@ -77,16 +80,25 @@ def _shared(loop: "_Loop", reference: DesiredMotion, start: tuple[np.ndarray, np
     if q0.ndim < 2:
         raise ArgumentError(f"workers share starts, and q0 has shape {q0.shape}; give q0 of shape (starts, ..., nv).")
     bounds = np.linspace(0, len(q0), min(workers, len(q0)) + 1).astype(int).tolist()
-    with tempfile.TemporaryDirectory() as folder, joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        files = [str(Path(folder) / f"{first}.npy") for first in bounds[:-1]]
-        shares = list(pairwise(bounds))
-        loops = [_of_starts(loop, first, end, len(q0)) for first, end in shares]
-        starts = [(q0[first:end], v0[first:end]) for first, end in shares]
-        jobs = [joblib.delayed(_share)(*job, reference) for job in zip(files, loops, starts, strict=True)]
-        runs = joblib.Parallel(n_jobs=workers)(jobs)
-        rows = np.concatenate([np.load(file, mmap_mode="r") for file in files], axis=2)
+    shares = list(pairwise(bounds))
+    shape = (len(_RECORDED), loop.steps + 1, *q0.shape)
+    with tempfile.TemporaryDirectory(dir=_roomy(8 * math.prod(shape))) as folder:
+        # One file that every process writes its starts into; its pages stay while the run refers to them.
+        file = str(Path(folder) / "run.npy")
+        rows = np.lib.format.open_memmap(file, mode="w+", dtype=float, shape=shape)
+        jobs = [
+            joblib.delayed(_share)(file, (first, end), _of_starts(loop, first, end, len(q0)), reference, q0, v0)
+            for first, end in shares
+        ]
+        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            runs = joblib.Parallel(n_jobs=workers)(jobs)
     references = {name: _tiled(getattr(runs[0], name), rows[0].shape) for name in ("q_ref", "v_ref", "a_ref")}
-    return replace(runs[0], **dict(zip(_RECORDED, rows, strict=True)), **references)
+    return replace(runs[0], **{name: np.asarray(row) for name, row in zip(_RECORDED, rows, strict=True)}, **references)
+
+
+def _roomy(size: int) -> str | None:
+    """Memory as a folder if there is one with room for `size` bytes, else None for the usual place."""
+    return _MEMORY if os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > 2 * size else None
 
 
 def _of_starts(loop: "_Loop", first: int, end: int, count: int) -> "_Loop":
@@ -95,12 +107,15 @@ def _of_starts(loop: "_Loop", first: int, end: int, count: int) -> "_Loop":
     return replace(loop, disturbance=replace(noise, share=(first, end, count))) if type(noise) is TorqueNoise else loop
 
 
-def _share(file: str, loop: "_Loop", start: tuple[np.ndarray, np.ndarray], reference: DesiredMotion) -> Run:
-    """One worker's simulation: what differs from start to start goes into a file, the first start comes back."""
-    run, _ = _block(loop, reference, 0, loop.steps, start, None, False)
-    rows = np.lib.format.open_memmap(file, mode="w+", dtype=float, shape=(len(_RECORDED), *run.q.shape))
+def _share(
+    file: str, share: tuple[int, int], loop: "_Loop", reference: DesiredMotion, q0: np.ndarray, v0: np.ndarray
+) -> Run:
+    """One worker's simulation: what differs from start to start goes into the file, the first start comes back."""
+    own = slice(*share)
+    run, _ = _block(loop, reference, 0, loop.steps, (q0[own], v0[own]), None, False)
+    rows = np.lib.format.open_memmap(file, mode="r+")
     for row, name in zip(rows, _RECORDED, strict=True):
-        row[:] = getattr(run, name)
+        row[:, own] = getattr(run, name)
     return replace(run, **{name: getattr(run, name)[:, :1] for name in (*_RECORDED, "q_ref", "v_ref", "a_ref")})
 
 
