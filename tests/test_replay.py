@@ -126,6 +126,7 @@ def test_play_pause_and_scrub(browser, tmp_path):
     browser.click("#play")
     assert not browser.evaluate("replay.playing")
     assert browser.evaluate(moved) == 0.0
+    browser.evaluate("replay.seek(1.2)")  # wherever the pause fell, away from the middle
     before = shown_pose(browser, "tip", "actual")
     browser.click("#time")  # the middle of the slider
     assert browser.evaluate("replay.time") == pytest.approx(2.0, abs=0.02)
