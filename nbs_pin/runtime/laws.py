@@ -8,7 +8,7 @@ from numba import boolean, float64, int64, void
 from nbs_pin.runtime.convex import potential
 from nbs_pin.runtime.damping import damping_force
 from nbs_pin.runtime.jit import compile_for, exact_kernel, kernel
-from nbs_pin.runtime.layout import BACKSTEPPING, COMPUTED_TORQUE, SLOTINE_LI
+from nbs_pin.runtime.layout import BACKSTEPPING, COMPUTED_TORQUE, PD_GRAVITY, SLOTINE_LI
 
 _TURN = 2.0 * math.pi
 
@@ -96,7 +96,7 @@ def linear_law(
             a_r[i] = a_ref[i] - second[i] * dz1 - first[i] * z1[i]
             feedback[i] = 0.0
         else:
-            v_r[i], a_r[i] = v_ref[i], a_ref[i]
+            v_r[i], a_r[i] = (0.0, 0.0) if law == PD_GRAVITY else (v_ref[i], a_ref[i])
             feedback[i] = -first[i] * z1[i] - second[i] * dz1
 
 

@@ -27,7 +27,7 @@ PADDING = 8
 """Row lengths are multiples of this many float64: one cache line, and whole vector registers."""
 SMOOTHED_RELU, SQUAREPLUS = 0, 1
 """Activations of a potential."""
-BACKSTEPPING, SLOTINE_LI, COMPUTED_TORQUE, PD_REFERENCE, PD_GRAVITY = 0, 1, 2, 3, 4
+BACKSTEPPING, SLOTINE_LI, COMPUTED_TORQUE, PD_REFERENCE, PD_GRAVITY, PID = 0, 1, 2, 3, 4, 5
 """Laws."""
 PART_HEADER, LAW_HEADER = 4, 8
 """Numbers in a layout before its layers, and in a law's before its parts."""
