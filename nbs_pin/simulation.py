@@ -13,10 +13,11 @@ from typing import Any
 import joblib
 import numpy as np
 
-from nbs_pin.checks import all_finite, positive, whole
+from nbs_pin.checks import all_finite
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.disturbances import Disturbance, TorqueNoise
 from nbs_pin.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.loop import Loop
 from nbs_pin.plants.plant import Plant
 from nbs_pin.progress import tracked
 from nbs_pin.references import DesiredMotion
@@ -24,8 +25,6 @@ from nbs_pin.state import Reference, Run
 
 _MEMORY = "/dev/shm"
 _RECORDED = ("q", "v", "tau", "tau_command", "disturbance")
-LONGEST_PLANT_STEP = 1e-3
-"""Plant step taken when none is given, or the nearest shorter one that divides the period [s]."""
 
 
 def simulate(
@@ -67,14 +66,14 @@ def simulate(
     """
     if workers < 1 or workers != int(workers):
         raise ArgumentError(f"workers is {workers}, expected a whole number of processes ≥ 1; correct it.")
-    loop = _loop(plant, controller, period, plant_step, effort_limit, disturbance, lookahead, duration)
+    loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
     start = loop.start(reference, q0, v0)
     if workers > 1:
         return _shared(loop, reference, start, int(workers))
     return _block(loop, reference, 0, loop.steps, start, None, progress)[0]
 
 
-def _shared(loop: "_Loop", reference: DesiredMotion, start: tuple[np.ndarray, np.ndarray], workers: int) -> Run:
+def _shared(loop: "_Closed", reference: DesiredMotion, start: tuple[np.ndarray, np.ndarray], workers: int) -> Run:
     """The run of slices of the starts in processes of their own, joined along the first batch axis."""
     q0, v0 = start
     if q0.ndim < 2:
@@ -101,14 +100,14 @@ def _roomy(size: int) -> str | None:
     return _MEMORY if os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > 2 * size else None
 
 
-def _of_starts(loop: "_Loop", first: int, end: int, count: int) -> "_Loop":
+def _of_starts(loop: "_Closed", first: int, end: int, count: int) -> "_Closed":
     """The loop for some of `count` starts: noise is the one those starts have among all of them."""
     noise = loop.disturbance
     return replace(loop, disturbance=replace(noise, share=(first, end, count))) if type(noise) is TorqueNoise else loop
 
 
 def _share(
-    file: str, share: tuple[int, int], loop: "_Loop", reference: DesiredMotion, q0: np.ndarray, v0: np.ndarray
+    file: str, share: tuple[int, int], loop: "_Closed", reference: DesiredMotion, q0: np.ndarray, v0: np.ndarray
 ) -> Run:
     """One worker's simulation: what differs from start to start goes into the file, the first start comes back."""
     own = slice(*share)
@@ -145,14 +144,14 @@ def stream(
     that `simulate` gives, for a controller whose `step` depends on its arguments alone: at the border of two blocks it
     is asked twice. Arguments and errors are those of `simulate`.
     """
-    loop = _loop(plant, controller, period, plant_step, effort_limit, disturbance, lookahead, duration)
+    loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
     if block < 1:
         raise ArgumentError(f"block is {block} periods, expected at least one; 1000 is usual.")
     return _blocks(loop, reference, loop.start(reference, q0, v0), block, progress)
 
 
 def _blocks(
-    loop: "_Loop", reference: DesiredMotion, state: tuple[np.ndarray, np.ndarray], block: int, progress: bool
+    loop: "_Closed", reference: DesiredMotion, state: tuple[np.ndarray, np.ndarray], block: int, progress: bool
 ) -> Iterator[Run]:
     memory = None
     for first in tracked(range(0, loop.steps, block), "simulating", progress):
@@ -162,49 +161,27 @@ def _blocks(
 
 
 @dataclass(frozen=True, eq=False)
-class _Loop:
-    """What stays the same from step to step."""
+class _Closed(Loop):
+    """A loop with what closes it."""
 
-    plant: Plant
     law: Controller
     name: str
-    period: float
-    steps: int
-    substeps: int
-    lead: float
-    limit: np.ndarray
     disturbance: Disturbance | None
 
-    def start(self, reference: DesiredMotion, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Start (q, v) of one batch shape."""
-        return _start(_sampled(reference, np.zeros(1), self.plant.nv), q0, v0)
 
-
-def _loop(
+def _closed(
     plant: Plant,
     controller: Controller,
+    duration: float,
     period: float,
     plant_step: float | None,
     effort_limit: Any,
-    disturbance: Disturbance | None,
     lookahead: float | None,
-    duration: float,
-) -> _Loop:
-    if controller.nv != plant.nv:
-        raise ArgumentError(
-            f"the controller has {controller.nv} joints and the plant {plant.nv}; build both for one arm."
-        )
-    return _Loop(
-        plant=plant,
-        law=_compiled(controller),
-        name=type(controller).__name__,
-        period=period,
-        steps=whole(duration, period, "duration", "period"),
-        substeps=_substeps(period, plant_step),
-        lead=_lead(lookahead, period),
-        limit=_effort_limit(plant, effort_limit),
-        disturbance=disturbance,
-    )
+    disturbance: Disturbance | None,
+) -> _Closed:
+    settings = {"plant_step": plant_step, "effort_limit": effort_limit, "lookahead": lookahead}
+    loop = Loop.of(plant, controller.nv, duration, period, **settings)
+    return _Closed(**vars(loop), law=_compiled(controller), name=type(controller).__name__, disturbance=disturbance)
 
 
 def _compiled(controller: Controller) -> Controller:
@@ -214,7 +191,7 @@ def _compiled(controller: Controller) -> Controller:
 
 
 def _block(
-    loop: _Loop,
+    loop: _Closed,
     reference: DesiredMotion,
     first: int,
     steps: int,
@@ -223,11 +200,8 @@ def _block(
     progress: bool,
 ) -> tuple[Run, Any]:
     """The rows of `steps` periods from the instant number `first` on, and the controller's memory at their end."""
-    times = loop.period * np.arange(first, first + steps + 1.0)
-    # A motion is not asked for what comes after its end: at the last instant the law does not look ahead.
-    seen = np.minimum(times + loop.lead, loop.period * loop.steps)
-    leads = (seen - times).tolist()
-    desired, target = (_sampled(reference, t, loop.plant.nv) for t in (times, seen))
+    times, ahead, desired, target = loop.schedule(reference, first, steps)
+    leads = ahead.tolist()
     run = _prepared(loop, times, desired, *start)
     memory = loop.law.initial_memory(run.q[0]) if first == 0 else memory
     # Overflow needs no warning here: every torque and every state is checked, and reported with its time.
@@ -241,7 +215,7 @@ def _block(
     return run, memory
 
 
-def _control(loop: _Loop, run: Run, k: int, lead: float, target: Reference, memory: Any) -> tuple[np.ndarray, Any]:
+def _control(loop: _Closed, run: Run, k: int, lead: float, target: Reference, memory: Any) -> tuple[np.ndarray, Any]:
     """The torque of row k, seen `lead` [s] ahead and written into the run, and the memory after it."""
     q, v, tau, dv = run.q[k], run.v[k], run.tau[k], lead * run.a_ref[k]
     aim = Reference(target.q[k], target.v[k], target.a[k])
@@ -252,9 +226,9 @@ def _control(loop: _Loop, run: Run, k: int, lead: float, target: Reference, memo
     return tau, memory
 
 
-def _advance(loop: _Loop, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _advance(loop: _Closed, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The state one period after row k; the disturbance at its start goes into the run."""
-    q, v, t, step = run.q[k], run.v[k], float(run.t[k]), loop.period / loop.substeps
+    q, v, t, step = run.q[k], run.v[k], float(run.t[k]), loop.step
     try:
         for j in range(loop.substeps):
             total = tau
@@ -269,54 +243,7 @@ def _advance(loop: _Loop, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarray
     return q, v
 
 
-def _substeps(period: float, plant_step: float | None) -> int:
-    if plant_step is not None:
-        return whole(period, plant_step, "period", "plant_step")
-    positive("period", period, "s")
-    return max(1, math.ceil(period / LONGEST_PLANT_STEP - 1e-9))
-
-
-def _lead(lookahead: float | None, period: float) -> float:
-    lead = 0.5 * period if lookahead is None else lookahead
-    if not 0.0 <= lead < math.inf:
-        raise ArgumentError(f"lookahead is {lookahead} s, expected a finite time ≥ 0; half a period is usual.")
-    return lead
-
-
-def _sampled(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
-    sampled = Reference(*(np.asarray(x, dtype=float) for x in reference(t)))
-    for name, rows in sampled._asdict().items():
-        if rows.shape != (t.size, nv):
-            raise ArgumentError(
-                f"the reference at {t.size} times gave {name} of shape {rows.shape}, expected ({t.size}, {nv}); "
-                f"give it one value for each of the {nv} joints and let it take arrays of times."
-            )
-        if not np.isfinite(rows).all():
-            k, joint = np.argwhere(~np.isfinite(rows))[0]
-            raise ArgumentError(f"the reference's {name} of joint {joint} at t = {t[k]:g} s is not finite; correct it.")
-    return sampled
-
-
-def _start(desired: Reference, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Start (q, v) of one batch shape."""
-    rest = desired.v[0] if q0 is None else np.zeros_like(desired.v[0])
-    given = {"q0": desired.q[0] if q0 is None else q0, "v0": rest if v0 is None else v0}
-    start = {name: np.asarray(value, dtype=float) for name, value in given.items()}
-    nv = rest.size
-    for name, x in start.items():
-        if x.ndim == 0 or x.shape[-1] != nv or 0 in x.shape:
-            raise ArgumentError(f"{name} has shape {x.shape}, expected (..., {nv}): one number per joint.")
-        if not np.isfinite(x).all():
-            raise ArgumentError(f"{name} is {x}, expected finite numbers; correct the start.")
-    try:
-        q, v = np.broadcast_arrays(start["q0"], start["v0"])
-        return q, v
-    except ValueError as error:
-        shapes = ", ".join(f"{name} {x.shape}" for name, x in start.items())
-        raise ArgumentError(f"the starts do not broadcast ({shapes}); give equal leading axes.") from error
-
-
-def _prepared(loop: _Loop, t: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray) -> Run:
+def _prepared(loop: _Closed, t: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray) -> Run:
     """The run with its times, reference and start in place, and room for the rest."""
     rows, n = desired.q.shape
     shape, robot = (rows, *q0.shape), loop.plant.robot
@@ -341,23 +268,12 @@ def _prepared(loop: _Loop, t: np.ndarray, desired: Reference, q0: np.ndarray, v0
         info={
             "controller": loop.name,
             "plant": repr(loop.plant),
-            "plant_step": loop.period / loop.substeps,
+            "plant_step": loop.step,
             "lookahead": loop.lead,
         },
     )
     run.q[0], run.v[0] = q0, v0
     return run
-
-
-def _effort_limit(plant: Plant, given: Any) -> np.ndarray:
-    if given is None:
-        given = np.inf if plant.robot is None else plant.robot.effort_limit
-    limit = np.asarray(given, dtype=float)
-    if limit.shape not in ((), (plant.nv,)) or not (limit > 0.0).all():
-        raise ArgumentError(
-            f"effort_limit is {given}, expected one number > 0 or {plant.nv} of them [N·m]; np.inf means no limit."
-        )
-    return np.full(plant.nv, limit)
 
 
 def _checked(command: Any, shape: tuple[int, ...], name: str, t: float) -> np.ndarray:

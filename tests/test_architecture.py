@@ -20,6 +20,7 @@ FLOORS = [
     {"urdf_source", "urdf_checks", "urdf", "catalogue", "robot", "networks"},
     {"dynamics", "references", "reference_files", "disturbances", "metrics", "meshes", "visuals"},
     {"controllers", "plants"},
+    {"loop"},
     {"simulation"},
     {"plotting", "replay_page"},
     {"studies"},

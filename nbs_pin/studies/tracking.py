@@ -25,13 +25,14 @@ from nbs_pin.disturbances import Disturbance
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
+from nbs_pin.loop import LONGEST_PLANT_STEP
 from nbs_pin.npz import LARGEST
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.plants.integrators import IntegratorName
 from nbs_pin.plants.plant import Plant
 from nbs_pin.references import DesiredMotion, Sinusoid, check_reference
 from nbs_pin.robot import Robot
-from nbs_pin.simulation import LONGEST_PLANT_STEP, simulate
+from nbs_pin.simulation import simulate
 from nbs_pin.state import Reference, Run
 
 PlantName: TypeAlias = Literal["mujoco", "pinocchio"]
