@@ -7,6 +7,8 @@ from nbs_pin.arrays import Array, array_namespace
 from nbs_pin.dynamics.provider import DynamicsProvider, ReferenceTorque
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
+from nbs_pin.runtime.layout import Packed
+from nbs_pin.runtime.tree_layout import Link, pack_tree
 
 
 class AnalyticDynamics(DynamicsProvider):
@@ -31,7 +33,7 @@ class AnalyticDynamics(DynamicsProvider):
                 " [kg] and lengths [m] must be positive."
             )
         (m1, m2), (l1, l2) = masses, lengths
-        self._robot = robot
+        self._robot, self._masses, self._lengths, self._gravity = robot, masses, lengths, gravity
         self._shoulder = (m1 + m2) * l1 * l1  # inertia of both masses at the elbow about the shoulder
         self._forearm = m2 * l2 * l2
         self._coupling = m2 * l1 * l2
@@ -85,6 +87,17 @@ class AnalyticDynamics(DynamicsProvider):
             return tau
 
         return route
+
+    def packed_tree(self) -> Packed | None:
+        """Two point masses on joints about z, with gravity along −y; None for a subclass."""
+        if type(self) is not AnalyticDynamics:
+            return None
+        (upper, lower), along, z = self._lengths, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+        links = [
+            Link(parent, False, z, np.eye(3), start * along, mass, length * along, np.zeros((3, 3)))
+            for parent, start, mass, length in zip((0, 1), (0.0, upper), self._masses, (upper, lower), strict=True)
+        ]
+        return pack_tree(links, np.array([0.0, -self._gravity, 0.0]))
 
     def potential_energy(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
         """V(q) [J], zero with the arm horizontal."""

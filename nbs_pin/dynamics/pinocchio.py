@@ -10,7 +10,10 @@ from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, is_torch_array, over_rows
 from nbs_pin.dynamics.provider import DynamicsProvider, ReferenceTorque
+from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
+from nbs_pin.runtime.layout import Packed
+from nbs_pin.runtime.tree_layout import Link, pack_tree
 
 Row: TypeAlias = np.ndarray
 
@@ -91,6 +94,10 @@ class PinocchioDynamics(DynamicsProvider):
         """The two RNEA on scratch space of its own, one where v_r is v itself; a subclass's own `reference_torque`."""
         return _TwoRnea(self._model, self._weightless) if type(self) is PinocchioDynamics else self.reference_torque
 
+    def packed_tree(self) -> Packed | None:
+        """The arm's joints and bodies; None for a subclass, which may have changed an equation."""
+        return pack_model(self._model) if type(self) is PinocchioDynamics else None
+
     def _evaluate(self, quantity: Quantity, **arguments: Array) -> Array:
         """The quantity over leading batch axes, in the kind of the arguments."""
         vectors = as_vectors(self.nv, **arguments)
@@ -165,6 +172,27 @@ class PinocchioDynamics(DynamicsProvider):
         live = pin.computeRNEADerivatives(model, self._data, q, v, a)  # views into data that the next call overwrites
         dq, dv, mass = (np.array(x) for x in live)
         return dq, dv, mass
+
+
+def pack_model(model: pin.Model) -> Packed:
+    """A Pinocchio model with its gravity and armature as a rigid tree for the kernels of `runtime/trees.py`.
+
+    Raises ArgumentError unless every joint is revolute or prismatic with one coordinate, and joint i has velocity i−1.
+    """
+    joints, links = model.createData().joints, []
+    for i in range(1, model.njoints):
+        motion = np.array(joints[i].S).reshape(6, -1)
+        slides, turns = motion[:3].any(), motion[3:].any()
+        if (model.nqs[i], model.nvs[i], model.idx_vs[i]) != (1, 1, i - 1) or slides == turns:
+            raise ArgumentError(
+                f"joint '{model.names[i]}' is a {joints[i].shortname()}, expected revolute or prismatic joints with one"
+                " coordinate each; lock it, or use a joint whose angle is unbounded."
+            )
+        body, at = model.inertias[i], model.jointPlacements[i]
+        axis, rotor = (motion[:3] if slides else motion[3:])[:, 0], float(model.armature[i - 1])
+        place = (model.parents[i], bool(slides), axis, at.rotation, at.translation)
+        links.append(Link(*place, body.mass, body.lever, body.inertia, rotor))
+    return pack_tree(links, model.gravity.linear)
 
 
 class _TwoRnea:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from nbs_pin.arrays import Array, array_namespace, matvec
 from nbs_pin.robot import Robot, configuration_difference
+from nbs_pin.runtime.layout import Packed
 
 ReferenceTorque: TypeAlias = Callable[[Array, Array, Array, Array], Array]
 """(q, v, v_r, a_r) -> M(q) a_r + C(q, v) v_r + G(q) [N·m]."""
@@ -67,6 +68,10 @@ class DynamicsProvider(ABC):
         Whatever that route compiles is compiled when it is first called. It may own scratch space.
         """
         return self.reference_torque
+
+    def packed_tree(self) -> Packed | None:
+        """The model as a rigid tree for the kernels of `runtime/trees.py`, or None when it is none."""
+        return None
 
     def forward_dynamics(
         self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
