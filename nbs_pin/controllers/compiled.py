@@ -7,11 +7,10 @@ from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, is_torch_array
 from nbs_pin.controllers.controller import MemorylessController
-from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.runtime.laws import compile_laws, law_row, law_rows
-from nbs_pin.runtime.layout import COMPUTED_TORQUE, PD_GRAVITY, Packed, pack_law
+from nbs_pin.runtime.layout import COMPUTED_TORQUE, PD_GRAVITY, Packed
 from nbs_pin.runtime.threads import over_cores
 
 
@@ -21,7 +20,7 @@ class CompiledController(MemorylessController):
     What `compile()` of a memoryless law gives: a snapshot, which later changes of that controller do not reach.
     Numpy only; batches run over all cores. NaN in gives NaN out. Each owns scratch space: use one per thread.
 
-    law: constants and weights (`runtime/layout.py`). dynamics: what the law believes of the arm.
+    law: constants and weights as numpy arrays (`Controller.packed_law`). dynamics: what the law believes of the arm.
     """
 
     def __init__(self, law: Packed, dynamics: DynamicsProvider) -> None:
@@ -33,20 +32,6 @@ class CompiledController(MemorylessController):
         one, two = np.zeros(dynamics.nv), np.zeros((2, dynamics.nv))
         for x in (one, two):  # so that no first call, of whatever the model compiles, happens inside a control loop
             self.torque(x, x, x, x, x)
-
-    @classmethod
-    def of(
-        cls,
-        law: int,
-        dynamics: DynamicsProvider,
-        gains: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]],
-        friction: JointFriction | None,
-        **parts: Any,
-    ) -> "CompiledController":
-        """The law of that code (`runtime/layout.py`) with its gains; parts: those of `layout.pack_law`."""
-        continuous = None if dynamics.robot is None else dynamics.robot.continuous
-        fed = None if friction is None else (friction.viscous, friction.coulomb, friction.transition)
-        return cls(pack_law(law, gains, continuous, fed, **parts), dynamics)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled as the arguments it is rebuilt from."""
@@ -92,11 +77,6 @@ class CompiledController(MemorylessController):
 
         over_cores(evaluate, len(v_r))
         return (self._model(rows[0], rows[1], v_r, a_r) + feedback).reshape(shape)
-
-
-def is_packable(dynamics: DynamicsProvider, friction: JointFriction | None) -> bool:
-    """Whether error and friction are the ones the kernels know, and not those of a subclass."""
-    return type(dynamics).difference is DynamicsProvider.difference and type(friction) in (JointFriction, type(None))
 
 
 def _gravity(route: Any, q: np.ndarray) -> np.ndarray:

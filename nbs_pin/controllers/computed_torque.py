@@ -3,18 +3,17 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, as_vectors, constant_like
-from nbs_pin.controllers.compiled import CompiledController, is_packable
-from nbs_pin.controllers.controller import Controller, MemorylessController
-from nbs_pin.controllers.gains import PerJoint, gains_for_robot, largest_inertia, positive_gains, warn_if_too_fast
-from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.arrays import Array, as_vectors
+from nbs_pin.controllers.gains import PerJoint, PositiveGains, gains_for_robot, largest_inertia, warn_if_too_fast
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import COMPUTED_TORQUE
+from nbs_pin.runtime.layout import COMPUTED_TORQUE, Packed
 
 
-class ComputedTorque(MemorylessController):
+class ComputedTorque(ModelLaw):
     """τ = M(a_d − k_d ż1 − k_p z1) + C v + G, so that z̈1 + k_d ż1 + k_p z1 = M⁻¹τ_d.
 
     kp: k_p [1/s²], (n,). kd: k_d [1/s], (n,). friction: fed forward at v_d, or None.
@@ -30,8 +29,8 @@ class ComputedTorque(MemorylessController):
         kd: PerJoint,
         friction: JointFriction | None = None,
     ) -> None:
-        self.dynamics, self.friction = dynamics, friction_of_size(friction, dynamics.nv)
-        self.kp, self.kd = positive_gains(dynamics.nv, kp=kp, kd=kd)
+        super().__init__(dynamics, friction)
+        self.gains = PositiveGains(dynamics.nv, kp=kp, kd=kd)
 
     @classmethod
     def for_robot(
@@ -51,20 +50,27 @@ class ComputedTorque(MemorylessController):
         return cls(dynamics, kp=kp, kd=2.0 * np.sqrt(kp), friction=friction)
 
     @property
-    def nv(self) -> int:
-        """Number of joints."""
-        return self.dynamics.nv
+    def kp(self) -> Float[np.ndarray, " n"]:
+        """k_p [1/s²]."""
+        return self.gains.numpy("kp")
+
+    @property
+    def kd(self) -> Float[np.ndarray, " n"]:
+        """k_d [1/s]."""
+        return self.gains.numpy("kd")
 
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
         """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
-        kp, kd = constant_like(q, self.kp), constant_like(q, self.kd)
+        kp, kd = self.gains.like(q)
         a = a_ref - kd * (v - v_ref) - kp * self.dynamics.difference(q, q_ref)
         tau = self.dynamics.reference_torque(q, v, v, a)
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
 
-    def compile(self) -> Controller:
-        """The law as machine code (`Controller.compile`)."""
-        if type(self) is not ComputedTorque or not is_packable(self.dynamics, self.friction):
-            return self
-        return CompiledController.of(COMPUTED_TORQUE, self.dynamics, (self.kp, self.kd), self.friction)
+    @property
+    def _is_known(self) -> bool:
+        return type(self) is ComputedTorque
+
+    def _packed(self, numpy: bool) -> Packed:
+        kp, kd = self.gains.value(numpy=numpy)
+        return self._pack(COMPUTED_TORQUE, (kp, kd))

@@ -6,6 +6,8 @@ from typing import Any
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.runtime.layout import Packed
 from nbs_pin.state import Reference
 
 
@@ -26,6 +28,19 @@ class Controller(ABC):
         self, memory: Any, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], reference: Reference, period: float
     ) -> tuple[Float[Array, "*batch n"], Any]:
         """Torque τ [N·m] to hold for the next period [s], and the memory for the step after it."""
+
+    @property
+    def packable(self) -> bool:
+        """Whether the law has a compiled form: `packed_law` gives its numbers and `compile` the same law on kernels."""
+        return False
+
+    def packed_law(self, *, numpy: bool = True) -> Packed:
+        """Constants and weights of the law as the kernels take them (`runtime/layout.py`).
+
+        numpy: True gives an array, False a tensor of the same numbers, differentiable in the law's parameters.
+        Raises ArgumentError unless the law is `packable`.
+        """
+        raise ArgumentError(f"{type(self).__name__} has no compiled form; run it as it is, or build it of known parts.")
 
     def compile(self) -> "Controller":
         """The same law as machine code, for numpy: a snapshot that later changes of this controller do not reach.

@@ -2,13 +2,16 @@
 
 import warnings
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import numpy as np
 from jaxtyping import Float
+from torch import nn
 
+from nbs_pin.arrays import Array, is_torch_array
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
+from nbs_pin.networks.gain import Gain
 from nbs_pin.robot import Robot
 
 PerJoint: TypeAlias = float | Float[np.ndarray, " n"]
@@ -123,3 +126,26 @@ def positive_gains(nv: int, **gains: PerJoint) -> tuple[Float[np.ndarray, " n"],
         if gain.shape not in ((), (nv,)) or not (gain > 0.0).all():
             raise ArgumentError(f"{name} is {gain.tolist()}; give one positive number, or {nv}, one per joint.")
     return tuple(np.full(nv, gain) for gain in arrays.values())
+
+
+class PositiveGains(nn.ModuleDict):
+    """Gains by name, one positive number per joint each; training may make them anything positive (`Gain`, φ = 0).
+
+    Raises ArgumentError unless each is one positive number, or one per joint (nv,).
+    """
+
+    def __init__(self, nv: int, **gains: PerJoint) -> None:
+        arrays = zip(gains, positive_gains(nv, **gains), strict=True)
+        super().__init__({name: Gain(array, name=name) for name, array in arrays})
+
+    def value(self, *, numpy: bool) -> tuple[Float[Array, " n"], ...]:
+        """All gains in the order they were given in: numpy arrays, or tensors differentiable in the parameters."""
+        return tuple(cast(Gain, gain).value(numpy=numpy) for gain in self.values())
+
+    def like(self, x: Array) -> tuple[Float[Array, " n"], ...]:
+        """All gains in the kind of x."""
+        return self.value(numpy=not is_torch_array(x))
+
+    def numpy(self, name: str) -> Float[np.ndarray, " n"]:
+        """The gain of that name."""
+        return cast(Gain, self[name]).numpy()

@@ -3,21 +3,19 @@
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import nn
 
-from nbs_pin.arrays import Array, array_namespace, as_vectors, is_torch_array, matvec
-from nbs_pin.controllers.compiled import CompiledController, is_packable
-from nbs_pin.controllers.controller import Controller, MemorylessController
+from nbs_pin.arrays import Array, array_namespace, as_vectors, matvec
 from nbs_pin.controllers.gains import Gains, gains_for_robot, warn_if_too_fast
-from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.networks.damping import Damping
+from nbs_pin.networks.gain import Gain, positive_scale
 from nbs_pin.networks.potential import Potential
 from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import BACKSTEPPING
+from nbs_pin.runtime.layout import BACKSTEPPING, Packed
 
 DAMPINGS = ("inertial", "bounded", "paper")
 
@@ -39,19 +37,18 @@ class Errors(NamedTuple):
     """Φ(z1) [J], shape (...)."""
 
 
-class NeuralBackstepping(MemorylessController, nn.Module):
+class NeuralBackstepping(ModelLaw):
     """τ = M(φ̇ − ωz2) + C(q, v)φ + G − ∇Φ(z1) − D(z2)z2 with φ = v_d − Λ∇Φ(z1), z1 = q ⊖ q_d, z2 = v − φ.
 
     With V = Φ + ½z2ᵀM z2:  V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ(ωM + D)z2 + z2ᵀτ_d for every weight of Φ and D (docs/theory.md §2).
     Λ = I, ω = 0 with the `paper` networks is the paper's law (its eq. (9)); the paper's Λ = I has the wrong units.
 
     dynamics: what the law believes of the arm. potential: Φ. damping: D without its ωM part.
-    rate: Λ [rad/s per N·m], (nv,), positive, diagonal. inertial_rate: ω ≥ 0 [1/s].
+    rate: Λ [rad/s per N·m], (nv,), positive, diagonal; a `Gain`, which training may change but never below least_share
+    of it. inertial_rate: ω ≥ 0 [1/s].
     friction: joint friction to feed forward at φ, or None; it is monotone in v, so it only adds dissipation.
     Raises ArgumentError when sizes disagree or Λ, ω are out of range.
     """
-
-    rate: torch.Tensor
 
     def __init__(
         self,
@@ -62,22 +59,19 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         rate: Float[Array, " n"] | None = None,
         inertial_rate: float = 0.0,
         friction: JointFriction | None = None,
+        least_share: float = 0.5,
     ) -> None:
-        super().__init__()
+        super().__init__(dynamics, friction)
         nv = dynamics.nv
         if not nv == potential.nv == damping.nv:
             raise ArgumentError(
                 f"dynamics, potential and damping have {nv}, {potential.nv} and {damping.nv} joints; make them equal."
             )
-        rates = torch.ones(nv, dtype=torch.float64) if rate is None else torch.as_tensor(rate, dtype=torch.float64)
-        if rates.shape != (nv,) or not bool(((rates > 0.0) & torch.isfinite(rates)).all()):
-            raise ArgumentError(f"the rate Λ is {rates.tolist()}; give {nv} positive numbers [rad/s per N·m].")
         if not 0.0 <= inertial_rate < np.inf:
             raise ArgumentError(f"the inertial rate ω is {inertial_rate}; give a number ≥ 0 [1/s].")
-        self.dynamics, self.friction = dynamics, friction_of_size(friction, dynamics.nv)
         self.potential, self.damping = potential, damping
         self.inertial_rate = inertial_rate
-        self.register_buffer("rate", rates.clone())
+        self.rate = Gain(positive_scale("the rate Λ", rate, nv), least_share=least_share, name="the rate Λ")
 
     @classmethod
     def for_robot(
@@ -91,6 +85,7 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         damping: str = "inertial",
         friction: JointFriction | None = None,
         gains: Gains | None = None,
+        least_share: float = 0.5,
         seed: int = 0,
     ) -> "NeuralBackstepping":
         """A controller for an arm that nobody tuned, from its inertia, effort limits and control period.
@@ -99,6 +94,7 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         period: control period h [s].
         potential: "smooth" or "paper". damping: "inertial" (ωM + D₀ + TᵀT), "bounded" (D₀ + TᵀT) or "paper" (TᵀT).
         dynamics: None takes Pinocchio's model of `robot`. gains: None computes them (`gains_for_robot`).
+        least_share: what training leaves at least of S, Λ and D₀ (`networks.gain.Gain`).
         The paper's networks with S = I, Λ = I are built by hand: see `paper_controller`.
         Raises ArgumentError for unknown names or numbers out of range.
         """
@@ -110,18 +106,14 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         chosen = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period) if gains is None else gains
         warn_if_too_fast(robot, dynamics, chosen.bandwidth)
         root = np.sqrt(chosen.stiffness)
-        phi = Potential(np.diag(0.5 * chosen.stiffness), form=potential, scale=root, seed=seed)
+        phi = Potential(np.diag(0.5 * chosen.stiffness), form=potential, scale=root, least_share=least_share, seed=seed)
         if damping == "paper":
             d = Damping(robot.nv, form="paper", m=1.0, scale=np.sqrt(chosen.damping), seed=seed + 1)
         else:
-            d = Damping(robot.nv, floor=np.diag(chosen.damping), scale=np.sqrt(chosen.damping), seed=seed + 1)
+            floor, scale = np.diag(chosen.damping), np.sqrt(chosen.damping)
+            d = Damping(robot.nv, floor=floor, scale=scale, least_share=least_share, seed=seed + 1)
         omega = chosen.bandwidth if damping == "inertial" else 0.0
-        return cls(dynamics, phi, d, rate=chosen.rate, inertial_rate=omega, friction=friction)
-
-    @property
-    def nv(self) -> int:
-        """Number of joints."""
-        return self.dynamics.nv
+        return cls(dynamics, phi, d, rate=chosen.rate, inertial_rate=omega, friction=friction, least_share=least_share)
 
     def errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
         """The backstepping signals for the state (q, v) and the reference, all of shape (..., nv).
@@ -141,22 +133,6 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         tau = feedforward - e.gradient - self.damping.force(e.z2)
         return tau if self.friction is None else tau + self.friction.torque(e.v_r)
 
-    def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
-        """The law as machine code (`Controller.compile`)."""
-        known = type(self) is NeuralBackstepping and self.potential.is_packable and self.damping.is_packable
-        if not (known and is_packable(self.dynamics, self.friction)):
-            return self
-        rate = self.rate.double().numpy()
-        return CompiledController.of(
-            BACKSTEPPING,
-            self.dynamics,
-            (rate, 0.0 * rate),
-            self.friction,
-            inertial_rate=self.inertial_rate,
-            potential=self.potential.packed(),
-            damping=self.damping.packed(),
-        )
-
     def storage(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
         """V = Φ(z1) + ½z2ᵀM(q)z2 [J], the Lyapunov function of the closed loop."""
         q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
@@ -168,17 +144,28 @@ class NeuralBackstepping(MemorylessController, nn.Module):
         q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
         e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
         force = self.inertial_rate * matvec(self.dynamics.mass_matrix(q), e.z2) + self.damping.force(e.z2)
-        return _dot(e.gradient, self._rate_like(e.gradient) * e.gradient) + _dot(e.z2, force)
+        return _dot(e.gradient, self.rate.like(e.gradient) * e.gradient) + _dot(e.z2, force)
 
     def _errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
-        rate = self._rate_like(q)
+        rate = self.rate.like(q)
         z1 = self.dynamics.difference(q, q_ref)
         value, gradient, gradient_rate = self.potential.terms(z1, v - v_ref)
         v_r = v_ref - rate * gradient
         return Errors(z1, v - v_r, v_r, a_ref - rate * gradient_rate, gradient, value)
 
-    def _rate_like(self, x: Array) -> Array:
-        return self.rate if is_torch_array(x) else self.rate.numpy()
+    @property
+    def _is_known(self) -> bool:
+        return type(self) is NeuralBackstepping and self.potential.is_packable and self.damping.is_packable
+
+    def _packed(self, numpy: bool) -> Packed:
+        rate = self.rate.value(numpy=numpy)
+        return self._pack(
+            BACKSTEPPING,
+            (rate, 0.0 * rate),
+            inertial_rate=self.inertial_rate,
+            potential=self.potential.packed(numpy=numpy),
+            damping=self.damping.packed(numpy=numpy),
+        )
 
 
 def _dot(x: Array, y: Array) -> Array:

@@ -4,14 +4,17 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from torch import nn
 
-from nbs_pin.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.arrays import Array, array_namespace, as_vectors, constant_like, is_torch_array
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.gains import PerJoint, pd_gains, positive_gains
+from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, positive_gains
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot, configuration_difference
+from nbs_pin.runtime import layout
 from nbs_pin.runtime.laws import compile_laws, pid
+from nbs_pin.runtime.layout import Packed
 from nbs_pin.state import Reference
 
 
@@ -24,11 +27,11 @@ class PIDMemory(NamedTuple):
     """Filtered ż1 [rad/s]."""
 
 
-class PID(Controller):
+class PID(Controller, nn.Module):
     """τ = −K_p z1 − I − K_d y,  İ = K_i z1,  T_f ẏ = ż1 − y, per joint, with clamping anti-windup.
 
     The integral rests while the torque is saturated and the error would drive it further (Åström and Hägglund 2006,
-    section 3.5). kp [N·m/rad], ki [N·m/(rad·s)], kd [N·m·s/rad]: (n,), positive. filter_time: T_f ≥ 0 [s].
+    section 3.5). kp [N·m/rad], ki [N·m/(rad·s)], kd [N·m·s/rad]: (n,), positive, parameters. filter_time: T_f ≥ 0 [s].
     effort_limit: where saturation begins [N·m], (n,). continuous: joints whose error wraps, (n,) or None.
     Raises ArgumentError for gains, limits or a filter time out of range.
     """
@@ -43,10 +46,10 @@ class PID(Controller):
         filter_time: float = 0.0,
         continuous: np.ndarray | None = None,
     ) -> None:
+        super().__init__()
         nv = np.size(kp)
-        self.kp, self.ki, self.kd, self.effort_limit = positive_gains(
-            nv, kp=kp, ki=ki, kd=kd, effort_limit=effort_limit
-        )
+        self.gains = PositiveGains(nv, kp=kp, ki=ki, kd=kd)
+        (self.effort_limit,) = positive_gains(nv, effort_limit=effort_limit)
         if not 0.0 <= filter_time < np.inf:
             raise ArgumentError(f"filter_time is {filter_time} s; give a time ≥ 0.")
         self.filter_time = filter_time
@@ -70,46 +73,74 @@ class PID(Controller):
     @property
     def nv(self) -> int:
         """Number of joints."""
-        return len(self.kp)
+        return len(self.effort_limit)
 
-    def initial_memory(self, q: Float[np.ndarray, "*batch n"]) -> PIDMemory:
-        """No integral, derivative at rest."""
-        return PIDMemory(np.zeros_like(q), np.zeros_like(q))
+    @property
+    def kp(self) -> Float[np.ndarray, " n"]:
+        """K_p [N·m/rad]."""
+        return self.gains.numpy("kp")
+
+    @property
+    def ki(self) -> Float[np.ndarray, " n"]:
+        """K_i [N·m/(rad·s)]."""
+        return self.gains.numpy("ki")
+
+    @property
+    def kd(self) -> Float[np.ndarray, " n"]:
+        """K_d [N·m·s/rad]."""
+        return self.gains.numpy("kd")
+
+    def initial_memory(self, q: Float[Array, "*batch n"]) -> PIDMemory:
+        """No integral, derivative at rest, in the kind of q."""
+        xp = array_namespace(q)
+        return PIDMemory(xp.zeros_like(q), xp.zeros_like(q))
 
     def step(
         self,
         memory: PIDMemory,
-        q: Float[np.ndarray, "*batch n"],
-        v: Float[np.ndarray, "*batch n"],
+        q: Float[Array, "*batch n"],
+        v: Float[Array, "*batch n"],
         reference: Reference,
         period: float,
-    ) -> tuple[Float[np.ndarray, "*batch n"], PIDMemory]:
-        """τ [N·m] for the next period [s], and the memory after it."""
+    ) -> tuple[Float[Array, "*batch n"], PIDMemory]:
+        """τ [N·m] for the next period [s], and the memory after it; torch in, differentiable torch out."""
+        xp, (kp, ki, kd) = array_namespace(q), self.gains.like(q)
         z1 = configuration_difference(q, reference.q, self.continuous)
         blend = period / (self.filter_time + period)  # backward Euler of the filter
         derivative = memory.derivative + blend * (v - reference.v - memory.derivative)
-        tau = -self.kp * z1 - memory.integral - self.kd * derivative
-        winding = (np.abs(tau) > self.effort_limit) & (tau * z1 < 0.0)
-        integral = memory.integral + np.where(winding, 0.0, self.ki * period * z1)
+        tau = -kp * z1 - memory.integral - kd * derivative
+        winding = (abs(tau) > constant_like(q, self.effort_limit)) & (tau * z1 < 0.0)
+        integral = memory.integral + xp.where(winding, 0.0 * z1, ki * period * z1)
         return tau, PIDMemory(integral, derivative)
 
-    def compile(self) -> Controller:
+    @property
+    def packable(self) -> bool:
+        """Whether this is the law that the kernel knows, and not a subclass."""
+        return type(self) is PID
+
+    def packed_law(self, *, numpy: bool = True) -> Packed:
+        """Its six rows of gains (`Controller.packed_law`)."""
+        if not self.packable:
+            return super().packed_law(numpy=numpy)
+        kp, ki, kd = self.gains.value(numpy=numpy)
+        constants = self.effort_limit, np.full(self.nv, self.filter_time), self.continuous.astype(float)
+        rows = [kp, ki, kd, *(constant_like(kp, row) for row in constants)]
+        return Packed(np.array([layout.PID, self.nv]), array_namespace(kp).concat(rows))
+
+    def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
         """The law as machine code (`Controller.compile`)."""
-        if type(self) is not PID:
-            return self
-        filter_time = np.full(self.nv, self.filter_time)
-        return CompiledPID(np.array([self.kp, self.ki, self.kd, self.effort_limit, filter_time, self.continuous]))
+        return CompiledPID(self.packed_law()) if self.packable else self
 
 
 class CompiledPID(Controller):
     """`PID.step` as machine code, memory in, memory out; numpy only.
 
-    gains: rows k_p, k_i, k_d, effort limit, T_f, continuous (6, n).
+    law: rows k_p, k_i, k_d, effort limit, T_f, continuous (6n) as numpy arrays (`Controller.packed_law`).
     """
 
-    def __init__(self, gains: Float[np.ndarray, "6 n"]) -> None:
+    def __init__(self, law: Packed) -> None:
         compile_laws()
-        self.gains = gains
+        self.gains = law.weights.reshape(6, int(law.layout[1]))
 
     @property
     def nv(self) -> int:

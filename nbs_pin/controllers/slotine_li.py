@@ -3,18 +3,17 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, as_vectors, constant_like
-from nbs_pin.controllers.compiled import CompiledController, is_packable
-from nbs_pin.controllers.controller import Controller, MemorylessController
-from nbs_pin.controllers.gains import PerJoint, effective_inertia, gains_for_robot, positive_gains, warn_if_too_fast
-from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.arrays import Array, as_vectors
+from nbs_pin.controllers.gains import PerJoint, PositiveGains, effective_inertia, gains_for_robot, warn_if_too_fast
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import SLOTINE_LI
+from nbs_pin.runtime.layout import SLOTINE_LI, Packed
 
 
-class SlotineLi(MemorylessController):
+class SlotineLi(ModelLaw):
     """τ = M a_r + C(q, v) v_r + G − K s,  v_r = v_d − λ z1,  a_r = a_d − λ ż1,  s = v − v_r.
 
     rate: λ [1/s], (n,). gain: K [N·m·s/rad], (n,). friction: fed forward at v_r, or None.
@@ -30,8 +29,8 @@ class SlotineLi(MemorylessController):
         gain: PerJoint,
         friction: JointFriction | None = None,
     ) -> None:
-        self.dynamics, self.friction = dynamics, friction_of_size(friction, dynamics.nv)
-        self.rate, self.gain = positive_gains(dynamics.nv, rate=rate, gain=gain)
+        super().__init__(dynamics, friction)
+        self.gains = PositiveGains(dynamics.nv, rate=rate, gain=gain)
 
     @classmethod
     def for_robot(
@@ -51,21 +50,28 @@ class SlotineLi(MemorylessController):
         return cls(dynamics, rate=np.full(robot.nv, bandwidth), gain=gain, friction=friction)
 
     @property
-    def nv(self) -> int:
-        """Number of joints."""
-        return self.dynamics.nv
+    def rate(self) -> Float[np.ndarray, " n"]:
+        """λ [1/s]."""
+        return self.gains.numpy("rate")
+
+    @property
+    def gain(self) -> Float[np.ndarray, " n"]:
+        """K [N·m·s/rad]."""
+        return self.gains.numpy("gain")
 
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
         """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
-        rate, gain = constant_like(q, self.rate), constant_like(q, self.gain)
+        rate, gain = self.gains.like(q)
         v_r = v_ref - rate * self.dynamics.difference(q, q_ref)
         a_r = a_ref - rate * (v - v_ref)
         tau = self.dynamics.reference_torque(q, v, v_r, a_r) - gain * (v - v_r)
         return tau if self.friction is None else tau + self.friction.torque(v_r)
 
-    def compile(self) -> Controller:
-        """The law as machine code (`Controller.compile`)."""
-        if type(self) is not SlotineLi or not is_packable(self.dynamics, self.friction):
-            return self
-        return CompiledController.of(SLOTINE_LI, self.dynamics, (self.rate, self.gain), self.friction)
+    @property
+    def _is_known(self) -> bool:
+        return type(self) is SlotineLi
+
+    def _packed(self, numpy: bool) -> Packed:
+        rate, gain = self.gains.value(numpy=numpy)
+        return self._pack(SLOTINE_LI, (rate, gain))

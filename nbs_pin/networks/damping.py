@@ -10,7 +10,7 @@ from torch import nn
 
 from nbs_pin.arrays import Array, array_namespace, is_torch_array, matvec
 from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.potential import positive_definite, positive_scale
+from nbs_pin.networks.gain import Gain, positive_definite, positive_scale
 from nbs_pin.runtime.layout import Packed, pack_damping
 
 DAMPINGS = ("bounded", "paper")
@@ -23,12 +23,14 @@ class Damping(nn.Module):
     form "paper": D = TᵀT with diagonal relu(·) + m, and no D₀. Positive definite, but not ⪰ m²I: T = [[1, 0], [1, 1]]
     has m = 1 and λ_min(TᵀT) = 0.382.
 
-    floor: D₀ (n, n) symmetric positive definite, for "bounded" only. m: for "paper" only. R: diagonal scale (n,).
-    Raises ArgumentError for an unknown form, a floor that is missing, superfluous or not positive definite, or m ≤ 0.
+    floor: D₀ (n, n) symmetric positive definite, for "bounded" only, a `Gain` which training may change but never below
+    least_share of it. m: for "paper" only. scale: R, a diagonal scale (n,).
+    Raises ArgumentError for an unknown form, a floor that is missing, superfluous or not positive definite, a share
+    outside [0, 1), or m ≤ 0.
     """
 
+    floor: Gain | None
     scale: torch.Tensor
-    floor: torch.Tensor
 
     def __init__(
         self,
@@ -40,6 +42,7 @@ class Damping(nn.Module):
         widths: tuple[int, ...] = (32, 32),
         scale: Float[Array, " n"] | None = None,
         gain: float = 0.2,
+        least_share: float = 0.5,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -52,8 +55,8 @@ class Damping(nn.Module):
         if not m > 0.0:
             raise ArgumentError(f"m is {m}; give a positive number, the smallest diagonal entry of T.")
         self.form, self.m = form, m
-        d0 = torch.zeros(nv, nv, dtype=torch.float64) if floor is None else positive_definite("the floor D₀", floor)
-        self.register_buffer("floor", d0)
+        d0 = None if floor is None else positive_definite("the floor D₀", floor)
+        self.floor = None if d0 is None else Gain(d0, least_share=least_share, name="the floor D₀")
         self.register_buffer("scale", positive_scale("the scale R", scale, nv))
         self._diagonal_index = np.arange(nv)
         self._lower_index = np.tril_indices(nv, -1)
@@ -81,13 +84,13 @@ class Damping(nn.Module):
     def matrix(self, z: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
         """D(z)."""
         xp = array_namespace(z)
-        d0, r = (self.floor, self.scale) if is_torch_array(z) else (self.floor.numpy(), self.scale.numpy())
+        d0, r = self._constants(numpy=not is_torch_array(z))
         t = self.factor(r * z) * r
         return d0 + xp.matrix_transpose(t) @ t
 
     def force(self, z: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
         """D(z) z [N·m]."""
-        d0, r = (self.floor, self.scale) if is_torch_array(z) else (self.floor.numpy(), self.scale.numpy())
+        d0, r = self._constants(numpy=not is_torch_array(z))
         t = self.factor(r * z)
         return matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
 
@@ -96,10 +99,19 @@ class Damping(nn.Module):
         """Whether all parts are the ones the kernels know, and not those of a subclass."""
         return (type(self), type(self.diagonal), type(self.lower)) == (Damping, _FCNN, _FCNN)
 
-    def packed(self) -> Packed:
-        """The weights as the compiled form of `force` takes them (`runtime/damping.py`)."""
-        networks = self.diagonal.layers(), self.lower.layers()
-        return pack_damping(networks, self.form == "paper", self.m, self.scale.numpy(), self.floor.numpy())
+    def packed(self, *, numpy: bool = True) -> Packed:
+        """The weights as the compiled form of `force` takes them (`runtime/damping.py`).
+
+        numpy: True gives an array, False a tensor of the same numbers, differentiable in the parameters.
+        """
+        networks = self.diagonal.layers(numpy=numpy), self.lower.layers(numpy=numpy)
+        d0, r = self._constants(numpy=numpy)
+        return pack_damping(networks, self.form == "paper", self.m, r, d0)
+
+    def _constants(self, *, numpy: bool) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+        r = self.scale.numpy() if numpy else self.scale
+        zero = array_namespace(r).zeros((self.nv, self.nv), dtype=r.dtype)
+        return zero if self.floor is None else self.floor.like(r), r
 
 
 class _FCNN(nn.Module):
@@ -114,15 +126,13 @@ class _FCNN(nn.Module):
             self.register_parameter(f"w{i}", nn.Parameter(weight))
             self.register_parameter(f"b{i}", nn.Parameter(torch.zeros(out, dtype=torch.float64)))
 
-    def layers(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        named = {k: p.detach().numpy() for k, p in self._parameters.items() if p is not None}
+    def layers(self, *, numpy: bool) -> list[tuple[Array, Array]]:
+        named = {k: p.detach().numpy() if numpy else p for k, p in self._parameters.items() if p is not None}
         return [(named[f"w{i}"], named[f"b{i}"]) for i in range(self.depth)]
 
     def output(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
         xp = array_namespace(x)
-        numpy = not is_torch_array(x)
-        named = {k: p.detach().numpy() if numpy else p for k, p in self._parameters.items() if p is not None}
-        for i in range(self.depth):
-            x = x @ named[f"w{i}"].T + named[f"b{i}"]
+        for i, (weight, bias) in enumerate(self.layers(numpy=not is_torch_array(x))):
+            x = x @ weight.T + bias
             x = xp.tanh(x) if i < self.depth - 1 else x
         return x

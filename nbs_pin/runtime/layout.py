@@ -19,9 +19,11 @@ a multiple of 8 numbers:
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+
+from nbs_pin.arrays import Array, array_namespace
 
 PADDING = 8
 """Row lengths are multiples of this many float64: one cache line, and whole vector registers."""
@@ -38,44 +40,47 @@ class Packed(NamedTuple):
 
     layout: np.ndarray
     """int64."""
-    weights: np.ndarray
-    """float64."""
+    weights: Array
+    """float64: a numpy array, or a torch tensor of the same numbers, differentiable in what was packed."""
 
 
 def pack_potential(
-    layers: Sequence[tuple[np.ndarray | None, np.ndarray, np.ndarray | None]],
+    layers: Sequence[tuple[Array | None, Array, Array | None]],
     activation: tuple[int, float],
-    scale: np.ndarray,
-    stiffness: np.ndarray,
+    scale: Array,
+    stiffness: Array,
+    tangent: tuple[Array, Array] | None = None,
 ) -> Packed:
-    """Φ(z) = zᵀSz + f(Rz) from the layers (Wy, Wx, b) of f, with f(0) = 0 and ∇f(0) = 0 noted.
+    """Φ(z) = zᵀSz + f(Rz) − f(0) − ∇f(0)ᵀRz from the layers (Wy, Wx, b) of f, all in the kind of R.
 
-    For the Bregman form see `convex.subtract_tangent`. activation: its code and parameter.
+    activation: its code and parameter. tangent: f(0), a scalar array, and ∇f(0); None notes zeros, which
+    `convex.subtract_tangent` replaces.
     """
     n = len(scale)
     code, parameter = activation
-    matrices = [_padded(wx, _column(bias, len(wx)), wy) for wy, wx, bias in layers]
-    head = [[parameter, 0.0], scale, np.zeros(n), (2.0 * stiffness).ravel()]
+    matrices = [_padded(wx, bias, wy) for wy, wx, bias in layers]
+    value, gradient = (0.0 * scale[0], 0.0 * scale) if tangent is None else tangent
+    head = [_vector(scale, parameter), value[None], scale, gradient, 2.0 * stiffness.ravel()]
     return _assembled([n, len(layers), code], head, matrices, [len(wx) for _, wx, _ in layers])
 
 
 def pack_damping(
-    networks: tuple[Sequence[tuple[np.ndarray, np.ndarray]], Sequence[tuple[np.ndarray, np.ndarray]]],
+    networks: tuple[Sequence[tuple[Array, Array]], Sequence[tuple[Array, Array]]],
     paper: bool,
     m: float,
-    scale: np.ndarray,
-    floor: np.ndarray,
+    scale: Array,
+    floor: Array,
 ) -> Packed:
-    """D(z) = D₀ + R TᵀT R from the layers (W, b) of the networks of T's diagonal and of its rows below."""
+    """D(z) = D₀ + R TᵀT R from the layers (W, b) of T's diagonal and of its rows below, all in the kind of R."""
     layers = [*networks[0], *networks[1]]
-    matrices = [_padded(weight, _column(bias, len(weight))) for weight, bias in layers]
-    head = [[m], scale, floor.ravel()]
+    matrices = [_padded(weight, bias) for weight, bias in layers]
+    head = [_vector(scale, m), scale, floor.ravel()]
     return _assembled([len(scale), int(paper), len(networks[0])], head, matrices, [len(w) for w, _ in layers])
 
 
 def pack_law(
     law: int,
-    gains: tuple[np.ndarray, np.ndarray],
+    gains: tuple[Array, Array],
     continuous: np.ndarray | None,
     friction: tuple[np.ndarray, np.ndarray, float] | None,
     inertial_rate: float = 0.0,
@@ -84,12 +89,12 @@ def pack_law(
 ) -> Packed:
     """A whole law: its gains, the joints whose error wraps, its friction (viscous, coulomb, transition), its networks.
 
-    gains: (Λ, –) of backstepping, (λ, K) of Slotine and Li, (k_p, k_d) of the others.
+    gains: (Λ, –) of backstepping, (λ, K) of Slotine and Li, (k_p, k_d) of the others; the networks are of their kind.
     """
     n = len(gains[0])
     wraps = np.zeros(n) if continuous is None else continuous
     viscous, coulomb, transition = (np.zeros(n), np.zeros(n), 1.0) if friction is None else friction
-    constants = [wraps, *gains, viscous, coulomb, [transition, inertial_rate]]
+    constants = [_vector(gains[0], wraps), *gains, _vector(gains[0], viscous, coulomb, transition, inertial_rate)]
     parts = [p for p in (potential, damping) if p is not None]
     layout_at = np.cumsum([LAW_HEADER, *(len(p.layout) for p in parts)])
     weights_at = np.cumsum([5 * n + 2, *(len(p.weights) for p in parts)])
@@ -97,7 +102,7 @@ def pack_law(
     head = [law, n, int(friction is not None), *starts, 8 * n + max((workspace(p) for p in parts), default=0)]
     return Packed(
         np.concatenate([head, *(p.layout for p in parts)]).astype(np.int64),
-        np.concatenate([*constants, *(p.weights for p in parts)]).astype(float),
+        _joined([*constants, *(p.weights for p in parts)]),
     )
 
 
@@ -108,19 +113,28 @@ def workspace(part: Packed) -> int:
     return int(4 * (widest + PADDING) + 3 * n + 2 * sizes.sum())
 
 
-def _column(bias: np.ndarray | None, size: int) -> np.ndarray:
-    return np.zeros((size, 1)) if bias is None else bias[:, None]
+def _vector(like: Array, *constants: np.ndarray | float) -> Array:
+    return array_namespace(like).asarray(np.hstack(constants).astype(float))
 
 
-def _padded(*blocks: np.ndarray | None) -> np.ndarray:
-    row = np.hstack([block for block in blocks if block is not None])
-    return np.pad(row, ((0, 0), (0, -row.shape[1] % PADDING)))
+def _joined(vectors: list[Array]) -> Array:
+    xp = array_namespace(*vectors)
+    return xp.astype(xp.concat(vectors), xp.float64, copy=False)
 
 
-def _assembled(head: list[int], constants: list[Any], matrices: list[np.ndarray], sizes: list[int]) -> Packed:
+def _padded(inputs: Array, bias: Array | None, others: Array | None = None) -> Array:
+    """[Wx | b | Wy | 0], row after row; a network without biases has zeros for them."""
+    xp = array_namespace(inputs)
+    size, width = inputs.shape[0], inputs.shape[1] + 1 + (0 if others is None else others.shape[1])
+    column = xp.zeros((size, 1), dtype=inputs.dtype) if bias is None else bias[:, None]
+    padding = xp.zeros((size, -width % PADDING), dtype=inputs.dtype)
+    return xp.concat([x for x in (inputs, column, others, padding) if x is not None], axis=1)
+
+
+def _assembled(head: list[int], constants: list[Array], matrices: list[Array], sizes: list[int]) -> Packed:
     start = sum(len(c) for c in constants)
-    offsets = start + np.cumsum([0, *(m.size for m in matrices)])
+    offsets = start + np.cumsum([0, *(size * m.shape[1] for size, m in zip(sizes, matrices, strict=True))])
     rows = [m.shape[1] for m in matrices]
     table = np.column_stack([sizes, rows, offsets[:-1]]).ravel()
     layout = np.concatenate([[*head, max(rows)], table]).astype(np.int64)
-    return Packed(layout, np.concatenate([*constants, *(m.ravel() for m in matrices)]).astype(float))
+    return Packed(layout, _joined([*constants, *(m.ravel() for m in matrices)]))
