@@ -16,6 +16,8 @@ from nbs_pin.runtime.layout import Packed
 from nbs_pin.runtime.tree_layout import Link, pack_tree
 
 Row: TypeAlias = np.ndarray
+_TURNING = ("JointModelRX", "JointModelRY", "JointModelRZ", "JointModelRevoluteUnaligned")
+_SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismaticUnaligned")
 
 
 @dataclass(frozen=True)
@@ -177,21 +179,20 @@ class PinocchioDynamics(DynamicsProvider):
 def pack_model(model: pin.Model) -> Packed:
     """A Pinocchio model with its gravity and armature as a rigid tree for the kernels of `runtime/trees.py`.
 
-    Raises ArgumentError unless every joint is revolute or prismatic with one coordinate, and joint i has velocity i−1.
+    Raises ArgumentError for a joint that is neither revolute nor prismatic, or whose angle is stored as two numbers.
     """
-    joints, links = model.createData().joints, []
+    data, links = model.createData(), []
     for i in range(1, model.njoints):
-        motion = np.array(joints[i].S).reshape(6, -1)
-        slides, turns = motion[:3].any(), motion[3:].any()
-        if (model.nqs[i], model.nvs[i], model.idx_vs[i]) != (1, 1, i - 1) or slides == turns:
+        kind = model.joints[i].shortname()
+        if kind not in _TURNING + _SLIDING or model.idx_vs[i] != i - 1:
             raise ArgumentError(
-                f"joint '{model.names[i]}' is a {joints[i].shortname()}, expected revolute or prismatic joints with one"
-                " coordinate each; lock it, or use a joint whose angle is unbounded."
+                f"joint '{model.names[i]}' is a {kind}, expected a revolute or prismatic one with one coordinate;"
+                " lock it, or use a joint whose angle is one unbounded number."
             )
-        body, at = model.inertias[i], model.jointPlacements[i]
-        axis, rotor = (motion[:3] if slides else motion[3:])[:, 0], float(model.armature[i - 1])
-        place = (model.parents[i], bool(slides), axis, at.rotation, at.translation)
-        links.append(Link(*place, body.mass, body.lever, body.inertia, rotor))
+        motion, slides = np.array(data.joints[i].S), kind in _SLIDING
+        body, at, axis = model.inertias[i], model.jointPlacements[i], motion[:3] if slides else motion[3:]
+        place = (model.parents[i], slides, axis, at.rotation, at.translation)
+        links.append(Link(*place, body.mass, body.lever, body.inertia, float(model.armature[i - 1])))
     return pack_tree(links, model.gravity.linear)
 
 
