@@ -1,0 +1,333 @@
+"""Adjoints are the gradients of what they name: against torch's autograd, and against differences of the kernels."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from nbs_pin.networks.activations import SmoothedReLU, Squareplus
+from nbs_pin.networks.damping import Damping
+from nbs_pin.networks.potential import Potential
+from nbs_pin.runtime.adjoints import adjoint_workspace, law_adjoint, pid_adjoint
+from nbs_pin.runtime.convex import subtract_tangent
+from nbs_pin.runtime.convex_adjoint import potential_adjoint, room_for_potential
+from nbs_pin.runtime.damping_adjoint import damping_adjoint, room_for_damping
+from nbs_pin.runtime.laws import law_row, pid
+from nbs_pin.runtime.layout import (
+    BACKSTEPPING,
+    COMPUTED_TORQUE,
+    PART_HEADER,
+    PD_GRAVITY,
+    PD_REFERENCE,
+    SLOTINE_LI,
+    SMOOTHED_RELU,
+    SQUAREPLUS,
+    Packed,
+    pack_damping,
+    pack_law,
+    pack_potential,
+)
+
+SIZES = [(1, ()), (1, (5,)), (2, (4, 3)), (7, (32, 32, 32)), (7, (11,))]
+ACTIVATIONS = {"smooth": (SQUAREPLUS, 0.7), "paper": (SMOOTHED_RELU, 0.5)}
+LINEAR = [SLOTINE_LI, COMPUTED_TORQUE, PD_REFERENCE, PD_GRAVITY]
+
+
+# Random parts, and the same parts written out in torch on the same flat weights.
+
+
+def random_potential(n: int, widths: tuple[int, ...], form: str, seed: int = 0) -> Packed:
+    rng = np.random.default_rng(seed)
+    layers = [
+        (rng.uniform(0.0, 1.0, (size, before)) / before if before else None, rng.normal(size=(size, n)), None)
+        for before, size in pairwise((0, *widths, 1))
+    ]
+    if form == "smooth":
+        layers = [(wy, wx, rng.normal(size=len(wx))) for wy, wx, _ in layers]
+    packed = pack_potential(layers, ACTIVATIONS[form], rng.uniform(0.5, 2.0, n), rng.normal(size=(n, n)))
+    return packed if form == "paper" else subtract_tangent(packed)
+
+
+def random_damping(n: int, widths: tuple[int, ...], form: str, seed: int = 0) -> Packed:
+    rng = np.random.default_rng(seed)
+    networks = [
+        [(rng.normal(size=(b, a)) / np.sqrt(a), rng.normal(size=b)) for a, b in pairwise((n, *widths, outputs))]
+        for outputs in (n, n * (n - 1) // 2)
+    ]
+    return pack_damping(tuple(networks), form == "paper", 0.3, rng.uniform(0.5, 2.0, n), rng.normal(size=(n, n)))
+
+
+def random_law(law: int, n: int, form: str, *, friction: bool, seed: int = 0) -> Packed:
+    rng = np.random.default_rng(seed)
+    parts = {}
+    if law == BACKSTEPPING:
+        parts = {"potential": random_potential(n, (6, 5), form, seed), "damping": random_damping(n, (5,), form, seed)}
+        parts["inertial_rate"] = 1.5
+    gains = tuple(rng.uniform(0.5, 2.0, (2, n)))
+    continuous = (np.arange(n) % 2).astype(float)
+    fed = (*rng.uniform(0.1, 1.0, (2, n)), 0.8) if friction else None
+    return pack_law(law, gains, continuous, fed, **parts)
+
+
+def layers_of(layout: np.ndarray, weights: torch.Tensor, first: int, depth: int) -> list[torch.Tensor]:
+    table = layout[PART_HEADER + 3 * first : PART_HEADER + 3 * (first + depth)].reshape(depth, 3).tolist()
+    return [weights[offset : offset + size * length].reshape(size, length) for size, length, offset in table]
+
+
+def sigma(code: int, parameter: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
+    if code == SQUAREPLUS:
+        return 0.5 * (a + (a * a + parameter).sqrt())
+    s = (a / parameter).clip(0.0, 1.0)
+    return s * (a - 0.5 * parameter * s)
+
+
+def torch_potential(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor, dz: torch.Tensor):
+    """∇Φ and ∇²Φ ż, by differentiating f itself."""
+    n, depth, code = layout[:3].tolist()
+    scale, tangent, double_s = weights[2 : 2 + n], weights[2 + n : 2 + 2 * n], weights[2 + 2 * n :][: n * n]
+    x, y = scale * z, z[:0]
+    for matrix in layers_of(layout, weights, 0, depth):
+        u = torch.cat([x, torch.ones(1, dtype=z.dtype), y])
+        y = sigma(code, weights[0], matrix[:, : len(u)] @ u)
+    (slope,) = torch.autograd.grad(y[0], x, create_graph=True)
+    (product,) = torch.autograd.grad(slope @ (scale * dz), x, create_graph=True)
+    s = double_s.reshape(n, n)
+    return scale * (slope - tangent) + s @ z, scale * product + s @ dz
+
+
+def torch_damping(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+    """D(z) z."""
+    n, paper, depth = layout[:3].tolist()
+    scale, floor = weights[1 : 1 + n], weights[1 + n :][: n * n].reshape(n, n)
+    outputs = []
+    for first in (0, depth):
+        h = scale * z
+        for k, matrix in enumerate(layers_of(layout, weights, first, depth)):
+            h = (torch.tanh(h) if k else h) @ matrix[:, : len(h)].T + matrix[:, len(h)]
+        outputs.append(h)
+    diagonal = outputs[0].clip(0.0) + weights[0] if paper else outputs[0]
+    below = torch.zeros(n, n, dtype=z.dtype)
+    below[*np.tril_indices(n, -1)] = outputs[1]
+    t = torch.diag(diagonal) + below
+    return floor @ z + scale * (t.T @ (t @ (scale * z)))
+
+
+def torch_law(law: Packed, weights: torch.Tensor, q, v, q_ref, v_ref, a_ref):
+    """v_r, a_r and feedback."""
+    code, n = law.layout[:2].tolist()
+    wraps, first, second, viscous, coulomb = weights[: 5 * n].reshape(5, n)
+    turns = torch.ceil((q - q_ref - np.pi) / (2.0 * np.pi))
+    z1, dz1 = q - q_ref - 2.0 * np.pi * wraps * turns, v - v_ref
+    if code == BACKSTEPPING:
+        gradient, product = torch_potential(law.layout[law.layout[3] :], weights[law.layout[4] :], z1, dz1)
+        v_r = v_ref - first * gradient
+        a_r = a_ref - first * product - weights[5 * n + 1] * (v - v_r)
+        damped = torch_damping(law.layout[law.layout[5] :], weights[law.layout[6] :], v - v_r)
+        feedback = -gradient - damped
+    elif code == SLOTINE_LI:
+        v_r, a_r = v_ref - first * z1, a_ref - first * dz1
+        feedback = -second * (v - v_r)
+    elif code == COMPUTED_TORQUE:
+        v_r, a_r, feedback = v + 0.0, a_ref - second * dz1 - first * z1, 0.0 * q
+    else:
+        feedback = -first * z1 - second * dz1
+        v_r, a_r = (0.0 * v_ref, 0.0 * a_ref) if code == PD_GRAVITY else (v_ref, a_ref)
+    if law.layout[2]:
+        speed = v_r if code in (BACKSTEPPING, SLOTINE_LI) else v_ref
+        feedback = feedback + viscous * speed + coulomb * torch.tanh(speed / weights[5 * n])
+    return v_r, a_r, feedback
+
+
+# What is compared.
+
+
+def guarded(size: int) -> np.ndarray:
+    """Scratch space full of NaN, so that a kernel that reads before it writes is seen."""
+    return np.full(int(size), np.nan)
+
+
+def leaves(*arrays: np.ndarray) -> list[torch.Tensor]:
+    return [torch.tensor(x, requires_grad=True) for x in arrays]
+
+
+def gradients(total: torch.Tensor, inputs: list[torch.Tensor]) -> list[np.ndarray]:
+    found = torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)
+    return [x.numpy() for x in found]
+
+
+def assert_close(found: np.ndarray, expected: np.ndarray, tolerance: float = 1e-10) -> None:
+    assert found.shape == expected.shape
+    assert np.abs(found - expected).max() <= tolerance * max(np.abs(expected).max(), 1e-3)
+
+
+@pytest.mark.parametrize(("n", "widths"), SIZES)
+@pytest.mark.parametrize("form", ACTIVATIONS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_potential_adjoint_is_the_gradient(n, widths, form, seed):
+    part = random_potential(n, widths, form, seed)
+    z, dz, gradient_bar, product_bar = given = np.random.default_rng(seed).normal(size=(4, n))
+    z_bar, dz_bar, weights_bar = np.zeros(n), np.zeros(n), np.zeros_like(part.weights)
+    potential_adjoint(*given, *part, guarded(room_for_potential(part.layout)), z_bar, dz_bar, weights_bar)
+
+    inputs = leaves(z, dz, part.weights)
+    gradient, product = torch_potential(part.layout, inputs[2], *inputs[:2])
+    total = gradient @ torch.tensor(gradient_bar) + product @ torch.tensor(product_bar)
+    expected = gradients(total, inputs)
+    expected[2][:2] = 0.0  # the activation's parameter and f(0)
+    for found, wanted in zip((z_bar, dz_bar, weights_bar), expected, strict=True):
+        assert_close(found, wanted)
+
+
+@pytest.mark.parametrize(("n", "widths"), SIZES)
+@pytest.mark.parametrize("form", ["bounded", "paper"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_damping_adjoint_is_the_gradient(n, widths, form, seed):
+    part = random_damping(n, widths, form, seed)
+    z, force_bar = np.random.default_rng(seed).normal(size=(2, n))
+    z_bar, weights_bar = np.zeros(n), np.zeros_like(part.weights)
+    damping_adjoint(z, force_bar, *part, guarded(room_for_damping(part.layout)), z_bar, weights_bar)
+
+    inputs = leaves(z, part.weights)
+    expected = gradients(torch_damping(part.layout, inputs[1], inputs[0]) @ torch.tensor(force_bar), inputs)
+    expected[1][0] = 0.0  # m
+    assert_close(z_bar, expected[0])
+    assert_close(weights_bar, expected[1])
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+@pytest.mark.parametrize(("form", "activation"), [("smooth", Squareplus(0.3)), ("paper", SmoothedReLU(0.4))])
+def test_networks_as_they_are_read(n, form, activation):
+    rng = np.random.default_rng(n)
+    scale, tensor = rng.uniform(0.5, 2.0, n), torch.tensor(rng.normal(size=(4, n)))
+    phi = Potential(np.eye(n) + 0.5, form=form, activation=activation, scale=scale, seed=n)
+    d = Damping(n, form="paper", scale=scale, gain=0.8) if form == "paper" else Damping(n, floor=np.eye(n), gain=0.8)
+    z, dz = tensor[:2].clone().requires_grad_()
+    gradient, product = phi.terms(z, dz)[1:]
+    expected = gradients(gradient @ tensor[2] + product @ tensor[3] + d.force(dz) @ tensor[2], [z, dz])
+
+    z_bar, dz_bar = np.zeros((2, n))
+    given, phi_part, d_part = tensor.numpy(), phi.packed(), d.packed()
+    potential_adjoint(
+        *given, *phi_part, guarded(room_for_potential(phi_part.layout)), z_bar, dz_bar, 0.0 * phi_part.weights
+    )
+    damping_adjoint(given[1], given[2], *d_part, guarded(room_for_damping(d_part.layout)), dz_bar, 0.0 * d_part.weights)
+    assert_close(z_bar, expected[0])
+    assert_close(dz_bar, expected[1])
+
+
+def states(n: int, seed: int) -> list[np.ndarray]:
+    """q, v, q_ref, v_ref, a_ref, errors beyond half a turn among them."""
+    return list(np.random.default_rng(seed).normal(size=(5, n)) * [[4.0], [1.0], [1.0], [1.0], [1.0]])
+
+
+def adjoint_of(law: Packed, given: list[np.ndarray], bars: np.ndarray, start: float = 0.0) -> list[np.ndarray]:
+    """By q, v and the weights, added to `start`."""
+    found = [np.full_like(x, start) for x in (given[0], given[1], law.weights)]
+    law_adjoint(*given, *law, guarded(adjoint_workspace(law)), *bars, *found)
+    return found
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+@pytest.mark.parametrize("form", ACTIVATIONS)
+@pytest.mark.parametrize("law_code", [BACKSTEPPING, *LINEAR])
+@pytest.mark.parametrize("friction", [False, True])
+def test_law_adjoint_is_the_gradient(n, form, law_code, friction):
+    law = random_law(law_code, n, form, friction=friction, seed=n)
+    given, bars = states(n, seed=n), np.random.default_rng(7).normal(size=(3, n))
+    inputs = leaves(given[0], given[1], law.weights)
+    signals = torch_law(law, inputs[2], *inputs[:2], *(torch.tensor(x) for x in given[2:]))
+    kernel = np.empty((3, n))
+    assert law_row(*given, *law, guarded(law.layout[7]), *kernel)
+    for x, y in zip(signals, kernel, strict=True):
+        assert_close(x.detach().numpy(), y, 1e-12)
+
+    expected = gradients(sum(x @ torch.tensor(bar) for x, bar in zip(signals, bars, strict=True)), inputs)
+    expected[2][:n] = 0.0  # which joints wrap
+    if law_code == BACKSTEPPING:
+        expected[2][law.layout[4] : law.layout[4] + 2] = expected[2][law.layout[6]] = 0.0  # σ's parameter, f(0), m
+    for found, wanted in zip(adjoint_of(law, given, bars), expected, strict=True):
+        assert_close(found, wanted)
+
+
+@pytest.mark.parametrize("law_code", [BACKSTEPPING, *LINEAR])
+def test_law_adjoint_against_differences_of_the_law(law_code):
+    n, rng = 3, np.random.default_rng(law_code)
+    law = random_law(law_code, n, "smooth", friction=True)
+    given, bars = states(n, seed=5), rng.normal(size=(3, n))
+    directions = [rng.normal(size=x.shape) for x in (given[0], given[1], law.weights)]
+    directions[2][:n] = 0.0
+    if law_code == BACKSTEPPING:
+        directions[2][law.layout[4] : law.layout[4] + 2] = directions[2][law.layout[6]] = 0.0
+
+    def value(step: float) -> float:
+        out = np.empty((3, n))
+        q, v, weights = (x + step * d for x, d in zip((*given[:2], law.weights), directions, strict=True))
+        law_row(q, v, *given[2:], law.layout, weights, guarded(law.layout[7]), *out)
+        return float((out * bars).sum())
+
+    slope = (value(1e-5) - value(-1e-5)) / 2e-5
+    found = sum(x @ d for x, d in zip(adjoint_of(law, given, bars), directions, strict=True))
+    assert found == pytest.approx(slope, rel=1e-7)
+
+
+@pytest.mark.parametrize("law_code", [BACKSTEPPING, *LINEAR])
+def test_law_adjoint_adds(law_code):
+    law = random_law(law_code, 2, "paper", friction=True)
+    given, bars = states(2, seed=1), np.random.default_rng(1).normal(size=(3, 2))
+    for alone, added in zip(adjoint_of(law, given, bars), adjoint_of(law, given, bars, start=0.5), strict=True):
+        np.testing.assert_allclose(added, 0.5 + alone, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("law_code", [BACKSTEPPING, *LINEAR])
+def test_bars_that_are_given_are_only_read(law_code):
+    law = random_law(law_code, 2, "smooth", friction=True)
+    given, bars = states(2, seed=2), np.random.default_rng(2).normal(size=(3, 2))
+    before = [x.copy() for x in (*given, bars, *law)]
+    adjoint_of(law, given, bars)
+    for x, y in zip(before, (*given, bars, *law), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_law_adjoint_follows_the_error_past_half_a_turn():
+    law = random_law(BACKSTEPPING, 2, "smooth", friction=False)
+    given, bars = states(2, seed=3), np.ones((3, 2))
+    turned = [given[0] + [0.0, 2.0 * np.pi], *given[1:]]  # joint 1 wraps
+    for x, y in zip(adjoint_of(law, given, bars), adjoint_of(law, turned, bars), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("filter_time", [0.0, 0.03])
+@pytest.mark.parametrize("rows", [1, 3])
+def test_pid_adjoint_against_differences(seed, filter_time, rows):
+    n, period, rng = 3, 0.01, np.random.default_rng(seed)
+    gains = np.array([*rng.uniform(1.0, 5.0, (4, n)), np.full(n, filter_time), [0.0, 1.0, 0.0]])
+    integral, derivative, q, v, q_ref, v_ref = given = list(rng.normal(size=(6, n * rows)))
+    q *= 4.0
+    bars = rng.normal(size=(3, n * rows))
+    found = [np.full_like(x, 0.25) for x in (integral, derivative, q, v, gains)]
+    pid_adjoint(*given, period, gains, bars, *found)
+
+    directions = [rng.normal(size=x.shape) for x in found]
+    directions[4][[3, 5]] = 0.0
+    np.testing.assert_array_equal(found[4][[3, 5]], 0.25)
+
+    def value(step: float) -> float:
+        out = np.empty((3, n * rows))
+        moved = [x + step * d for x, d in zip((*given[:4], gains), directions, strict=True)]
+        assert pid(*moved[:4], q_ref, v_ref, period, moved[4], out)
+        return float((out * bars).sum())
+
+    slope = (value(1e-6) - value(-1e-6)) / 2e-6
+    total = sum(((x - 0.25) * d).sum() for x, d in zip(found, directions, strict=True))
+    assert total == pytest.approx(slope, rel=1e-6)
+
+
+def test_pid_adjoint_rests_where_the_integral_rests():
+    one, gains = np.ones(1), np.array([[2.0], [3.0], [1.0], [0.5], [0.0], [0.0]])
+    zero = np.zeros(1)
+    found = [np.zeros(1) for _ in range(4)]
+    gains_bar, bars = np.zeros((6, 1)), np.array([[0.0], [1.0], [0.0]])
+    pid_adjoint(zero, zero, one, zero, zero, zero, 0.01, gains, bars, *found, gains_bar)  # τ = −2, limit 0.5
+    np.testing.assert_array_equal([*np.ravel(found), *np.ravel(gains_bar)], [1.0, *[0.0] * 9])
