@@ -60,8 +60,10 @@ def _sweep(
     v: np.ndarray, w: np.ndarray, a: np.ndarray, layout: np.ndarray, weights: np.ndarray, work: np.ndarray
 ) -> None:
     """Motion and force of every body alone, outwards, from R and p in work."""
-    work[V:ROW] = 0.0
-    work[A : A + 3] = weights[:3]
+    for k in range(V, ROW):  # loops: an assignment to a slice would first ask whether the two overlap
+        work[k] = 0.0
+    for k in range(3):
+        work[A + k] = weights[k]
     for i in range(layout[0]):
         at = layout[1 + 2 * i] * ROW
         row = work[ROW * (i + 1) : ROW * (i + 2)]
@@ -109,7 +111,8 @@ def _spread(mu: np.ndarray, layout: np.ndarray, work: np.ndarray) -> None:
         x, y, z = from_parent(row, x, y, z)
         row[U], row[U + 1], row[U + 2] = ux, uy, uz + slide * mu[i]
         row[SPIN], row[SPIN + 1], row[SPIN + 2] = x, y, z + (1.0 - slide) * mu[i]
-        row[V_BAR:ROW] = 0.0
+        for k in range(V_BAR, ROW):
+            row[k] = 0.0
 
 
 @kernel
@@ -150,8 +153,10 @@ def _mass(layout: np.ndarray, weights: np.ndarray, work: np.ndarray, mass: np.nd
     """The lower triangle of M(q) from R and p in work, by composite bodies: column i is the load of a unit a_i."""
     for i in range(layout[0]):
         start, at = ROW * (i + 1) + COMPOSITE, BASE + BODY * i
-        work[start : start + 10] = weights[at + MASS : at + ARMATURE]
-        mass[i] = 0.0
+        for k in range(ARMATURE - MASS):
+            work[start + k] = weights[at + MASS + k]
+        for j in range(layout[0]):
+            mass[i, j] = 0.0
     for i in range(layout[0] - 1, -1, -1):
         row = work[ROW * (i + 1) : ROW * (i + 2)]
         at, hx, hy = COMPOSITE + 4, row[COMPOSITE + 1], row[COMPOSITE + 2]
@@ -180,28 +185,31 @@ def _factorise(matrix: np.ndarray) -> None:
     """The lower triangle of a positive definite matrix becomes its Cholesky factor; not a number where it is none."""
     for i in range(len(matrix)):
         row = matrix[i]
+        rest = row[i]
         for j in range(i):
-            other = matrix[j]
+            other, share = matrix[j], row[j]
             for k in range(j):
-                row[j] -= row[k] * other[k]
-            row[j] /= other[j]
-        for k in range(i):
-            row[i] -= row[k] * row[k]
-        row[i] = math.sqrt(row[i])
+                share -= row[k] * other[k]
+            share /= other[j]
+            row[j] = share
+            rest -= share * share
+        row[i] = math.sqrt(rest)
 
 
 @kernel
 def _solve(factor: np.ndarray, x: np.ndarray) -> None:
-    """X ← (LLᵀ)⁻¹ x."""
+    """Solve LLᵀ x = b, with b in x."""
     n = len(factor)
     for i in range(n):
+        total = x[i]
         for k in range(i):
-            x[i] -= factor[i, k] * x[k]
-        x[i] /= factor[i, i]
+            total -= factor[i, k] * x[k]
+        x[i] = total / factor[i, i]
     for i in range(n - 1, -1, -1):
-        x[i] /= factor[i, i]
+        total = x[i] / factor[i, i]
+        x[i] = total
         for k in range(i):
-            x[k] -= factor[i, k] * x[i]
+            x[k] -= factor[i, k] * total
 
 
 @kernel
