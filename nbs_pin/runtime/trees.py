@@ -101,7 +101,7 @@ def tree_torque(
 
 @kernel
 def _spread(mu: np.ndarray, layout: np.ndarray, work: np.ndarray) -> None:
-    """U and o of every body at the joint velocity μ."""
+    """The velocities u and o of every body at the joint velocity μ."""
     for i in range(layout[0]):
         at, slide = layout[1 + 2 * i] * ROW, float(layout[2 + 2 * i])
         up, row = work[at : at + ROW], work[ROW * (i + 1) : ROW * (i + 2)]
