@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from array_api_compat import device
 from jaxtyping import Float
 from torch import nn
 
@@ -76,7 +77,7 @@ class Damping(nn.Module):
         diagonal = self.diagonal.output(x)
         if self.form == "paper":
             diagonal = xp.clip(diagonal, 0.0, math.inf) + self.m
-        t = xp.zeros((*x.shape, self.nv), dtype=x.dtype)
+        t = xp.zeros((*x.shape, self.nv), dtype=x.dtype, device=device(x))
         t[..., self._diagonal_index, self._diagonal_index] = diagonal
         t[..., *self._lower_index] = self.lower.output(x)
         return t
@@ -110,7 +111,7 @@ class Damping(nn.Module):
 
     def _constants(self, *, numpy: bool) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         r = self.scale.numpy() if numpy else self.scale
-        zero = array_namespace(r).zeros((self.nv, self.nv), dtype=r.dtype)
+        zero = array_namespace(r).zeros((self.nv, self.nv), dtype=r.dtype, device=device(r))
         return zero if self.floor is None else self.floor.like(r), r
 
 
