@@ -10,7 +10,7 @@ from nbs_pin.checks import positive, whole
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.plants.plant import Plant
 from nbs_pin.references import DesiredMotion
-from nbs_pin.state import Reference
+from nbs_pin.state import Reference, Run
 
 LONGEST_PLANT_STEP = 1e-3
 """Plant step taken when none is given, or the nearest shorter one that divides the period [s]."""
@@ -92,6 +92,42 @@ class Loop:
         seen = np.minimum(times + self.lead, self.period * self.steps)
         desired, target = (_sampled(reference, t, self.plant.nv) for t in (times, seen))
         return Schedule(times, seen - times, desired, target)
+
+    def blank_run(self, times: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray, controller: str) -> Run:
+        """A run with its times, reference and start in place, and room for the rest.
+
+        desired: (rows, n) each, or (rows, *batch, n) where the starts (*batch, n) follow motions of their own.
+        """
+        rows, n = len(times), self.plant.nv
+        shape, robot = (rows, *q0.shape), self.plant.robot
+        aligned = (x if x.ndim == len(shape) else x.reshape(rows, *(1,) * (q0.ndim - 1), n) for x in desired)
+        q_ref, v_ref, a_ref = (np.array(np.broadcast_to(x, shape)) for x in aligned)
+        run = Run(
+            t=times,
+            q=np.zeros(shape),
+            v=np.zeros(shape),
+            tau=np.zeros(shape),
+            tau_command=np.zeros(shape),
+            disturbance=np.zeros(shape),
+            q_ref=q_ref,
+            v_ref=v_ref,
+            a_ref=a_ref,
+            effort_limit=self.limit,
+            continuous=np.zeros(n, dtype=bool) if robot is None else robot.continuous,
+            joint_names=tuple(f"q{i + 1}" for i in range(n)) if robot is None else robot.joint_names,
+            period=self.period,
+            robot="" if robot is None else robot.source,
+            robot_sha256="" if robot is None else robot.sha256,
+            robot_options={} if robot is None else robot.options,
+            info={
+                "controller": controller,
+                "plant": repr(self.plant),
+                "plant_step": self.step,
+                "lookahead": self.lead,
+            },
+        )
+        run.q[0], run.v[0] = q0, v0
+        return run
 
 
 def _substeps(period: float, plant_step: float | None) -> int:

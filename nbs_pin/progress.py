@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -11,8 +11,11 @@ _PATIENCE = 2.0
 _REFRESH = 0.1
 
 
-def tracked(items: Sequence[T], label: str, show: bool = True) -> Iterator[T]:
-    """The items one by one, with a progress bar on stderr once the work has taken 2 s and stderr is a terminal."""
+def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = True) -> Iterator[T]:
+    """The items one by one, with a progress bar on stderr once the work has taken 2 s and stderr is a terminal.
+
+    label: what the work is called; a function is asked again whenever the bar is drawn.
+    """
     if not (show and sys.stderr.isatty()):
         yield from items
         return
@@ -21,10 +24,14 @@ def tracked(items: Sequence[T], label: str, show: bool = True) -> Iterator[T]:
 
     start = drawn = time.perf_counter()
     with Progress(console=Console(stderr=True), auto_refresh=False, transient=True) as bar:
-        task = bar.add_task(label, total=len(items), visible=False)
+        task = bar.add_task(_text(label), total=len(items), visible=False)
         for done, item in enumerate(items):
             now = time.perf_counter()
             if now - start > _PATIENCE and now - drawn > _REFRESH:
-                bar.update(task, completed=done, visible=True, refresh=True)
+                bar.update(task, description=_text(label), completed=done, visible=True, refresh=True)
                 drawn = now
             yield item
+
+
+def _text(label: str | Callable[[], str]) -> str:
+    return label if isinstance(label, str) else label()

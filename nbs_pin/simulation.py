@@ -202,7 +202,7 @@ def _block(
     """The rows of `steps` periods from the instant number `first` on, and the controller's memory at their end."""
     times, ahead, desired, target = loop.schedule(reference, first, steps)
     leads = ahead.tolist()
-    run = _prepared(loop, times, desired, *start)
+    run = loop.blank_run(times, desired, *start, controller=loop.name)
     memory = loop.law.initial_memory(run.q[0]) if first == 0 else memory
     # Overflow needs no warning here: every torque and every state is checked, and reported with its time.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -241,39 +241,6 @@ def _advance(loop: _Closed, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarr
     except SimulationDiverged as error:
         raise SimulationDiverged(f"after t = {t:g} s: {error}") from error
     return q, v
-
-
-def _prepared(loop: _Closed, t: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray) -> Run:
-    """The run with its times, reference and start in place, and room for the rest."""
-    rows, n = desired.q.shape
-    shape, robot = (rows, *q0.shape), loop.plant.robot
-    q_ref, v_ref, a_ref = (np.array(np.broadcast_to(x.reshape(rows, *(1,) * (q0.ndim - 1), n), shape)) for x in desired)
-    run = Run(
-        t=t,
-        q=np.zeros(shape),
-        v=np.zeros(shape),
-        tau=np.zeros(shape),
-        tau_command=np.zeros(shape),
-        disturbance=np.zeros(shape),
-        q_ref=q_ref,
-        v_ref=v_ref,
-        a_ref=a_ref,
-        effort_limit=loop.limit,
-        continuous=np.zeros(n, dtype=bool) if robot is None else robot.continuous,
-        joint_names=tuple(f"q{i + 1}" for i in range(n)) if robot is None else robot.joint_names,
-        period=loop.period,
-        robot="" if robot is None else robot.source,
-        robot_sha256="" if robot is None else robot.sha256,
-        robot_options={} if robot is None else robot.options,
-        info={
-            "controller": loop.name,
-            "plant": repr(loop.plant),
-            "plant_step": loop.step,
-            "lookahead": loop.lead,
-        },
-    )
-    run.q[0], run.v[0] = q0, v0
-    return run
 
 
 def _checked(command: Any, shape: tuple[int, ...], name: str, t: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.arrays import Array, is_torch_array
 from nbs_pin.checks import all_finite
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -46,26 +47,32 @@ class DynamicsPlant(Plant):
 
     def step(
         self,
-        q: Float[np.ndarray, "*batch n"],
-        v: Float[np.ndarray, "*batch n"],
-        tau: Float[np.ndarray, "*batch n"],
+        q: Float[Array, "*batch n"],
+        v: Float[Array, "*batch n"],
+        tau: Float[Array, "*batch n"],
         duration: float,
-    ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"]]:
+    ) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]:
         """State (q, v) after one integration step of `duration` [s] with τ [N·m] held (zero-order hold).
+
+        Numpy in, numpy out; torch in, differentiable torch out.
 
         Raises SimulationDiverged when the result is not finite.
         """
         dynamics, friction = self.dynamics, self.friction
 
-        def acceleration(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        def acceleration(q: Array, v: Array) -> Array:
             net = tau if friction is None else tau - friction.torque(v)
             return dynamics.forward_dynamics(q, v, net)
 
         with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below, with its cause
             q, v = self._step(acceleration, q, v, duration)
-        if not (all_finite(q) and all_finite(v)):
+        if not (_finite(q) and _finite(v)):
             raise SimulationDiverged(
                 f"{self!r} left the finite numbers in a step of {duration:g} s; "
                 "take a shorter plant step, or look for an unstable controller."
             )
         return q, v
+
+
+def _finite(x: Array) -> bool:
+    return bool(x.isfinite().all()) if is_torch_array(x) else all_finite(x)

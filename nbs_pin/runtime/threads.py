@@ -11,11 +11,11 @@ FEWEST_ROWS = 64
 """Fewer rows than this are not worth a thread."""
 
 
-def over_cores(function: Callable[[slice], None], rows: int) -> None:
-    """`function` of slices that make up all rows, at the same time; NUMBA_NUM_THREADS bounds their number."""
+def over_cores(function: Callable[[slice], None], rows: int, fewest: int = FEWEST_ROWS) -> None:
+    """`function` of slices of at least `fewest` rows that make up all, at once; NUMBA_NUM_THREADS bounds their number."""
     parts = min(
         numba.config.NUMBA_NUM_THREADS,  # type: ignore[attr-defined]  # read from the environment
-        rows // FEWEST_ROWS,
+        rows // fewest,
     )
     if parts < 2:
         function(slice(0, rows))
