@@ -53,9 +53,9 @@ def backstepping_adjoint(
 ) -> None:
     """Adjoint of `laws.backstepping` and of its friction, fed forward at v_r, with z1 in work[:n]."""
     n, rate, omega = layout[1], weights[layout[1] : 2 * layout[1]], weights[5 * layout[1] + 1]
-    z1, dz1, v_r, z2, r_bar, z2_bar, gradient, product, gradient_bar, product_bar = work[: _VECTORS * n].reshape(
-        _VECTORS, n
-    )
+    vectors = work[: _VECTORS * n].reshape(_VECTORS, n)
+    z1, dz1, v_r, z2, r_bar, z2_bar = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
+    gradient, product, gradient_bar, product_bar = vectors[6], vectors[7], vectors[8], vectors[9]
     phi, phi_weights, phi_bar = layout[layout[3] :], weights[layout[4] :], weights_bar[layout[4] :]
     d, d_weights, d_bar = layout[layout[5] :], weights[layout[6] :], weights_bar[layout[6] :]
     room, d_room = work[_VECTORS * n :], work[_VECTORS * n + room_for_potential(phi) :]

@@ -84,15 +84,20 @@ def times(matrix: np.ndarray, u: np.ndarray, du: np.ndarray, a: np.ndarray, da: 
 
 
 @kernel
-def add_transposed(matrix: np.ndarray, d: np.ndarray, dd: np.ndarray, g: np.ndarray, dg: np.ndarray) -> None:
-    """Add Wᵀδ to g and Wᵀδ̇ to ġ."""
-    length = len(matrix) // len(d)
-    for i in range(len(d)):
-        row = matrix[i * length : (i + 1) * length]
-        x, dx = d[i], dd[i]
+def add_transposed(matrix: np.ndarray, d: np.ndarray, g: np.ndarray) -> None:
+    """Add Wᵀδ to g, four rows of W at a time so that g is fetched and stored less often."""
+    size, length = len(d), len(g)
+    whole = size - size % 4
+    for i in range(0, whole, 4):
+        r0, r1 = matrix[i * length : (i + 1) * length], matrix[(i + 1) * length : (i + 2) * length]
+        r2, r3 = matrix[(i + 2) * length : (i + 3) * length], matrix[(i + 3) * length : (i + 4) * length]
+        d0, d1, d2, d3 = d[i], d[i + 1], d[i + 2], d[i + 3]
         for j in range(length):
-            g[j] += x * row[j]
-            dg[j] += dx * row[j]
+            g[j] += d0 * r0[j] + d1 * r1[j] + d2 * r2[j] + d3 * r3[j]
+    for i in range(whole, size):
+        row, di = matrix[i * length : (i + 1) * length], d[i]
+        for j in range(length):
+            g[j] += di * row[j]
 
 
 @kernel
@@ -142,7 +147,9 @@ def reverse(layout: np.ndarray, weights: np.ndarray, tape: np.ndarray, g: np.nda
             third[i] = third[i] * a1[i] * lam12 + bend[i] * lam2
             bend[i], a1[i] = bend[i] * lam12, bent
         g[n:], g1[n:] = 0.0, 0.0
-        add_transposed(weights[offset : offset + size * length], delta12, delta2, g[:length], g1[:length])
+        matrix = weights[offset : offset + size * length]
+        add_transposed(matrix, delta12, g[:length])
+        add_transposed(matrix, delta2, g1[:length])
 
 
 @kernel
@@ -184,10 +191,11 @@ def reverse_again(
             lam, lam1, a2, a12 = g[n + 1 + i], g1[n + 1 + i], delta1[i], delta[i]
             delta1[i] = slope[i] * lam1 + bent2[i] * a2
             delta[i] = slope[i] * lam + bent1[i] * lam1 + bent[i] * a2 + bent2[i] * a12
-        matrix = slice(offset, offset + size * length)
-        add_outer(tape, at, inputs, here, weights_bar[matrix].reshape(size, length))
+        matrix = weights[offset : offset + size * length]
+        add_outer(tape, at, inputs, here, weights_bar[offset : offset + size * length].reshape(size, length))
         g[n:], g1[n:] = 0.0, 0.0
-        add_transposed(weights[matrix], delta, delta1, g[:length], g1[:length])
+        add_transposed(matrix, delta, g[:length])
+        add_transposed(matrix, delta1, g1[:length])
 
 
 @kernel
@@ -225,7 +233,8 @@ def taped(
 ) -> None:
     """∇Φ(z) → gradient and ∇²Φ(z) ż → product, (n,), as `convex.potential`; work keeps what `pull_back` needs."""
     n = layout[0]
-    inputs, tape, (g, g1) = tape_of(layout, work)
+    inputs, tape, lam = tape_of(layout, work)
+    g, g1 = lam[0], lam[1]
     scale, tangent = weights[2 : 2 + n], weights[2 + n : 2 + 2 * n]
     stiffness = weights[2 + 2 * n : 2 + 2 * n + n * n].reshape(n, n)
     inputs[:] = 0.0
@@ -261,7 +270,8 @@ def pull_back(
 ) -> None:
     """`potential_adjoint`, once per call of `taped` at the same z, ż, whose tape it uses up."""
     n = layout[0]
-    inputs, tape, (g, g1) = tape_of(layout, work)
+    inputs, tape, lam = tape_of(layout, work)
+    g, g1 = lam[0], lam[1]
     scale, tangent_bar = weights[2 : 2 + n], weights_bar[2 + n : 2 + 2 * n]
     spread(layout, inputs, 2, scale, product_bar)
     spread(layout, inputs, 3, scale, gradient_bar)

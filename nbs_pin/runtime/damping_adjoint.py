@@ -6,6 +6,7 @@ With x = Rz and y = Rf̄:  s = f̄ᵀD₀z + (Ty)ᵀ(Tx), so T̄ = (Ty)xᵀ + (T
 
 import numpy as np
 
+from nbs_pin.runtime.convex_adjoint import add_transposed
 from nbs_pin.runtime.damping import tanh
 from nbs_pin.runtime.jit import kernel
 from nbs_pin.runtime.layout import PART_HEADER
@@ -68,14 +69,11 @@ def tanh_reverse(
         at -= length
         h, total = tape[at : at + length], h_bar[:length]
         total[:] = 0.0
+        add_transposed(weights[offset : offset + size * length], out_bar[:size], total)
         for i in range(size):
-            row = weights[offset + i * length : offset + (i + 1) * length]
-            row_bar = weights_bar[offset + i * length : offset + (i + 1) * length]
-            delta = out_bar[i]
+            row_bar, delta = weights_bar[offset + i * length : offset + (i + 1) * length], out_bar[i]
             for j in range(length):
                 row_bar[j] += delta * h[j]
-            for j in range(length):
-                total[j] += delta * row[j]
         if layer > first:
             for j in range(layout[PART_HEADER + 3 * layer - 3]):
                 out_bar[j] = total[j] * (1.0 - h[j] * h[j])
@@ -116,7 +114,8 @@ def damping_adjoint(
     """Add the gradient of force_barᵀD(z)z by z and the weights of the damping: (n,) and as weights; m gets none."""
     n, paper, depth, widest = layout[0], layout[1], layout[2], layout[3]
     m, scale, below = weights[0], weights[1 : 1 + n], n * (n - 1) // 2
-    x, y, x_bar, y_bar, diagonal = work[: _VECTORS * n].reshape(_VECTORS, n)
+    x, y, x_bar, y_bar = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n]
+    diagonal = work[4 * n : 5 * n]
     room = work[_VECTORS * n :]
     h_bar, upper, lower = room[:widest], room[widest : 2 * widest + n], room[2 * widest + n : 3 * widest + n + below]
     tapes = room[3 * widest + n + below :]
