@@ -19,6 +19,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "nbs_pin.catalogue": ("ROBOT_NAMES",),
+    "nbs_pin.checkpoints": ("load", "save"),
     "nbs_pin.controllers.computed_torque": ("ComputedTorque",),
     "nbs_pin.controllers.controller": ("Controller", "MemorylessController"),
     "nbs_pin.controllers.neural_backstepping": ("NeuralBackstepping", "paper_controller"),

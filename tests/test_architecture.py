@@ -15,13 +15,14 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 # From the ground up; a module imports only its own floor and the floors below.
 FLOORS = [
-    {"exceptions", "arrays", "files", "progress"},
+    {"exceptions", "arrays", "files", "progress", "versions"},
     {"checks", "npz", "archives", "state", "runtime"},
     {"urdf_source", "urdf_checks", "urdf", "catalogue", "robot", "networks"},
     {"dynamics", "references", "reference_files", "disturbances", "metrics", "meshes", "visuals"},
     {"controllers", "plants"},
-    {"loop"},
+    {"loop", "checkpoints"},
     {"simulation"},
+    {"learning"},
     {"plotting", "replay_page"},
     {"studies"},
     {"cli"},

@@ -20,6 +20,7 @@ import nbs_pin as nbs
 from nbs_pin import cli, metrics
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_number
 from nbs_pin.studies import tracking
+from nbs_pin.versions import versions
 
 NBS_PIN = (sys.executable, "-m", "nbs_pin.cli")
 TRACKS = {
@@ -71,7 +72,7 @@ def test_track_leaves_four_files_that_say_the_same(tracked):
     last = metrics.rms_error(run, after=0.7 * run.t[-1]).tolist()
     assert summary["figures"]["rms_error_last_30_percent_rad"] == last
     assert summary["settings"] == run.info["settings"]
-    assert summary["versions"] == run.info["versions"] == tracking.versions()
+    assert summary["versions"] == run.info["versions"] == versions()
     assert summary["robot_sha256"] == run.robot_sha256 == nbs.load_robot(name).sha256
     assert summary["wall_time_s"] > 0.0
     assert (folder / "tracking.png").read_bytes().startswith(b"\x89PNG")

@@ -101,6 +101,7 @@ class Track:
         with notes.status(f"loading {self.robot}"):
             from nbs_pin.robot import load_robot
             from nbs_pin.studies import motions, tracking
+            from nbs_pin.versions import versions
 
             robot = load_robot(self.robot)
         if self.no_effort_limit or self.effort_limit is not None:
@@ -109,7 +110,7 @@ class Track:
         start = self._start(robot.nv)
         settings = self._settings(robot.source, self.duration or length)
         folder = self.out or Path("out") / f"track-{re.sub(r'[^A-Za-z0-9_.-]', '_', robot.name)}"
-        facts = {"settings": settings, "versions": tracking.versions(), "robot_sha256": robot.sha256}
+        facts = {"settings": settings, "versions": versions(), "robot_sha256": robot.sha256}
         _check_folder(folder, tracking.FILES, facts, self.force)
         with _folder(folder):
             run, wall_time = tracking.track(

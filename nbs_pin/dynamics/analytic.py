@@ -33,7 +33,7 @@ class AnalyticDynamics(DynamicsProvider):
                 " [kg] and lengths [m] must be positive."
             )
         (m1, m2), (l1, l2) = masses, lengths
-        self._robot, self._masses, self._lengths, self._gravity = robot, masses, lengths, gravity
+        self._robot, self.masses, self.lengths, self.gravity_constant = robot, masses, lengths, gravity
         self._shoulder = (m1 + m2) * l1 * l1  # inertia of both masses at the elbow about the shoulder
         self._forearm = m2 * l2 * l2
         self._coupling = m2 * l1 * l2
@@ -92,12 +92,12 @@ class AnalyticDynamics(DynamicsProvider):
         """Two point masses on joints about z, with gravity along −y; None for a subclass."""
         if type(self) is not AnalyticDynamics:
             return None
-        (upper, lower), along, z = self._lengths, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+        (upper, lower), along, z = self.lengths, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
         links = [
             Link(parent, False, z, np.eye(3), start * along, mass, length * along, np.zeros((3, 3)))
-            for parent, start, mass, length in zip((0, 1), (0.0, upper), self._masses, (upper, lower), strict=True)
+            for parent, start, mass, length in zip((0, 1), (0.0, upper), self.masses, (upper, lower), strict=True)
         ]
-        return pack_tree(links, np.array([0.0, -self._gravity, 0.0]))
+        return pack_tree(links, np.array([0.0, -self.gravity_constant, 0.0]))
 
     def potential_energy(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
         """V(q) [J], zero with the arm horizontal."""

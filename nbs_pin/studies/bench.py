@@ -26,7 +26,8 @@ from nbs_pin.robot import Robot, load_robot
 from nbs_pin.simulation import simulate, stream
 from nbs_pin.state import Reference
 from nbs_pin.studies.chains import serial_chain
-from nbs_pin.studies.tracking import ControllerName, build_controller, versions
+from nbs_pin.studies.tracking import ControllerName, build_controller
+from nbs_pin.versions import versions
 
 LAWS: tuple[ControllerName, ...] = ("nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid")
 CHAINS = (1, 2, 3, 5, 7, 10, 15, 20, 25, 30)

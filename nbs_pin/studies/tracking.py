@@ -2,17 +2,14 @@
 
 import json
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
-import nbs_pin
 from nbs_pin import metrics
 from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import Controller
@@ -179,12 +176,6 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
         beyond = np.maximum(robot.lower - run.q, run.q - robot.upper).reshape(-1, run.nv)
         values["outside_position_range_rad"] = np.maximum(beyond.max(axis=0), 0.0).tolist()
     return values
-
-
-def versions() -> dict[str, str]:
-    """Of Python, this package and the libraries that decide the numbers."""
-    libraries = {name: version(name) for name in ("pin", "mujoco", "numpy", "torch")}
-    return {"python": platform.python_version(), "nbs_pin": nbs_pin.__version__, **libraries}
 
 
 def write_results(run: Run, folder: str | Path, robot: Robot, summary: dict[str, Any]) -> Path:

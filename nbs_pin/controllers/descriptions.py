@@ -1,0 +1,223 @@
+"""A controller as settings that JSON can store and tensors, and the same controller back.
+
+Every part of a controller is its class and the arguments of its constructor. `_KINDS` says for each class where each
+argument is found: plain settings and further parts in the description, arrays among the tensors of the `state_dict`.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from operator import attrgetter
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+import torch
+from torch import nn
+
+from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.pd import PD
+from nbs_pin.controllers.pid import PID
+from nbs_pin.controllers.slotine_li import SlotineLi
+from nbs_pin.dynamics.analytic import AnalyticDynamics
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.networks.activations import SmoothedReLU, Squareplus
+from nbs_pin.networks.damping import Damping
+from nbs_pin.networks.potential import Potential
+from nbs_pin.robot import Robot
+
+Settings: TypeAlias = dict[str, Any]
+"""A part in JSON: its `kind`, its settings by name, and its own parts."""
+
+
+class Tensors(dict[str, torch.Tensor]):
+    """Tensors by name; asking for one that is not there raises ArgumentError."""
+
+    def __missing__(self, name: str) -> torch.Tensor:
+        raise ArgumentError(f"there is no tensor '{name}'")
+
+    def below(self, prefix: str) -> "Tensors":
+        """Those whose names begin with the prefix, named without it."""
+        return Tensors({name.removeprefix(prefix): x for name, x in self.items() if name.startswith(prefix)})
+
+    def widths(self, stem: str) -> tuple[int, ...]:
+        """Sizes of the hidden layers; the weights of the layers are named stem0, stem1 and so on."""
+        count = sum(name.startswith(stem) for name in self)
+        return tuple(len(self[f"{stem}{i}"]) for i in range(count))[:-1]
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Where the arguments of a constructor come from."""
+
+    make: Callable[..., Any]
+    settings: Mapping[str, str] = field(default_factory=dict)
+    """Arguments stored as they are, and the attributes that hold them."""
+    parts: Mapping[str, str] = field(default_factory=dict)
+    """Arguments that are parts or None, and the attributes that hold them."""
+    arrays: Callable[[Tensors], Mapping[str, Any]] = lambda tensors: {}
+    """Arguments that are found among the part's tensors."""
+    sequence: Callable[[list[Any]], Any] = np.array
+    """What a stored list is handed over as."""
+
+
+def describe(controller: Controller) -> tuple[Settings, Tensors]:
+    """The controller in JSON and copies of the tensors of its `state_dict`: what `rebuild` makes the same one of.
+
+    Raises ArgumentError for a controller with parts that are not the package's own, or numbers that are not finite.
+    """
+    settings = cast(Settings, _described(controller))
+    module = cast(nn.Module, controller)
+    tensors = Tensors({name: x.detach().cpu().clone().contiguous() for name, x in module.state_dict().items()})
+    robot = attrgetter("dynamics.robot")(controller) if "dynamics" in settings else None
+    copy = cast(nn.Module, rebuild(settings, tensors, robot))
+    for mine, theirs in zip(module.modules(), copy.modules(), strict=True):
+        if type(mine) is not type(theirs):
+            raise ArgumentError(f"a {type(mine).__name__} cannot be stored in place of a {type(theirs).__name__}")
+    return settings, tensors
+
+
+def described_robot(description: Any) -> Settings | None:
+    """The description of the arm that a controller is for, None where it knows no arm.
+
+    Raises ArgumentError for a description that `describe` would not give.
+    """
+    if "dynamics" not in _kind_of(description).parts:
+        return None
+    _kind_of(description["dynamics"])
+    robot = description["dynamics"].get("robot")
+    if robot is not None and _kind_of(robot).make is not Robot:
+        raise ArgumentError(f"the arm of the dynamics is a {robot['kind']}")
+    return robot
+
+
+def rebuild(description: Settings, tensors: Mapping[str, torch.Tensor], robot: Robot | None) -> Controller:
+    """The controller that `describe` described, with these tensors as its `state_dict`.
+
+    robot: stands where the description has an arm. Raises ArgumentError when description and tensors do not make one
+    controller: a setting or tensor too many or too few, of another shape or kind, or out of its range.
+    """
+    try:
+        controller = _rebuild(description, Tensors(tensors), robot)
+    except (AttributeError, TypeError, ValueError, RuntimeError) as error:  # constructors given what is none of theirs
+        raise ArgumentError(f"settings and tensors make no controller: {error}") from error
+    module = cast(nn.Module, controller)
+    _check_tensors(tensors, module)
+    module.load_state_dict(tensors)
+    return controller
+
+
+def _described(part: Any) -> Settings | None:
+    """The part in JSON, None for None."""
+    if part is None:
+        return None
+    kind = _KINDS.get(type(part).__name__)
+    if kind is None or kind.make is not type(part):
+        raise ArgumentError(f"a {type(part).__name__} cannot be stored, only {', '.join(_KINDS)} and no subclass")
+    settings = {name: _plain(attrgetter(place)(part)) for name, place in kind.settings.items()}
+    parts = {name: _described(attrgetter(place)(part)) for name, place in kind.parts.items()}
+    return {"kind": type(part).__name__, **settings, **parts}
+
+
+def _rebuild(description: Any, tensors: Tensors, robot: Robot | None) -> Any:
+    if description is None:
+        return None
+    kind = _kind_of(description)
+    if kind.make is Robot:
+        return robot
+    given = {name: description[name] for name in kind.settings}
+    settings = {name: _revived(x, kind.sequence) if isinstance(x, list) else x for name, x in given.items()}
+    parts = {name: _rebuild(description[name], tensors.below(f"{place}."), robot) for name, place in kind.parts.items()}
+    return kind.make(**settings, **parts, **kind.arrays(tensors))
+
+
+def _kind_of(description: Any) -> _Kind:
+    """The kind of part that is described; raises ArgumentError unless it is a known one with just its settings."""
+    name = description.get("kind") if isinstance(description, dict) else None
+    kind = _KINDS.get(str(name))
+    if kind is None:
+        raise ArgumentError(f"kind {name!r} is unknown; this version knows {', '.join(_KINDS)}")
+    wrong = description.keys() ^ {"kind", *kind.settings, *kind.parts}
+    if wrong:
+        raise ArgumentError(f"'{min(wrong)}' of {name} is {'unknown' if min(wrong) in description else 'missing'}")
+    return kind
+
+
+def _check_tensors(tensors: Mapping[str, torch.Tensor], module: nn.Module) -> None:
+    """Raise ArgumentError unless they are a state of the module, its fixed numbers included."""
+    expected, fixed = module.state_dict(), dict(module.named_buffers())
+    wrong = sorted(tensors.keys() ^ expected.keys())
+    if wrong:
+        raise ArgumentError(f"tensor '{wrong[0]}' is {'superfluous' if wrong[0] in tensors else 'missing'}")
+    for name, x in expected.items():
+        found = tensors[name]
+        if (found.shape, found.dtype) != (x.shape, x.dtype):
+            stated = [f"{tuple(t.shape)} {t.dtype}" for t in (found, x)]
+            raise ArgumentError(f"tensor '{name}' is {stated[0]}, expected {stated[1]}")
+        bad = int((~torch.isfinite(found)).sum())
+        if bad:
+            raise ArgumentError(f"tensor '{name}' has {bad} numbers that are not finite")
+        if name in fixed and not torch.equal(found, x):
+            raise ArgumentError(f"tensor '{name}' is not what its constructor makes")
+
+
+def _plain(value: Any) -> Any:
+    """Numbers, text and lists for JSON, which has no infinity: null stands for it."""
+    if isinstance(value, np.ndarray | tuple):
+        return [_plain(x) for x in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    return None if value == math.inf else value
+
+
+def _revived(values: list[Any], sequence: Callable[[list[Any]], Any]) -> Any:
+    return sequence([math.inf if x is None else x for x in values])
+
+
+def _same(*names: str, **elsewhere: str) -> dict[str, str]:
+    """Arguments that attributes of the same name hold, and those that others do."""
+    return {name: name for name in names} | elsewhere
+
+
+def _gains(*names: str) -> Callable[[Tensors], Mapping[str, Any]]:
+    return lambda t: {name: t[f"gains.{name}.nominal"].numpy() for name in names}
+
+
+def _backstepping(t: Tensors) -> Mapping[str, Any]:
+    return {"rate": t["rate.nominal"], "least_share": float(t["rate.least_share"])}
+
+
+def _potential(t: Tensors) -> Mapping[str, Any]:
+    gain = {"stiffness": t["stiffness.nominal"], "least_share": float(t["stiffness.least_share"])}
+    return gain | {"scale": t["scale"], "widths": t.widths("network.wx")}
+
+
+def _damping(t: Tensors) -> Mapping[str, Any]:
+    sizes = {"nv": len(t["scale"]), "scale": t["scale"], "widths": t.widths("diagonal.w")}
+    if "floor.nominal" not in t:
+        return sizes
+    return sizes | {"floor": t["floor.nominal"], "least_share": float(t["floor.least_share"])}
+
+
+_LAW = _same("dynamics", "friction")
+_KINDS: dict[str, _Kind] = {
+    kind.make.__name__: kind
+    for kind in (
+        _Kind(NeuralBackstepping, _same("inertial_rate"), _LAW | _same("potential", "damping"), _backstepping),
+        _Kind(SlotineLi, {}, _LAW, _gains("rate", "gain")),
+        _Kind(ComputedTorque, {}, _LAW, _gains("kp", "kd")),
+        _Kind(PD, _same("feedforward"), _LAW, _gains("kp", "kd")),
+        _Kind(PID, _same("effort_limit", "filter_time", "continuous"), {}, _gains("kp", "ki", "kd")),
+        _Kind(Potential, _same("form"), _same(activation="network.activation"), _potential),
+        _Kind(Damping, _same("form", "m"), {}, _damping),
+        _Kind(SmoothedReLU, _same("d")),
+        _Kind(Squareplus, _same("b")),
+        _Kind(JointFriction, _same("viscous", "coulomb", "transition")),
+        _Kind(PinocchioDynamics, {}, _same("robot")),
+        _Kind(AnalyticDynamics, _same("masses", "lengths", gravity="gravity_constant"), _same("robot"), sequence=tuple),
+        _Kind(Robot, _same("name", "source", "options", "sha256", "effort_limit")),
+    )
+}
