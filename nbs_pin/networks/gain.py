@@ -1,5 +1,6 @@
 """Gains that training may change, but never below a share of where they began."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
@@ -57,7 +58,7 @@ class Gain(nn.Module):
 
 def positive_definite(name: str, matrix: Float[Array, "n n"]) -> Float[torch.Tensor, "n n"]:
     """The matrix as a float64 tensor; raises ArgumentError unless it is symmetric positive definite."""
-    tensor = torch.as_tensor(matrix, dtype=torch.float64).clone()
+    tensor = _copied(matrix)
     square = tensor.ndim == 2 and tensor.shape[0] == tensor.shape[1]
     if not square or not bool(torch.isfinite(tensor).all()) or not torch.equal(tensor, tensor.T):
         raise ArgumentError(
@@ -71,9 +72,12 @@ def positive_definite(name: str, matrix: Float[Array, "n n"]) -> Float[torch.Ten
 
 def positive_scale(name: str, scale: Float[Array, " n"] | None, nv: int) -> Float[torch.Tensor, " n"]:
     """The scale as a float64 tensor of shape (nv,), ones for None; raises ArgumentError unless all are positive."""
-    tensor = (
-        torch.ones(nv, dtype=torch.float64) if scale is None else torch.as_tensor(scale, dtype=torch.float64).clone()
-    )
+    tensor = torch.ones(nv, dtype=torch.float64) if scale is None else _copied(scale)
     if tensor.shape != (nv,) or not bool((tensor > 0.0).all() & torch.isfinite(tensor).all()):
         raise ArgumentError(f"{name} is {tensor.tolist()}; give {nv} positive numbers.")
     return tensor
+
+
+def _copied(x: Array) -> torch.Tensor:
+    """A float64 tensor of its own; numpy copies first, because torch warns of arrays that cannot be written."""
+    return x.detach().clone().double() if is_torch_array(x) else torch.from_numpy(np.array(x, dtype=float))
