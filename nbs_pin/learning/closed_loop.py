@@ -96,7 +96,7 @@ def motions(controller: Controller, batch: Batch, engine: Engine | None = None) 
     scene = _scene(controller, batch.loop)
     if scene is None:
         raise ArgumentError(
-            f"{type(controller).__name__} on {batch.loop.plant!r} has no kernels; take engine='torch', which any law has."
+            f"{type(controller).__name__} on {batch.loop.plant!r} has no kernels; take engine='torch', as any law can."
         )
     law = controller.packed_law(numpy=False)
     return Motions(*_ByKernels.apply(law.weights, law.layout, batch, scene))  # type: ignore[no-untyped-call]
