@@ -40,6 +40,8 @@ _HOMES = {
     "nbs_pin.dynamics.pinocchio": ("PinocchioDynamics",),
     "nbs_pin.dynamics.provider": ("DynamicsProvider",),
     "nbs_pin.exceptions": ("NbsPinError",),
+    "nbs_pin.learning.costs": ("TimeOutside", "TorqueAware", "squared_error"),
+    "nbs_pin.learning.training": ("Training", "train"),
     "nbs_pin.networks.damping": ("Damping",),
     "nbs_pin.networks.potential": ("Potential",),
     "nbs_pin.plants.dynamics_plant": ("DynamicsPlant",),

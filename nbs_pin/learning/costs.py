@@ -30,8 +30,8 @@ class TorqueAware:
     """z1ᵀz1 + rate²·ż1ᵀż1 + excess·Σ max(|τ_i|/limit_i − 1, 0)² + effort·Σ (τ_i/limit_i)².
 
     limit: torque per joint [N·m], a number or (n,); where it is inf the torque is free. rate [s]: how far ahead an
-    error counts. excess, effort [rad²]: the price of asking for more than the limit, and of torque as such. What exceeds a
-    limit is never applied and so has no gradient of its own: `excess` gives it one.
+    error counts. excess, effort [rad²]: the price of asking for more than the limit, and of torque as such. What
+    exceeds a limit is never applied and so has no gradient of its own: `excess` gives it one.
     Raises ArgumentError for numbers out of range.
     """
 

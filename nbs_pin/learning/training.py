@@ -92,8 +92,8 @@ def train(
     The loop is that of `simulate`, with its arguments `duration`, `period`, `effort_limit` and `lookahead`, and the
     gradient is the exact one, through law, model, torque limits and integrator. Source: paper section IV-C.
 
-    plant: a `DynamicsPlant`. references: each is followed from every start. starts: configurations (starts, n) at rest, a
-    pair (q0, v0), or how many to draw, each joint within ±start_error [rad] of the reference's start. held_out: the
+    plant: a `DynamicsPlant`. references: each is followed from every start. starts: configurations (starts, n) at rest,
+    a pair (q0, v0), or how many to draw, each joint within ±start_error [rad] of the reference's start. held_out: the
     same for motions that are never trained on and that choose the best epoch; None draws a quarter as many (none when
     starts are given). plant_step [s]: None takes one step per period, unlike `simulate`. disturbance: constant torque.
     cost: l; None takes `TorqueAware` with the effort limits. gains: whether S, Λ and D₀ are trained too, never
@@ -257,13 +257,13 @@ class _Trainer:
         self._set(stepped)
         at.epoch += 1
 
-    def _closure(self) -> torch.Tensor:
+    def _closure(self) -> float:
         self.optimiser.zero_grad()
         loss = self.task.loss()
         if not torch.isfinite(loss):
             raise _NotFinite
         loss.backward()  # type: ignore[no-untyped-call]
-        return loss.detach()
+        return float(loss.detach())
 
     def _note(self, value: float) -> None:
         """Write the cost of the present parameters down, and keep them when they are the best so far."""
@@ -309,9 +309,8 @@ class _Trainer:
             best.load_state_dict(at.best)
         for parameter in best.parameters():
             parameter.grad = None
-        return Training(
-            best, *(np.array(x, dtype=float) for x in (at.history, at.held_out)), at.best_epoch, stopped, at.seconds
-        )
+        history, held_out = (np.array(x, dtype=float) for x in (at.history, at.held_out))
+        return Training(best, history, held_out, at.best_epoch, stopped, at.seconds)
 
     def _save(self) -> None:
         if self.task.checkpoint is None:
