@@ -195,6 +195,17 @@ def test_damping_adjoint_is_the_gradient(n, widths, form, seed):
     assert_close(weights_bar, expected[1])
 
 
+@pytest.mark.parametrize(("n", "widths"), [*SIZES, (12, (3,)), (2, (41, 2)), (9, (2, 50))])
+def test_adjoints_stay_within_their_scratch_space(n, widths):
+    one, parts = np.ones(n), (random_potential(n, widths, "smooth"), random_damping(n, widths, "paper"))
+    law = pack_law(BACKSTEPPING, (one, one), None, (one, one, 0.1), 1.0, *parts)
+    size = adjoint_workspace(law)
+    room, found = guarded(size + 100), np.zeros((2, n))
+    law_adjoint(*states(n, seed=0), *law, room[:size], one, one, one, *found, np.zeros_like(law.weights))
+    assert np.isfinite(found).all()
+    assert np.isnan(room[size:]).all()
+
+
 @pytest.mark.parametrize("n", [1, 2, 7])
 @pytest.mark.parametrize(("form", "activation"), [("smooth", Squareplus(0.3)), ("paper", SmoothedReLU(0.4))])
 def test_networks_as_they_are_read(n, form, activation):

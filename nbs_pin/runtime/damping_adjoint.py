@@ -58,10 +58,10 @@ def tanh_reverse(
     out_bar: np.ndarray,
     h_bar: np.ndarray,
     weights_bar: np.ndarray,
-) -> None:
-    """What is gained per x → h_bar[:n] and, added to weights_bar, per weight; tape as `tanh_forward` left it.
+) -> int:
+    """What is gained per x → h_bar[:n] and, added to weights_bar, per weight; returns where its tape began.
 
-    out_bar, as wide as a layer, is used up.
+    tape: up to the last number that `tanh_forward` wrote. out_bar, as wide as a layer, is used up.
     """
     at = len(tape)
     for layer in range(first + depth - 1, first - 1, -1):
@@ -77,6 +77,7 @@ def tanh_reverse(
         if layer > first:
             for j in range(layout[PART_HEADER + 3 * layer - 3]):
                 out_bar[j] = total[j] * (1.0 - h[j] * h[j])
+    return at
 
 
 @kernel
@@ -117,23 +118,23 @@ def damping_adjoint(
     x, y, x_bar, y_bar = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n]
     diagonal = work[4 * n : 5 * n]
     room = work[_VECTORS * n :]
-    h_bar, upper, lower = room[:widest], room[widest : 2 * widest + n], room[2 * widest + n : 3 * widest + n + below]
-    tapes = room[3 * widest + n + below :]
+    h_bar, out = room[:widest], room[widest : 3 * widest + n + below]
+    second, tapes, used = widest + n, room[3 * widest + n + below :], 0
+    upper, lower = out[:second], out[second:]
     for i in range(n):
         x[i], y[i] = scale[i] * z[i], scale[i] * force_bar[i]
-    middle = tanh_forward(0, depth, layout, weights, x, tapes, upper)
-    end = middle + tanh_forward(depth, depth, layout, weights, x, tapes[middle:], lower)
+    for k in range(2):
+        used += tanh_forward(k * depth, depth, layout, weights, x, tapes[used:], out[k * second :])
     for i in range(n):
         diagonal[i] = upper[i] if not paper else (m if upper[i] < 0.0 else upper[i] + m)
     factor_adjoint(x, y, diagonal, lower, x_bar, y_bar)
     for i in range(n):
         upper[i] = diagonal[i] if not paper or upper[i] > 0.0 else 0.0
-    tanh_reverse(0, depth, layout, weights, tapes[:middle], upper, h_bar, weights_bar)
+    for k in range(1, -1, -1):
+        used = tanh_reverse(k * depth, depth, layout, weights, tapes[:used], out[k * second :], h_bar, weights_bar)
+        for i in range(n):
+            x_bar[i] += h_bar[i]
     for i in range(n):
-        x_bar[i] += h_bar[i]
-    tanh_reverse(depth, depth, layout, weights, tapes[middle:end], lower, h_bar, weights_bar)
-    for i in range(n):
-        x_bar[i] += h_bar[i]
         z_bar[i] += scale[i] * x_bar[i]
         weights_bar[1 + i] += z[i] * x_bar[i] + force_bar[i] * y_bar[i]
     floor, floor_bar = weights[1 + n :], weights_bar[1 + n :]
