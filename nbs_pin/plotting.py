@@ -1,7 +1,8 @@
-"""Figures of runs, drawn without any global plotting state."""
+"""Figures of runs, and the style of every picture; drawn without any global plotting state."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +43,19 @@ _STYLE: Any = {
 }
 
 
-def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]], path: str | Path) -> Path:
-    """Draws cost [µs] against number of joints, a line per series, and writes the picture (PNG); returns its path."""
+@contextmanager
+def picture(path: str | Path, width: float, height: float, dpi: int = 120) -> Iterator[Figure]:
+    """An empty figure of that size [inch] in the style of every picture, written to the path (PNG) when the block ends.
+
+    Written whole or, when drawing fails, not at all; raises OSError when it cannot be written.
+    """
     with rc_context(_STYLE):
-        figure = Figure(figsize=(6.4, 4.0), dpi=120, layout="constrained")
+        figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
         FigureCanvasAgg(figure)
-        axes = figure.add_subplot()
-        for (name, values), colour in zip(series.items(), (ACTUAL, REFERENCE, TORQUE, ERROR), strict=False):
-            axes.plot(joints, values, "o-", color=colour, markersize=3.5, label=name)
-        axes.set(xlabel="joints", ylabel="one control step, median [µs]", xlim=(0, None), ylim=(0, None))
-        axes.legend(frameon=False, loc="upper left")
+        yield figure
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png")
-    return write_whole(path, buffer.getvalue())
+    write_whole(path, buffer.getvalue())
 
 
 def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
@@ -74,9 +75,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
     cut = np.abs(asked) > run.effort_limit
     tau[-1], cut[-1] = np.nan, False  # asked for, never applied
     fraction = float(np.ravel(saturated_fraction(run))[start])
-    with rc_context(_STYLE):
-        figure = Figure(figsize=(13.0, 1.15 + 1.5 * run.nv), dpi=120, layout="constrained")
-        FigureCanvasAgg(figure)
+    with picture(path, 13.0, 1.15 + 1.5 * run.nv) as figure:
         grid = figure.subplots(run.nv, 3, sharex=True, squeeze=False)
         for joint, (position_axes, error_axes, torque_axes) in enumerate(grid):
             _draw_position(position_axes, run.t, q[:, joint], q_ref[:, joint])
@@ -84,9 +83,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
             _draw_torque(torque_axes, run.t, tau[:, joint], float(run.effort_limit[joint]), cut[:, joint])
             position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color="#1d2733")
         _dress(figure, grid, run, fraction)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png")
-    return write_whole(path, buffer.getvalue())
+    return Path(path)
 
 
 def _draw_position(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarray, " rows"],

@@ -23,14 +23,14 @@ FLOORS = [
     {"loop", "checkpoints"},
     {"simulation"},
     {"learning"},
-    {"plotting", "replay_page"},
+    {"plotting", "charts", "replay_page"},
     {"studies"},
     {"cli"},
 ]
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
 HOMES = {
     "mujoco": {"plants.mujoco_plant"},
-    "matplotlib": {"plotting"},
+    "matplotlib": {"plotting", "charts"},
     "meshcat": {"replay_page"},
     "yourdfpy": {"visuals"},
     "trimesh": {"meshes", "visuals", "replay_page"},
