@@ -156,13 +156,20 @@ def _arm(path: str | Path, stored: Settings, given: Robot | None) -> Robot:
             raise RobotError(f"{message}that file was changed: give the arm as it was then as robot=….")
         raise ArgumentError(f"{message}give that arm, or build a controller for this one.")
     limits = [math.inf if limit is None else limit for limit in stored["effort_limit"]]
-    same = given is not None or robot.effort_limit.tolist() == limits
-    return robot if same else robot.with_effort_limit(limits)
+    if given is not None or robot.effort_limit.tolist() == limits:
+        return robot
+    with _refusing(path):
+        return robot.with_effort_limit(limits)
 
 
 def _loaded(path: str | Path, stored: Settings) -> Robot:
     try:
-        return load_robot(stored["source"], **stored["options"])
+        with _refusing(path):
+            return load_robot(stored["source"], **stored["options"])
+    except TypeError as error:
+        raise FileFormatError(
+            f"{path}: its arm is loaded with options that this version does not know ({error}); give it as robot=…."
+        ) from error
     except RobotNotFound as error:
         raise RobotNotFound(
             f"{path} is for the arm '{stored['name']}' of {stored['source']}, which is not there; give it as "

@@ -29,4 +29,4 @@ class SimulationDiverged(NbsPinError, ArithmeticError):
 
 
 class FileFormatError(NbsPinError, ValueError):
-    """A data file (run, reference) that is not what it should be; names file, row or key, and remedy."""
+    """A data file (run, reference, checkpoint) that is not what it should be; names file, row or key, and remedy."""

@@ -89,8 +89,14 @@ def described_robot(description: Any) -> Settings | None:
         return None
     _kind_of(description["dynamics"])
     robot = description["dynamics"].get("robot")
-    if robot is not None and _kind_of(robot).make is not Robot:
+    if robot is None:
+        return None
+    if _kind_of(robot).make is not Robot:
         raise ArgumentError(f"the arm of the dynamics is a {robot['kind']}")
+    kinds = {"name": str, "source": str, "options": dict, "sha256": str, "effort_limit": list}
+    wrong = [name for name, kind in kinds.items() if not isinstance(robot[name], kind)]
+    if wrong:
+        raise ArgumentError(f"'{wrong[0]}' of the arm is {robot[wrong[0]]!r}")
     return robot
 
 

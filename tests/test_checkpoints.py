@@ -1,0 +1,609 @@
+"""Controllers on disk: the same to the last bit when they come back, for their own arm, or not at all."""
+
+import copy
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+import nbs_pin as nbs
+from nbs_pin.archives import read_archive, write_archive
+from nbs_pin.checkpoints import FORMAT, TrainingState, about, read_checkpoint, write_checkpoint
+from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.controllers.neural_backstepping import DAMPINGS, NeuralBackstepping, paper_controller
+from nbs_pin.controllers.pd import PD
+from nbs_pin.controllers.pid import PID
+from nbs_pin.controllers.slotine_li import SlotineLi
+from nbs_pin.dynamics.analytic import AnalyticDynamics
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.exceptions import ArgumentError, FileFormatError, RobotError, RobotNotFound
+from nbs_pin.files import ABANDONED, whole_file
+from nbs_pin.networks.activations import SmoothedReLU, Squareplus
+from nbs_pin.networks.convex import FICNN
+from nbs_pin.networks.damping import Damping
+from nbs_pin.networks.potential import POTENTIALS, Potential
+from nbs_pin.npz import LARGEST
+from nbs_pin.robot import load_robot
+from nbs_pin.state import Reference
+from nbs_pin.studies.chains import serial_chain
+from nbs_pin.versions import versions
+from tests.test_networks import randomise
+
+TWO_LINK, PANDA, KINOVA = (load_robot(name) for name in ("two_link", "panda", "kinova"))
+
+
+def by_hand(robot):
+    """Every part built with something other than its default."""
+    dynamics, n = PinocchioDynamics(robot), robot.nv
+    root = np.random.default_rng(1).normal(size=(n, n))
+    potential = Potential(
+        root @ root.T + np.eye(n), widths=(5, 3), activation=SmoothedReLU(0.3), scale=np.arange(1.0, n + 1),
+        least_share=0.25, seed=3,
+    )  # fmt: skip
+    damping = Damping(n, floor=0.1 * np.eye(n), widths=(4,), scale=np.full(n, 0.7), gain=0.5, least_share=0.0, seed=4)
+    friction = JointFriction(np.full(n, 0.3), np.arange(float(n)), transition=0.02)
+    return NeuralBackstepping(
+        dynamics, potential, damping, rate=np.full(n, 0.3), inertial_rate=2.0, friction=friction, least_share=0.9
+    )
+
+
+def analytic(robot):
+    dynamics = AnalyticDynamics((1.5, 0.7), (0.4, 1.1), 3.7, robot=robot)
+    return NeuralBackstepping.for_robot(robot, dynamics)
+
+
+LAWS = {
+    **{
+        f"nbs_{form}_{damping}": lambda robot, form=form, damping=damping: NeuralBackstepping.for_robot(
+            robot, potential=form, damping=damping, least_share=0.2
+        )
+        for form in POTENTIALS
+        for damping in DAMPINGS
+    },
+    "by_hand": by_hand,
+    "paper": lambda robot: paper_controller(PinocchioDynamics(robot), m=0.3),
+    "slotine_li": lambda robot: SlotineLi.for_robot(robot, friction=JointFriction.of(robot)),
+    "computed_torque": ComputedTorque.for_robot,
+    "pd_plus": PD.for_robot,
+    "pd_gravity": lambda robot: PD.for_robot(robot, feedforward="gravity"),
+    "pid": PID.for_robot,
+}
+
+
+def torques(controller, rows=20):
+    """Torques in random states; of a law with memory, after three steps."""
+    rng = np.random.default_rng(5)
+    q, v, q_ref, v_ref, a_ref = rng.normal(scale=2.0, size=(5, rows, controller.nv))
+    memory = controller.initial_memory(q)
+    for _ in range(3):
+        tau, memory = controller.step(memory, q, v, Reference(q_ref, v_ref, a_ref), 0.01)
+    return tau
+
+
+def scrambled(controller, seed=0):
+    randomise(controller, seed)
+    return controller
+
+
+def saved(path, robot=TWO_LINK, **settings):
+    nbs.save(scrambled(NeuralBackstepping.for_robot(robot, **settings)), path)
+    return path
+
+
+@pytest.fixture
+def path(tmp_path):
+    return saved(tmp_path / "arm.nbs")
+
+
+@pytest.mark.parametrize("robot", [TWO_LINK, PANDA, KINOVA], ids=lambda r: r.name)
+@pytest.mark.parametrize("law", LAWS)
+def test_a_controller_comes_back_to_the_last_bit(tmp_path, law, robot):
+    controller = scrambled(LAWS[law](robot))
+    nbs.save(controller, tmp_path / "arm.nbs")
+    again = nbs.load(tmp_path / "arm.nbs")
+    assert type(again) is type(controller)
+    np.testing.assert_array_equal(torques(again), torques(controller))
+    np.testing.assert_array_equal(torques(again.compile()), torques(controller.compile()))
+    before, after = controller.state_dict(), again.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert [p.requires_grad for p in again.parameters()] == [True] * len(list(controller.parameters()))
+    assert [path.name for path in tmp_path.iterdir()] == ["arm.nbs"]
+
+
+@pytest.mark.parametrize("robot", [None, TWO_LINK], ids=["no_robot", "robot"])
+def test_equations_in_closed_form_come_back(tmp_path, robot):
+    controller = paper_controller(AnalyticDynamics((2.0, 1.0), (0.5, 1.5), 1.62, robot))
+    nbs.save(controller, tmp_path / "arm.nbs")
+    again = nbs.load(tmp_path / "arm.nbs", robot)
+    np.testing.assert_array_equal(torques(again), torques(controller))
+    assert again.dynamics.robot is robot
+
+
+@pytest.mark.parametrize("activation", [SmoothedReLU(0.2), Squareplus(0.3)], ids=repr)
+def test_activations_come_back(tmp_path, activation):
+    potential = Potential(np.eye(2), activation=activation)
+    controller = NeuralBackstepping(AnalyticDynamics(), potential, Damping(2, floor=np.eye(2)))
+    nbs.save(controller, tmp_path / "arm.nbs")
+    assert nbs.load(tmp_path / "arm.nbs").potential.network.activation == activation
+
+
+def test_an_arm_of_one_joint_comes_back(tmp_path):
+    robot = serial_chain(1)
+    controller = scrambled(NeuralBackstepping.for_robot(robot))
+    nbs.save(controller, tmp_path / "arm.nbs")
+    np.testing.assert_array_equal(torques(nbs.load(tmp_path / "arm.nbs", robot)), torques(controller))
+
+
+def test_the_random_numbers_of_others_are_left_alone(path):
+    torch.manual_seed(3)
+    expected = torch.rand(3)
+    torch.manual_seed(3)
+    nbs.save(nbs.load(path), path)
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_what_a_file_says_of_itself(tmp_path):
+    controller = NeuralBackstepping.for_robot(PANDA)
+    nbs.save(controller, tmp_path / "arm.nbs", info={"seed": 7})
+    said = about(tmp_path / "arm.nbs")
+    assert (said["info"], said["versions"]) == ({"seed": 7}, versions())
+    assert said["controller"]["dynamics"]["robot"]["sha256"] == PANDA.sha256
+    with zipfile.ZipFile(tmp_path / "arm.nbs") as archive:
+        assert archive.namelist() == ["manifest.json", "controller.json", "controller.safetensors"]
+        assert archive.testzip() is None
+
+
+def test_the_same_controller_is_the_same_file(tmp_path):
+    files = [saved(tmp_path / name).read_bytes() for name in ("one.nbs", "two.nbs")]
+    assert files[0] == files[1]
+
+
+# The arm
+
+
+def test_effort_limits_come_back_unless_an_arm_is_given(tmp_path):
+    weak = PANDA.with_effort_limit([50.0, 60.0, 70.0, np.inf, 8.0, 9.0, 10.0])
+    saved(tmp_path / "arm.nbs", weak)
+    assert nbs.load(tmp_path / "arm.nbs").dynamics.robot.effort_limit.tolist() == weak.effort_limit.tolist()
+    assert nbs.load(tmp_path / "arm.nbs", PANDA).dynamics.robot is PANDA
+
+
+def test_the_arm_is_loaded_as_it_was(tmp_path):
+    robot = load_robot("panda", gravity=1.62, lock=["panda_finger_joint1", "panda_finger_joint2", "panda_joint7"])
+    saved(tmp_path / "arm.nbs", robot)
+    assert nbs.load(tmp_path / "arm.nbs").dynamics.robot.sha256 == robot.sha256
+
+
+@pytest.mark.parametrize("other", ["ur5", "panda_on_the_moon", "xarm7"])
+def test_another_arm_is_refused(tmp_path, other):
+    robot = load_robot("panda", gravity=1.62) if other == "panda_on_the_moon" else load_robot(other)
+    with pytest.raises(ArgumentError, match=r"is for the arm 'panda' .* has other links, joints, limits or gravity"):
+        nbs.load(saved(tmp_path / "arm.nbs", PANDA), robot)
+
+
+def test_a_law_without_a_model_is_for_its_number_of_joints(tmp_path):
+    nbs.save(PID.for_robot(PANDA), tmp_path / "arm.nbs")
+    assert nbs.load(tmp_path / "arm.nbs", PANDA).nv == 7
+    with pytest.raises(ArgumentError, match="is for 7 joints and ur5 has 6"):
+        nbs.load(tmp_path / "arm.nbs", load_robot("ur5"))
+
+
+def test_an_arm_whose_file_is_gone_is_asked_for(tmp_path):
+    robot = serial_chain(2)
+    with pytest.raises(RobotNotFound, match=r"is for the arm 'chain_2' of .*chain_2.urdf, which is not there; give it"):
+        nbs.load(saved(tmp_path / "arm.nbs", robot))
+    assert nbs.load(tmp_path / "arm.nbs", robot).nv == 2
+
+
+def test_an_arm_whose_file_has_changed_is_refused(tmp_path):
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(Path(TWO_LINK.urdf.path).read_text())
+    saved(tmp_path / "arm.nbs", load_robot(urdf))
+    urdf.write_text(urdf.read_text().replace('<mass value="1', '<mass value="2'))
+    with pytest.raises(RobotError, match="that file was changed"):
+        nbs.load(tmp_path / "arm.nbs")
+
+
+# What cannot be saved leaves the old file alone
+
+
+class OwnFriction(JointFriction):
+    pass
+
+
+class OwnPotential(Potential):
+    pass
+
+
+class OwnLaw(SlotineLi):
+    pass
+
+
+class OwnActivation(Squareplus):
+    pass
+
+
+class OwnNetwork(FICNN):
+    pass
+
+
+class OwnDynamics(AnalyticDynamics):
+    pass
+
+
+def own_network():
+    controller = paper_controller(AnalyticDynamics())
+    controller.potential.network.__class__ = OwnNetwork
+    return controller
+
+
+def not_a_number():
+    controller = paper_controller(AnalyticDynamics())
+    controller.damping.diagonal.w0.data[0, 0] = np.nan
+    return controller
+
+
+def changed_share():
+    controller = SlotineLi.for_robot(TWO_LINK)
+    controller.gains["rate"].least_share.fill_(0.5)
+    return controller
+
+
+def law(potential=None, friction=None):
+    potential = potential or Potential(np.eye(2))
+    return NeuralBackstepping(AnalyticDynamics(), potential, Damping(2, floor=np.eye(2)), friction=friction)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: OwnLaw.for_robot(TWO_LINK), "a OwnLaw cannot be stored"),
+        (lambda: paper_controller(OwnDynamics()), "a OwnDynamics cannot be stored"),
+        (lambda: law(OwnPotential(np.eye(2))), "a OwnPotential cannot be stored"),
+        (lambda: law(Potential(np.eye(2), activation=OwnActivation())), "a OwnActivation cannot be stored"),
+        (lambda: law(friction=OwnFriction(np.ones(2), np.ones(2))), "a OwnFriction cannot be stored"),
+        (lambda: paper_controller(AnalyticDynamics()).compile(), "a CompiledController cannot be stored"),
+        (own_network, "a OwnNetwork cannot be stored in place of a FICNN"),
+        (not_a_number, r"tensor 'damping.diagonal.w0' has 1 numbers that are not finite"),
+        (changed_share, r"tensor 'gains.rate.least_share' is not what its constructor makes"),
+        (lambda: paper_controller(AnalyticDynamics()).float(), r"is .*float32, expected .*float64"),
+    ],
+)
+def test_what_cannot_come_back_is_not_saved(path, make, message):
+    before = path.read_bytes()
+    with pytest.raises(ArgumentError, match=message):
+        nbs.save(make(), path)
+    assert path.read_bytes() == before
+    assert [file.name for file in path.parent.iterdir()] == ["arm.nbs"]
+
+
+@pytest.mark.parametrize("fact", [np.nan, np.inf, {1, 2}, Path("x")], ids=repr)
+def test_notes_that_json_cannot_say_are_refused(path, fact):
+    with pytest.raises(ArgumentError, match="cannot be stored as JSON"):
+        nbs.save(PID.for_robot(TWO_LINK), path, info={"fact": fact})
+    with pytest.raises(ArgumentError, match="cannot be stored as JSON"):
+        write_checkpoint(path, PID.for_robot(TWO_LINK), TrainingState({}, {"fact": fact}))
+    with pytest.raises(ArgumentError, match="'x' of the training is not finite"):
+        write_checkpoint(path, PID.for_robot(TWO_LINK), TrainingState({"x": torch.tensor(torch.inf)}))
+    assert isinstance(nbs.load(path), NeuralBackstepping)
+
+
+# Damage
+
+
+def test_a_flipped_byte_anywhere_is_refused(path):
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    names = int.from_bytes(content[-64 - 6 : -64 - 2], "little")  # where the directory of the archive begins
+    positions = [*rng.integers(0, len(content), 200), *range(names, len(content)), *range(60)]
+    for position in positions:
+        damaged = bytearray(content)
+        damaged[position] ^= int(rng.integers(1, 256))
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError, match=r"arm.nbs: .*; (take|write) "):
+            nbs.load(path)
+
+
+def test_a_file_cut_or_drawn_out_anywhere_is_refused(path):
+    content = path.read_bytes()
+    rng = np.random.default_rng(1)
+    for length in [0, 1, len(content) - 1, *rng.integers(0, len(content), 200)]:
+        path.write_bytes(content[:length])
+        with pytest.raises(FileFormatError, match=r"arm.nbs: (not an intact|was changed after)"):
+            nbs.load(path)
+    for more in (b"\0", content, rng.bytes(100)):
+        for longer in (content + more, more + content):
+            path.write_bytes(longer)
+            with pytest.raises(FileFormatError):
+                nbs.load(path)
+
+
+def test_the_damaged_entry_is_named(path):
+    content = path.read_bytes()
+    for name, byte in {"controller.json": b'"kind"', "controller.safetensors": b'"dtype"'}.items():
+        path.write_bytes(content.replace(byte, byte.upper(), 1))
+        with pytest.raises(FileFormatError, match=name):
+            nbs.load(path)
+
+
+class Payload:
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return Path.touch, (self.marker,)
+
+
+@pytest.mark.parametrize("kind", ["pickle", "text", "zip", "run", "bomb", "huge"])
+def test_other_files_are_refused(tmp_path, kind):
+    path, marker = tmp_path / "other.nbs", tmp_path / "marker"
+    if kind == "pickle":
+        torch.save({"weights": Payload(marker)}, path)
+    elif kind == "text":
+        path.write_text("weights\n" * 1000)
+    elif kind == "run":
+        np.savez(npz := io.BytesIO(), q=np.zeros(3))
+        path.write_bytes(npz.getvalue())
+    elif kind == "huge":
+        with path.open("wb") as file:
+            file.truncate(LARGEST + 1)
+    else:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED if kind == "bomb" else zipfile.ZIP_STORED) as archive:
+            archive.writestr("controller.json", bytes(10**7) if kind == "bomb" else "{}")
+    with pytest.raises(FileFormatError, match=r"other.nbs: (the format|not an intact|has \d+ bytes)"):
+        nbs.load(path)
+    assert not marker.exists()
+
+
+def test_no_file_is_no_file(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        nbs.load(tmp_path / "none.nbs")
+
+
+def reseal(path, entries):
+    write_archive(path, FORMAT, entries)
+
+
+def with_settings(path, change):
+    """The file again, well sealed, after `change` of what controller.json says."""
+    entries = read_archive(path, FORMAT)
+    document = json.loads(entries["controller.json"])
+    change(document)
+    reseal(path, entries | {"controller.json": json.dumps(document).encode()})
+
+
+def with_tensors(path, change):
+    entries = read_archive(path, FORMAT)
+    tensors = safetensors.torch.load(entries["controller.safetensors"])
+    change(tensors)
+    reseal(path, entries | {"controller.safetensors": safetensors.torch.save(tensors)})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.update(more=torch.zeros(2)), "tensor 'more' is superfluous"),
+        (lambda t: t.pop("potential.network.b1"), r"tensor 'potential.network.b1' is missing"),
+        (lambda t: t.pop("potential.network.wx0"), r"there is no tensor 'network.wx0'"),
+        (lambda t: t.pop("rate.nominal"), r"there is no tensor 'rate.nominal'"),
+        (lambda t: t.update({"damping.lower.w1": torch.zeros(3, 3)}), r"'damping.lower.w1' is \(3, 3\).*expected"),
+        (lambda t: t.update({"rate.change": t["rate.change"].float()}), "is .*float32, expected .*float64"),
+        (lambda t: t["potential.network.wy1"].__setitem__(0, torch.nan), "has 32 numbers that are not finite"),
+        (lambda t: t["rate.nominal"].neg_(), "give 2 positive numbers"),
+        (lambda t: t["rate.nominal"].fill_(torch.inf), "give 2 positive numbers"),
+        (lambda t: t["potential.stiffness.nominal"].neg_(), "give a positive definite matrix"),
+        (lambda t: t["potential.stiffness.least_share"].fill_(1.5), r"give a number in \[0, 1\)"),
+        (lambda t: t["damping.scale"].zero_(), "give 2 positive numbers"),
+    ],
+)
+def test_tensors_that_make_no_controller_are_refused(path, change, message):
+    with_tensors(path, change)
+    with pytest.raises(FileFormatError, match=rf"arm.nbs: .*{message}.*; save the controller again"):
+        nbs.load(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["controller"].update(kind="Sorcery"), "kind 'Sorcery' is unknown"),
+        (lambda d: d["controller"].update(kind=["PID"]), "is unknown"),
+        (lambda d: d["controller"].update(apha=1.0), "'apha' of NeuralBackstepping is unknown"),
+        (lambda d: d["controller"].pop("friction"), "'friction' of NeuralBackstepping is missing"),
+        (lambda d: d["controller"].update(inertial_rate="fast"), "make no controller"),
+        (lambda d: d["controller"].update(inertial_rate=-1.0), "give a number ≥ 0"),
+        (lambda d: d["controller"]["potential"].update(form="rough"), "potential 'rough' is unknown"),
+        (lambda d: d["controller"]["potential"]["activation"].update(b=-1.0), "give a positive number"),
+        (lambda d: d["controller"].update(potential=None), "make no controller"),
+        (lambda d: d["controller"].update(dynamics=d["controller"]["potential"]["activation"]), "make no controller"),
+        (lambda d: d["controller"]["dynamics"].update(robot={"kind": "Squareplus", "b": 1.0}), "is a Squareplus"),
+        (lambda d: d["controller"]["dynamics"].update(robot=None), "make no controller"),
+        (lambda d: d["controller"]["dynamics"]["robot"].update(sha256=1), "'sha256' of the arm is 1"),
+        (lambda d: d["controller"]["dynamics"]["robot"].update(effort_limit=[1.0]), "effort limit is"),
+        (lambda d: d["controller"]["dynamics"]["robot"]["options"].update(spin=1), "options that this version"),
+        (
+            lambda d: d["controller"]["dynamics"]["robot"]["options"].update(gravity=[1.0, 2.0]),
+            r"gravity is .1.0, 2.0.",
+        ),
+        (lambda d: d.update(controller=[]), "kind None is unknown"),
+        (lambda d: d.update(more=1), "not what we write"),
+        (lambda d: d.pop("versions"), "not what we write"),
+    ],
+)
+def test_settings_that_make_no_controller_are_refused(path, change, message):
+    with_settings(path, change)
+    with pytest.raises(FileFormatError, match=rf"arm.nbs: .*{message}"):
+        nbs.load(path)
+
+
+@pytest.mark.parametrize(
+    "text", ['{"a": 1, "a": 2}', '{"a": NaN}', '{"a": 1e999}', "[1]", "", "[" * 100_000, '{"a": ' + "9" * 5000 + "}"]
+)
+def test_json_that_we_do_not_write_is_refused(path, text):
+    reseal(path, read_archive(path, FORMAT) | {"controller.json": text.encode()})
+    with pytest.raises(FileFormatError, match=r"controller.json"):
+        nbs.load(path)
+
+
+def test_entries_and_formats_that_are_not_ours_are_refused(path):
+    entries = read_archive(path, FORMAT)
+    write_archive(path, "nbs_pin checkpoint 9", entries)
+    with pytest.raises(FileFormatError, match="the format is 'nbs_pin checkpoint 9', expected 'nbs_pin checkpoint 1'"):
+        nbs.load(path)
+    for wrong in ({**entries, "code.py": b""}, {**entries, "training.json": b"{}"}, {"controller.json": b"{}"}, {}):
+        reseal(path, wrong)
+        with pytest.raises(FileFormatError, match="not what a checkpoint holds"):
+            nbs.load(path)
+    reseal(path, {**entries, "controller.safetensors": b"\xff" * 20})
+    with pytest.raises(FileFormatError, match=r"'controller.safetensors' is damaged"):
+        nbs.load(path)
+
+
+# Training that goes on
+
+
+class Trainer:
+    """Adam with drawn steps: everything a training has that must be carried on."""
+
+    def __init__(self, controller):
+        self.controller, self.epoch, self.history = controller, 0, []
+        self.optimiser = torch.optim.Adam(controller.parameters(), lr=0.01)
+        self.torch_draw = torch.Generator().manual_seed(1)
+        self.numpy_draw = np.random.default_rng(2)
+
+    def epochs(self, count):
+        for _ in range(count):
+            q = torch.randn(5, 5, 2, generator=self.torch_draw, dtype=torch.float64)
+            loss = self.numpy_draw.uniform() * (self.controller.torque(*q) ** 2).mean()
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.optimiser.step()
+            self.epoch, self.history = self.epoch + 1, [*self.history, loss.item()]
+        return self
+
+    def write(self, path):
+        state = self.optimiser.state_dict()["state"]
+        tensors = {f"{i}.{key}": x for i, moments in state.items() for key, x in moments.items()}
+        tensors["draw"] = self.torch_draw.get_state()
+        facts = {"epoch": self.epoch, "history": self.history, "draw": self.numpy_draw.bit_generator.state}
+        write_checkpoint(path, self.controller, TrainingState(tensors, facts), info={"seed": 1})
+
+    @classmethod
+    def read(cls, path):
+        controller, training = read_checkpoint(path)
+        trainer = cls(controller)
+        tensors, facts = dict(training.tensors), training.facts
+        trainer.epoch, trainer.history = facts["epoch"], facts["history"]
+        trainer.numpy_draw.bit_generator.state = facts["draw"]
+        trainer.torch_draw.set_state(tensors.pop("draw"))
+        state = trainer.optimiser.state_dict()
+        for name, x in tensors.items():
+            state["state"].setdefault(int(name.split(".")[0]), {})[name.split(".")[1]] = x
+        trainer.optimiser.load_state_dict(state)
+        return trainer
+
+
+def test_a_training_goes_on_bit_for_bit(tmp_path):
+    controller = paper_controller(AnalyticDynamics())
+    whole = Trainer(copy.deepcopy(controller)).epochs(6)
+    Trainer(controller).epochs(3).write(tmp_path / "training.ckpt")
+    resumed = Trainer.read(tmp_path / "training.ckpt").epochs(3)
+    assert (resumed.epoch, resumed.history) == (6, whole.history)
+    for mine, theirs in zip(resumed.controller.parameters(), whole.controller.parameters(), strict=True):
+        assert torch.equal(mine, theirs)
+    forgetful = Trainer(nbs.load(tmp_path / "training.ckpt")).epochs(3)
+    assert forgetful.history != whole.history[3:]
+
+
+def test_a_training_keeps_the_kinds_of_its_tensors(tmp_path):
+    tensors = {
+        "moment": torch.randn(3, 2, dtype=torch.float64).T,
+        "step": torch.tensor(3.0),
+        "random": torch.get_rng_state(),
+        "count": torch.arange(3),
+        "mask": torch.tensor([True, False]),
+        "none": torch.zeros(0, 4),
+    }
+    write_checkpoint(tmp_path / "t.ckpt", PID.for_robot(TWO_LINK), TrainingState(tensors, {"best": None, "n": 2**100}))
+    training = read_checkpoint(tmp_path / "t.ckpt").training
+    assert training.facts == {"best": None, "n": 2**100}
+    assert training.tensors.keys() == tensors.keys()
+    for name, x in tensors.items():
+        assert training.tensors[name].dtype == x.dtype
+        assert torch.equal(training.tensors[name], x)
+    assert read_checkpoint(saved(tmp_path / "arm.nbs")).training is None
+
+
+# Killed while writing
+
+WRITER = """
+import os, signal, sys
+import torch
+import nbs_pin as nbs
+torch.set_num_threads(1)
+controller = nbs.paper_controller(nbs.AnalyticDynamics())
+nbs.save(controller, sys.argv[1], info={"count": 0})
+print("ready", flush=True)
+for _ in sys.stdin:  # every line asks for one more writer
+    child = os.fork()
+    if child == 0:
+        count = 0
+        while True:
+            count += 1
+            with torch.no_grad():
+                for parameter in controller.parameters():
+                    parameter.fill_(count)
+            nbs.save(controller, sys.argv[1], info={"count": count})
+    print(child, flush=True)
+    print(os.waitpid(child, 0)[1], flush=True)
+"""
+
+
+def test_a_writer_killed_at_any_moment_leaves_a_whole_file(tmp_path):
+    path = tmp_path / "arm.nbs"
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    with writer:
+        assert writer.stdout.readline() == "ready\n"
+        rng, counts = np.random.default_rng(0), []
+        for _ in range(20):
+            writer.stdin.write("more\n")
+            writer.stdin.flush()
+            child = int(writer.stdout.readline())
+            time.sleep(rng.uniform(0.02, 0.15))
+            os.kill(child, signal.SIGKILL)
+            assert int(writer.stdout.readline()) == signal.SIGKILL
+            counts.append(about(path)["info"]["count"])
+            weights = {float(x) for p in nbs.load(path).parameters() for x in p.detach().flatten()}
+            assert counts[-1] == 0 or weights == {counts[-1]}
+        writer.stdin.close()
+    assert writer.returncode == 0
+    assert len(set(counts)) > 1
+
+
+def test_drafts_of_killed_writers_are_cleared_away(tmp_path):
+    names = [".arm.nbs.0123abcd.tmp", ".arm.nbs.4567abcd.tmp", ".arm.nbs.notes.tmp", ".leg.nbs.0123abcd.tmp"]
+    old, young, *others = [tmp_path / name for name in names]
+    for draft in (old, young, *others):
+        draft.write_bytes(b"half")
+    folder = tmp_path / ".arm.nbs.89ababcd.tmp"
+    folder.mkdir()
+    for draft in (old, *others, folder):
+        os.utime(draft, (time.time() - 2 * ABANDONED,) * 2)
+    with whole_file(tmp_path / "arm.nbs") as file:
+        file.write(b"whole")
+    assert not old.exists()
+    assert young.exists()
+    assert folder.is_dir()
+    assert all(other.exists() for other in others)
