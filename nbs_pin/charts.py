@@ -3,7 +3,14 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from nbs_pin.plotting import ACTUAL, ERROR, REFERENCE, TORQUE, picture
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+
+from nbs_pin.metrics import PAPER_THRESHOLD, squared_error
+from nbs_pin.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, TORQUE, picture
+from nbs_pin.state import Run
 
 
 def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]], path: str | Path) -> Path:
@@ -15,3 +22,53 @@ def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]],
         axes.set(xlabel="joints", ylabel="one control step, median [µs]", xlim=(0, None), ylim=(0, None))
         axes.legend(frameon=False, loc="upper left")
     return Path(path)
+
+
+def plot_training(
+    history: Float[np.ndarray, " epochs"],
+    held_out: Float[np.ndarray, " epochs"],
+    before: Run,
+    after: Run,
+    path: str | Path,
+) -> Path:
+    """Draws what training changed and writes the picture (PNG); returns its path.
+
+    Left: mean cost of the training and the held-out motions by epoch (`Training`), the best epoch marked. Right:
+    ‖z1‖ over time of the same motions under the controller before and after, their median, and the worst, at each time.
+    """
+    with picture(path, 11.0, 4.2) as figure:
+        costs, errors = figure.subplots(1, 2)
+        _draw_costs(costs, history, held_out)
+        _draw_errors(errors, {"before": before, "after": after})
+    return Path(path)
+
+
+def _draw_costs(axes: Axes, history: Float[np.ndarray, " epochs"], held_out: Float[np.ndarray, " epochs"]) -> None:
+    for name, values, colour in (("training", history, ACTUAL), ("held out", held_out, REFERENCE)):
+        axes.plot(values, color=colour, label=name)
+    chosen = held_out if held_out.size else history
+    best, colour = int(np.nanargmin(chosen)), REFERENCE if held_out.size else ACTUAL
+    lowered = f"best, {1.0 - chosen[best] / chosen[0]:.0%} lower"
+    axes.plot(best, chosen[best], "o", color=colour, markersize=5, label=lowered)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(MaxNLocator(6))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set(xlabel="epoch", xlim=(0, max(len(history) - 1, 1)))
+    axes.set_title("mean cost of a motion", loc="left")
+    axes.legend(frameon=False)
+
+
+def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
+    for (name, run), colour in zip(runs.items(), (LIMIT, ACTUAL), strict=True):
+        size = np.sqrt(squared_error(run)).reshape(len(run.t), -1)
+        axes.plot(run.t, np.median(size, axis=1), color=colour, linewidth=1.8, label=f"{name}, median")
+        axes.plot(run.t, size.max(axis=1), color=colour, linewidth=1.0, linestyle=(0, (4, 2)), label=f"{name}, worst")
+        axes.fill_between(run.t, np.median(size, axis=1), size.max(axis=1), color=colour, alpha=0.12, linewidth=0)
+    mark = float(np.sqrt(PAPER_THRESHOLD))
+    axes.axhline(mark, color=ERROR, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.annotate("converged", (1.0, mark), xycoords=("axes fraction", "data"), ha="right", va="bottom", color=ERROR)
+    axes.set_yscale("log")
+    axes.set(xlabel="time [s]", xlim=(0.0, run.t[-1]))
+    axes.set_title(f"‖error‖ of {size.shape[1]} fresh motions [rad]", loc="left")
+    axes.legend(frameon=False)

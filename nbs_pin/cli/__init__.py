@@ -20,16 +20,18 @@ from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.robots import Robots
 from nbs_pin.cli.track import Track
+from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import OptionError
 from nbs_pin.exceptions import NbsPinError
 
 Command: TypeAlias = (
     Annotated[Track, tyro.conf.subcommand("track")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Robots, tyro.conf.subcommand("robots")]
 )
-NAMES = ("track", "replay", "bench", "robots")
+NAMES = ("track", "train", "replay", "bench", "robots")
 BAD_INPUT, INTERRUPTED = 2, 130
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` shows the options of a command; "

@@ -28,6 +28,33 @@ def print_tracking(console: Console, title: str, figures: dict[str, Any], wall_t
         console.print(line, highlight=False, markup=False)
 
 
+def print_training(console: Console, title: str, figures: dict[str, Any]) -> None:
+    """What training changed, a row per figure; `figures` as `studies.training.figures` gives them."""
+    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    table.add_column("")
+    for heading in ("before", "after"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name in ("training", "held-out"):
+        costs = figures[f"{name.replace('-', '_')}_cost"]
+        table.add_row(Text(f"mean cost of {name} motions"), *(f"{cost:.4g}" for cost in costs))
+    both = figures["before"], figures["after"]
+    for name in ("median", "worst"):
+        times = (on[f"convergence_time_{name}_s"] for on in both)
+        table.add_row(Text(f"converged, {name} [s]"), *("never" if t is None else f"{t:.3f}" for t in times))
+    table.add_row(Text("peak torque [N·m]"), *(f"{on['peak_torque_Nm']:.4g}" for on in both))
+    table.add_row(Text("RMS torque [N·m]"), *(f"{on['rms_torque_Nm']:.4g}" for on in both))
+    table.add_row(Text("some joint at its limit"), *(f"{on['saturated_fraction']:.2%}" for on in both))
+    console.print(table)
+    ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
+    for line in (
+        f"held-out cost lowered by {figures['held_out_cost_lowered_by']:.1%}; "
+        f"converged is ‖error‖ < 0.1 rad to the end, from {figures['fresh_starts']} fresh starts",
+        f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
+        f"the best after {figures['best_epoch']}",
+    ):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
 def converged(figures: dict[str, Any]) -> str:
     """When the error came to stay below the paper's threshold, in words."""
     time = figures["convergence_time_s"]

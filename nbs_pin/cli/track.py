@@ -1,12 +1,8 @@
 """`nbs-pin track`: an arm follows a motion; run, summary, picture and replay land in a folder."""
 
-import contextlib
 import dataclasses
 import hashlib
-import json
 import math
-import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,20 +10,18 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
+from nbs_pin.cli.folders import check_folder, default, folder_for, made
 from nbs_pin.cli.tables import print_tracking
 from nbs_pin.cli.values import (
     OptionError,
     configuration,
+    controller_text,
     disturbance_text,
     integer,
     number,
     parse_disturbance,
     plain_numbers,
 )
-
-
-def _default(hint: str) -> Any:
-    return tyro.conf.arg(help_behavior_hint=f"(default: {hint})")
 
 
 @dataclass(frozen=True)
@@ -41,14 +35,15 @@ class Track:
     """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
     plant: Literal["mujoco", "pinocchio"] = "mujoco"
     """What simulates the arm."""
-    controller: Literal["nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid"] = "nbs"
-    """The law. nbs-paper is the paper's own on two_link, its networks with this arm's gains elsewhere."""
+    controller: Annotated[str, controller_text()] = "nbs"
+    """The law by name, or a controller saved by nbs-pin train, with its own gains. nbs-paper is the paper's own on
+    two_link, its networks with this arm's gains elsewhere."""
     reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
     """What to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints."""
     frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0
     """Frequency of the sinusoid [rad/s]."""
     duration: Annotated[
-        float | None, number("--duration", above=0.0, most=100_000.0, unit="s"), _default("10, or the file's length")
+        float | None, number("--duration", above=0.0, most=100_000.0, unit="s"), default("10, or the file's length")
     ] = None
     """Simulated time, a whole number of periods [s]."""
     period: Annotated[float, number("--period", least=1e-5, most=0.1, unit="s")] = 0.001
@@ -57,7 +52,7 @@ class Track:
     """Rate at which errors decay [rad/s]; the paper's own law on two_link has none."""
     start_error: Annotated[float, number("--start-error", least=0.0, most=math.pi, unit="rad")] = 0.0
     """Added to every joint with alternating sign, the arm then starting at rest [rad]; 0 starts on the motion."""
-    start: Annotated[str | None, configuration("--start"), _default("on the motion")] = None
+    start: Annotated[str | None, configuration("--start"), default("on the motion")] = None
     """Where the arm starts at rest [rad], one number per joint: --start=-0.1,0.2."""
     disturbance: Annotated[str, disturbance_text()] = "none"
     """Torque on every joint [N·m]: none, constant:5, square:5@8, sine:5@8 (@ rad/s) or noise:0.5 (standard deviation).
@@ -65,7 +60,7 @@ class Track:
     joint_friction: Literal["drop", "keep"] = "drop"
     """Joint friction of the URDF: left out, or acting and fed forward by every law with a model."""
     effort_limit: Annotated[
-        float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), _default("the arm's")
+        float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), default("the arm's")
     ] = None
     """Largest torque of every joint [N·m]."""
     no_effort_limit: bool = False
@@ -73,21 +68,21 @@ class Track:
     integrator: Annotated[
         Literal["rk4", "euler", "implicitfast", "semi_implicit_euler"] | None,
         tyro.conf.arg(metavar="{rk4,euler,implicitfast,semi_implicit_euler}"),
-        _default("the plant's usual one"),
+        default("the plant's usual one"),
     ] = None
     """How the plant is integrated. mujoco: rk4, euler (semi-implicit), implicitfast; pinocchio: rk4, euler (explicit),
     semi_implicit_euler."""
     plant_step: Annotated[
-        float | None, number("--plant-step", least=1e-6, most=0.1, unit="s"), _default("at most 0.001")
+        float | None, number("--plant-step", least=1e-6, most=0.1, unit="s"), default("at most 0.001")
     ] = None
     """Step of the plant, of which a period is a whole number [s]."""
     lookahead: Annotated[
-        float | None, number("--lookahead", least=0.0, most=0.1, unit="s"), _default("half a period")
+        float | None, number("--lookahead", least=0.0, most=0.1, unit="s"), default("half a period")
     ] = None
     """How far ahead of the measured state the law is evaluated [s]; 0 is the plain sampled law."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
     """Of network weights and noise."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), _default("out/track-ROBOT")] = None
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), default("out/track-ROBOT")] = None
     """Folder for the results."""
     force: bool = False
     """Replace the results of another run in that folder."""
@@ -109,10 +104,10 @@ class Track:
         motion, length = motions.motion_of(self.reference, robot, frequency=self.frequency, period=self.period)
         start = self._start(robot.nv)
         settings = self._settings(robot.source, self.duration or length)
-        folder = self.out or Path("out") / f"track-{re.sub(r'[^A-Za-z0-9_.-]', '_', robot.name)}"
+        folder = folder_for(self.out, "track", robot.name)
         facts = {"settings": settings, "versions": versions(), "robot_sha256": robot.sha256}
-        _check_folder(folder, tracking.FILES, facts, self.force)
-        with _folder(folder):
+        check_folder(folder, tracking.FILES, facts, self.force)
+        with made(folder):
             run, wall_time = tracking.track(
                 robot,
                 plant=self.plant,
@@ -151,36 +146,8 @@ class Track:
         """Everything that decides the run, as JSON can store it."""
         settings = dataclasses.asdict(self) | {"robot": robot, "duration": duration}
         del settings["out"], settings["force"]
-        if Path(self.reference).is_file():
-            settings["reference_sha256"] = hashlib.sha256(Path(self.reference).read_bytes()).hexdigest()
+        for name in ("reference", "controller"):
+            path = Path(settings[name])
+            if path.is_file():
+                settings[f"{name}_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
         return settings
-
-
-@contextlib.contextmanager
-def _folder(folder: Path) -> Iterator[None]:
-    """The folder, made before any long work so that a bad path is known at once; unmade again if it stays empty."""
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        yield
-    finally:
-        for path in made:
-            if path.is_dir() and not any(path.iterdir()):
-                path.rmdir()
-
-
-def _check_folder(folder: Path, names: tuple[str, ...], same: dict[str, Any], force: bool) -> None:
-    """Raises OptionError when the folder holds results that are not those of the very same run, unless forced."""
-    if folder.exists() and not folder.is_dir():
-        raise OptionError(f"--out '{folder}' is a file; give a folder.")
-    present = [name for name in names if (folder / name).exists()]
-    if not present or force:
-        return
-    try:
-        summary = json.loads((folder / "summary.json").read_text())
-    except (OSError, ValueError):
-        summary = None  # results without a readable summary are another run's
-    if not isinstance(summary, dict) or {key: summary.get(key) for key in same} != same:
-        raise OptionError(
-            f"'{folder}' holds {present[0]} of another run; give another --out, or --force to replace it."
-        )

@@ -1,5 +1,6 @@
 """Values of options, read strictly: a number that cannot be meant is refused in one sentence that names the flag."""
 
+import difflib
 import math
 import re
 from collections.abc import Callable
@@ -12,6 +13,10 @@ from nbs_pin.exceptions import NbsPinError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INTEGER = re.compile(r"[0-9]+")
+LAWS = ("nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid")
+"""Laws by name; those that `studies.tracking.build_controller` knows, which is too heavy to ask here."""
+SAVED = ".nbs"
+"""How the name of a saved controller ends."""
 DisturbanceKind: TypeAlias = Literal["constant", "square", "sine", "noise"]
 
 
@@ -45,12 +50,39 @@ def configuration(flag: str) -> PrimitiveConstructorSpec[str]:
     return _spec("Q1,Q2,…", parse, str)
 
 
-def integer(flag: str, most: int) -> PrimitiveConstructorSpec[int]:
-    """A whole number in [0, most] for tyro; raises OptionError for any other text."""
+def positive_list(flag: str, most: float, unit: str) -> PrimitiveConstructorSpec[str]:
+    """The text of numbers in (0, most] split by commas for tyro, read by `plain_numbers`; raises OptionError else."""
+
+    def parse(words: list[str]) -> str:
+        values = plain_numbers(words[0])
+        if values is None or not all(0.0 < value <= most for value in values):
+            raise OptionError(
+                f"{flag} is '{words[0]}'; give numbers above 0 and at most {most:g} {unit}: {flag} 0.5,1."
+            )
+        return words[0]
+
+    return _spec("W1,W2,…", parse, str)
+
+
+def controller_text() -> PrimitiveConstructorSpec[str]:
+    """The name of a law, or a path that ends in .nbs, for tyro; raises OptionError for any other text."""
+
+    def parse(words: list[str]) -> str:
+        if words[0] not in LAWS and not words[0].endswith(SAVED):
+            near = difflib.get_close_matches(words[0], LAWS, n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            raise OptionError(f"no controller '{words[0]}'; {hint}give {', '.join(LAWS)}, or a {SAVED} file.")
+        return words[0]
+
+    return _spec(f"{{{','.join(LAWS)},FILE{SAVED}}}", parse, str)
+
+
+def integer(flag: str, most: int, least: int = 0) -> PrimitiveConstructorSpec[int]:
+    """A whole number in [least, most] for tyro; raises OptionError for any other text."""
 
     def parse(words: list[str]) -> int:
-        if not _INTEGER.fullmatch(words[0]) or int(words[0][:20]) > most:
-            raise OptionError(f"{flag} is '{words[0]}'; give a whole number from 0 to {most}.")
+        if not _INTEGER.fullmatch(words[0]) or not least <= int(words[0][:20]) <= most:
+            raise OptionError(f"{flag} is '{words[0]}'; give a whole number from {least} to {most}.")
         return int(words[0])
 
     return _spec("INTEGER", parse, str)

@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 import numpy as np
 
 from nbs_pin import metrics
+from nbs_pin.checkpoints import load
 from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
@@ -117,15 +118,19 @@ def build_controller(
     friction: JointFriction | None = None,
     seed: int = 0,
 ) -> Controller:
-    """The law of that name, tuned for the arm by its own `for_robot`.
+    """The law of that name, tuned for the arm by its own `for_robot`; a name that ends in .nbs is a saved controller.
 
     bandwidth [rad/s], period [s]. friction: fed forward by every law with a model. seed: of the network weights.
     "nbs-paper" is the paper's own law (`paper_controller`) on the bundled two_link, and its networks with this arm's
-    gains on every other. Raises ArgumentError for an unknown name or numbers out of range.
+    gains on every other. A saved controller is as it was saved, whatever the other arguments say.
+    Raises ArgumentError for an unknown name, numbers out of range or a file for another arm; errors of `load` else.
     """
+    if name.endswith(".nbs"):
+        return load(name, robot)
     if name not in get_args(ControllerName):
         raise ArgumentError(
-            f"controller '{name}' is unknown; choose one of {', '.join(get_args(ControllerName))}, or build one."
+            f"controller '{name}' is unknown; choose one of {', '.join(get_args(ControllerName))}, a .nbs "
+            "file, or build one."
         )
     if name == "nbs-paper" and robot.source == "two_link":
         return paper_controller(PinocchioDynamics(robot), seed=seed)

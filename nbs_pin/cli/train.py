@@ -1,0 +1,128 @@
+"""`nbs-pin train`: a controller learns through the closed loop, and says what it gained on starts it never saw."""
+
+import dataclasses
+import hashlib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+from nbs_pin.cli.folders import check_folder, default, folder_for, made
+from nbs_pin.cli.tables import print_training
+from nbs_pin.cli.values import OptionError, controller_text, integer, number, plain_numbers, positive_list
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a controller through the closed loop, and write controller.nbs, summary.json and learning.png.
+
+    Ctrl-C stops early and keeps the best epoch; --resume goes on from there. Track with the result:
+    nbs-pin track panda --controller out/train-panda/controller.nbs
+
+    Example: nbs-pin train panda --epochs 60 --out out/panda
+    """
+
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
+    """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
+    controller: Annotated[str, controller_text()] = "nbs"
+    """The law to begin with, by name, or a saved controller to train on."""
+    frequencies: Annotated[str, positive_list("--frequencies", most=1000.0, unit="rad/s")] = "0.5,1,2"
+    """Sinusoids to follow, fitted to the arm: their frequencies [rad/s], split by commas."""
+    starts: Annotated[int, integer("--starts", least=1, most=100_000)] = 32
+    """Starts to train from, shared out over the frequencies; a quarter as many are held out to choose the epoch."""
+    start_error: Annotated[float, number("--start-error", above=0.0, most=math.pi, unit="rad")] = 0.5
+    """Starts are at rest, each joint within this of the motion's start [rad]."""
+    duration: Annotated[float, number("--duration", above=0.0, most=1000.0, unit="s")] = 1.0
+    """Length of the motions trained on, a whole number of periods [s]."""
+    period: Annotated[float, number("--period", least=1e-4, most=0.1, unit="s")] = 0.005
+    """Control period [s]."""
+    epochs: Annotated[int, integer("--epochs", least=1, most=1_000_000)] = 60
+    """Steps of the optimiser."""
+    cost: Literal["torque-aware", "squared-error", "time-outside"] = "torque-aware"
+    """What is made small: error, its rate and torque beyond the limits; the error alone, as in the paper; or the time
+    spent 0.1 rad and more away."""
+    optimiser: Literal["adam", "lbfgs"] = "lbfgs"
+    """How: L-BFGS with line search, or Adam with its step halved five times in all."""
+    learning_rate: Annotated[
+        float | None, number("--learning-rate", above=0.0, most=100.0, unit=""), default("adam 0.01, lbfgs 1")
+    ] = None
+    """Step of the optimiser."""
+    patience: Annotated[int | None, integer("--patience", least=1, most=1_000_000), default("all epochs")] = None
+    """Stop after so many epochs without a lower held-out cost."""
+    fixed_gains: bool = False
+    """Train the networks alone and leave every gain as it is."""
+    bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
+    """Rate at which errors decay before training [rad/s]."""
+    effort_limit: Annotated[
+        float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), default("the arm's")
+    ] = None
+    """Largest torque of every joint [N·m]."""
+    no_effort_limit: bool = False
+    """Let torques grow without limit."""
+    seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
+    """Of network weights and starts."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), default("out/train-ROBOT")] = None
+    """Folder for the results."""
+    resume: bool = False
+    """Go on with the training in that folder, as if it had never stopped."""
+    force: bool = False
+    """Replace the results of another training in that folder."""
+
+    def run(self, console: Console, notes: Console) -> None:
+        """Trains, writes and prints; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
+        if self.no_effort_limit and self.effort_limit is not None:
+            raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
+        with notes.status(f"loading {self.robot}"):
+            from nbs_pin.robot import load_robot
+            from nbs_pin.studies import training
+            from nbs_pin.versions import versions
+
+            robot = load_robot(self.robot)
+        if self.no_effort_limit or self.effort_limit is not None:
+            robot = robot.with_effort_limit(self.effort_limit or math.inf)
+        folder = folder_for(self.out, "train", robot.name)
+        facts = {"settings": self._settings(robot.source), "versions": versions(), "robot_sha256": robot.sha256}
+        if not self.resume:
+            whole = facts | {"interrupted": False}
+            check_folder(folder, (training.CHECKPOINT, *training.FILES), whole, self.force)
+        with made(folder):
+            result = training.train_robot(
+                robot,
+                controller=self.controller,
+                bandwidth=self.bandwidth,
+                frequencies=tuple(plain_numbers(self.frequencies) or ()),
+                starts=self.starts,
+                start_error=self.start_error,
+                duration=self.duration,
+                period=self.period,
+                epochs=self.epochs,
+                cost=self.cost,
+                optimiser=self.optimiser,
+                learning_rate=self.learning_rate,
+                patience=self.patience,
+                gains=not self.fixed_gains,
+                seed=self.seed,
+                folder=folder,
+                resume=self.resume,
+                progress=True,
+            )
+            interrupted = result.training.stopped == "interrupted"
+            with notes.status(f"drawing the picture into {folder}"):
+                figures = training.write_results(result, folder, facts | {"interrupted": interrupted})
+        print_training(console, f"{robot.name}, {self.controller}", figures)
+        for name in training.FILES:
+            console.print(str(folder / name), soft_wrap=True, highlight=False, markup=False)
+        if interrupted:
+            raise KeyboardInterrupt
+
+    def _settings(self, robot: str) -> dict[str, Any]:
+        """Everything that decides the training, as JSON can store it."""
+        settings = dataclasses.asdict(self) | {"robot": robot}
+        for name in ("out", "resume", "force"):
+            del settings[name]
+        if Path(self.controller).is_file():
+            settings["controller_sha256"] = hashlib.sha256(Path(self.controller).read_bytes()).hexdigest()
+        return settings

@@ -1,0 +1,174 @@
+"""One arm, one law, trained through its closed loop: the study behind `nbs-pin train`."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+import torch
+
+from nbs_pin import metrics
+from nbs_pin.checkpoints import save
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.files import write_whole
+from nbs_pin.learning.closed_loop import Batch, motions, recorded
+from nbs_pin.learning.costs import StageCost, TimeOutside, TorqueAware, squared_error
+from nbs_pin.learning.training import Training, train
+from nbs_pin.loop import Loop
+from nbs_pin.plants.dynamics_plant import DynamicsPlant
+from nbs_pin.references import DesiredMotion, Sinusoid, check_reference
+from nbs_pin.robot import Robot
+from nbs_pin.state import Run
+from nbs_pin.studies.tracking import build_controller
+
+CostName: TypeAlias = Literal["torque-aware", "squared-error", "time-outside"]
+"""What `stage_cost` knows."""
+CHECKPOINT = "training.ckpt"
+"""What `train_robot` keeps up to date in its folder."""
+FILES = ("controller.nbs", "learning.png", "summary.json")
+"""What `write_results` writes, the summary last."""
+FRESH_STARTS = 20
+"""Starts per reference on which the controller is compared with what it was before."""
+_LONGER = 3.0  # fresh motions last this many times longer than those trained on
+
+
+class Trained(NamedTuple):
+    """A training, and the same fresh motions under the controller before and after it."""
+
+    training: Training
+    before: Run
+    after: Run
+
+
+def train_robot(
+    robot: Robot,
+    *,
+    controller: Controller | str = "nbs",
+    bandwidth: float = 8.0,
+    frequencies: tuple[float, ...] = (0.5, 1.0, 2.0),
+    starts: int = 32,
+    start_error: float = 0.5,
+    duration: float = 1.0,
+    period: float = 0.005,
+    cost: str = "torque-aware",
+    seed: int = 0,
+    folder: Path | None = None,
+    **settings: Any,
+) -> Trained:
+    """A law for the arm, trained on sinusoids of these frequencies [rad/s] within the arm's effort limits.
+
+    controller: a law by name, a .nbs file (`build_controller`), or one that is built. starts: in all, shared out over
+    the frequencies. cost: by name (`stage_cost`). folder: where `CHECKPOINT` is kept, None for nowhere. duration,
+    period [s], start_error [rad], and settings (epochs, optimiser, resume, …): as `train` has them.
+    The fresh motions last three times longer, from `FRESH_STARTS` starts per frequency that training never saw.
+    Raises ArgumentError for settings that do not fit and a motion outside the arm's limits; errors of `train` else.
+    """
+    references = [Sinusoid.for_robot(robot, frequency) for frequency in frequencies]
+    for reference in references:
+        check_reference(reference, robot, _LONGER * duration)
+    if not isinstance(controller, Controller):
+        controller = build_controller(controller, robot, bandwidth=bandwidth, period=period, seed=seed)
+    plant = DynamicsPlant(PinocchioDynamics(robot))
+    training = train(
+        controller,
+        plant,
+        references,
+        starts=max(1, round(starts / len(references))),
+        start_error=start_error,
+        duration=duration,
+        period=period,
+        effort_limit=robot.effort_limit,
+        cost=stage_cost(cost, robot),
+        seed=seed,
+        checkpoint=None if folder is None else folder / CHECKPOINT,
+        **settings,
+    )
+    steps = _LONGER * round(duration / period)
+    loop = Loop.of(plant, robot.nv, steps * period, period, plant_step=period, effort_limit=None, lookahead=None)
+    fresh = fresh_batch(loop, references, start_error, seed)
+    return Trained(training, compared(controller, fresh), compared(training.controller, fresh))
+
+
+def stage_cost(name: str, robot: Robot) -> StageCost:
+    """The stage cost of that name, with the arm's effort limits; raises ArgumentError for an unknown name."""
+    known: dict[str, StageCost] = {
+        "torque-aware": TorqueAware.for_robot(robot),
+        "squared-error": squared_error,
+        "time-outside": TimeOutside(),
+    }
+    if name not in known:
+        raise ArgumentError(f"cost '{name}' is unknown; choose one of {', '.join(get_args(CostName))}.")
+    return known[name]
+
+
+def fresh_batch(loop: Loop, references: Sequence[DesiredMotion], start_error: float, seed: int) -> Batch:
+    """`FRESH_STARTS` motions along each reference, at rest within ±start_error [rad] of its start.
+
+    They are drawn apart from those of `train`, whose seed is the number alone.
+    """
+    draw, batches = np.random.default_rng((seed, 1)), []
+    for reference in references:
+        begin = loop.schedule(reference, 0, 0).desired.q[0]
+        away = draw.uniform(-start_error, start_error, (FRESH_STARTS, loop.plant.nv))
+        batches.append(Batch.of(loop, reference, begin + away))
+    return Batch.joined(batches)
+
+
+def compared(controller: Controller, batch: Batch) -> Run:
+    """The motions of a batch as a run."""
+    with torch.no_grad():
+        return recorded(motions(controller, batch), batch, type(controller).__name__)
+
+
+def figures(result: Trained) -> dict[str, Any]:
+    """What training changed, as JSON can store it; None for a time that never came."""
+    training = result.training
+    held_out, best = training.held_out, training.best_epoch
+    return {
+        "epochs": len(training.history) - (training.stopped != "interrupted"),
+        "best_epoch": best,
+        "stopped": training.stopped,
+        "training_cost": [float(training.history[0]), float(training.history[best])],
+        "held_out_cost": [float(held_out[0]), float(held_out[best])],
+        "held_out_cost_lowered_by": 1.0 - float(held_out[best] / held_out[0]),
+        "seconds": training.seconds,
+        "fresh_starts": result.before.q.shape[1],
+        "before": _on_fresh_starts(result.before),
+        "after": _on_fresh_starts(result.after),
+    }
+
+
+def write_results(result: Trained, folder: Path, facts: dict[str, Any]) -> dict[str, Any]:
+    """Writes `FILES` into the folder, the trained controller first; returns the figures.
+
+    facts: what summary.json holds beside the figures and the cost of every epoch. Raises OSError when they cannot be
+    written.
+    """
+    from nbs_pin.charts import plot_training
+
+    numbers, training = figures(result), result.training
+    save(training.controller, folder / "controller.nbs", info={"trained": facts})
+    plot_training(training.history, training.held_out, result.before, result.after, folder / "learning.png")
+    curves = {"history": _plain(training.history), "held_out": _plain(training.held_out)}
+    text = json.dumps(facts | {"figures": numbers, **curves}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    write_whole(folder / "summary.json", text.encode())
+    return numbers
+
+
+def _on_fresh_starts(run: Run) -> dict[str, float | None]:
+    times = np.asarray(metrics.convergence_time(run))
+    median, worst = _plain(np.array([np.sort(times)[len(times) // 2], times.max()]))
+    return {
+        "convergence_time_median_s": median,
+        "convergence_time_worst_s": worst,
+        "peak_torque_Nm": float(np.max(metrics.peak_torque(run))),
+        "rms_torque_Nm": float(np.sqrt(np.mean(np.square(metrics.rms_torque(run))))),
+        "saturated_fraction": float(np.mean(metrics.saturated_fraction(run))),
+    }
+
+
+def _plain(values: np.ndarray) -> list[float | None]:
+    return [float(x) if np.isfinite(x) else None for x in values]
