@@ -47,12 +47,15 @@ def steady_error(run: Run, last: float = 0.3, shift: int = 0) -> Numbers:
     return np.max(values[late], axis=0)
 
 
-def convergence_time(run: Run, threshold: float = PAPER_THRESHOLD) -> Numbers:
-    """First control instant from which ‖z1‖² stays below the threshold [rad²] to the end [s]; inf if it never does."""
-    outside = ~(squared_error(run) < threshold)  # what is not a number is outside
+def convergence_time(run: Run, threshold: float = PAPER_THRESHOLD, shift: int = 0) -> Numbers:
+    """First control instant from which ‖z1‖² stays below the threshold [rad²] to the end [s]; inf if it never does.
+
+    shift: as in `squared_error`; 1 is the authors' count, one period less than the aligned one.
+    """
+    outside = ~(squared_error(run, shift) < threshold)  # what is not a number is outside
     rows = len(outside)
     last_outside = np.where(outside.any(axis=0), rows - 1 - np.argmax(outside[::-1], axis=0), -1)
-    return np.append(run.t, np.inf)[last_outside + 1]
+    return np.append(run.t[:rows], np.inf)[last_outside + 1]
 
 
 def rms_error(run: Run, after: float = 0.0) -> Float[np.ndarray, "*batch n"]:
