@@ -96,8 +96,11 @@ def test_numpy_and_torch_are_one_law(seed, nv, form):
 @any_weights
 @given(seed=seeds, nv=sizes, form=st.sampled_from(POTENTIALS))
 def test_psi_is_zero_with_zero_gradient_at_zero_and_nowhere_negative(seed, nv, form):
-    potential = random_potential(form, nv, seed)
-    zero = np.zeros(nv)
+    check_psi(random_potential(form, nv, seed), seed)
+
+
+def check_psi(potential: Potential, seed: int) -> None:
+    nv, zero = potential.nv, np.zeros(potential.nv)
     value, gradient, _ = potential.terms(zero, zero)
     z = 3.0 * np.random.default_rng(seed).normal(size=(200, nv))
     total, slope, _ = potential.terms(z, z)
@@ -111,8 +114,12 @@ def test_psi_is_zero_with_zero_gradient_at_zero_and_nowhere_negative(seed, nv, f
 @any_weights
 @given(seed=seeds, nv=sizes, form=st.sampled_from(POTENTIALS))
 def test_potential_is_strongly_convex_with_its_modulus(seed, nv, form):
+    check_strong_convexity(random_potential(form, nv, seed), seed)
+
+
+def check_strong_convexity(potential: Potential, seed: int) -> None:
     """⟨∇Φ(x) − ∇Φ(y), x − y⟩ ≥ (x − y)ᵀ2S(x − y) ≥ μ‖x − y‖² on random pairs, near and far."""
-    potential = random_potential(form, nv, seed)
+    nv = potential.nv
     x, y = np.random.default_rng(seed).normal(size=(2, 300, nv)) * np.geomspace(1e-3, 10.0, 300)[:, None]
     step = x - y
     monotone = ((potential.terms(x, x)[1] - potential.terms(y, y)[1]) * step).sum(-1)
@@ -130,7 +137,12 @@ def test_bounded_damping_is_above_its_floor(seed, nv):
     floor = root @ root.T + 0.05 * np.eye(nv)
     damping = Damping(nv, floor=0.5 * (floor + floor.T), widths=(8, 8), scale=rng.uniform(0.2, 5.0, nv))
     randomise(damping, seed, gain=3.0)
-    z = 3.0 * rng.normal(size=(50, nv))
+    check_floor(damping, seed)
+
+
+def check_floor(damping: Damping, seed: int) -> None:
+    """D is symmetric, D ⪰ D₀, and `force` is D(z) z."""
+    z = 3.0 * np.random.default_rng(seed).normal(size=(50, damping.nv))
     matrix = damping.matrix(z)
     np.testing.assert_allclose(matrix, np.swapaxes(matrix, -1, -2), rtol=1e-13, atol=1e-13 * np.abs(matrix).max())
     excess = np.linalg.eigvalsh(matrix - damping.floor.numpy()).min(axis=-1)
