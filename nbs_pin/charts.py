@@ -1,7 +1,9 @@
 """Charts of studies: curves over many runs, in the style of `plotting`."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -26,7 +28,7 @@ def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]],
 
 def plot_training(
     history: Float[np.ndarray, " epochs"],
-    held_out: Float[np.ndarray, " epochs"],
+    held_out: Float[np.ndarray, " checked"],
     before: Run,
     after: Run,
     path: str | Path,
@@ -43,7 +45,7 @@ def plot_training(
     return Path(path)
 
 
-def _draw_costs(axes: Axes, history: Float[np.ndarray, " epochs"], held_out: Float[np.ndarray, " epochs"]) -> None:
+def _draw_costs(axes: Axes, history: Float[np.ndarray, " epochs"], held_out: Float[np.ndarray, " checked"]) -> None:
     for name, values, colour in (("training", history, ACTUAL), ("held out", held_out, REFERENCE)):
         axes.plot(values, color=colour, label=name)
     chosen = held_out if held_out.size else history
@@ -72,3 +74,41 @@ def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
     axes.set(xlabel="time [s]", xlim=(0.0, run.t[-1]))
     axes.set_title(f"‖error‖ of {size.shape[1]} fresh motions [rad]", loc="left")
     axes.legend(frameon=False)
+
+
+def plot_comparison(rows: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
+    """Draws the convergence times of the fair comparison and writes the picture (PNG); returns its path.
+
+    rows: those of `studies.fair.Row` as dictionaries. A panel per arm and period; per law, a dot at the median of its
+    starts for each reference and a line to the worst one. What does not converge ends in an arrow at the right edge.
+    """
+    panels = list(dict.fromkeys((row["arm"], row["period_s"]) for row in rows))
+    with picture(path, 11.0, 0.6 + 2.4 * math.ceil(len(panels) / 2)) as figure:
+        grid = figure.subplots(math.ceil(len(panels) / 2), min(2, len(panels)), squeeze=False).ravel()
+        for axes, panel in zip(grid, panels, strict=False):
+            _draw_comparison(axes, [row for row in rows if (row["arm"], row["period_s"]) == panel])
+            axes.set_title(f"{panel[0]}, control at {1000 * panel[1]:g} ms", loc="left")
+        handles, labels = grid[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), frameon=False)
+    return Path(path)
+
+
+def _draw_comparison(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    laws = list(dict.fromkeys(row["law"] for row in rows))
+    frequencies = list(dict.fromkeys(row["frequency_rad_per_s"] for row in rows))
+    times = np.array([[row["convergence_median_s"], row["convergence_worst_s"]] for row in rows])
+    edge = 1.3 * times[np.isfinite(times)].max(initial=1.0)
+    for k, (frequency, colour) in enumerate(zip(frequencies, (TORQUE, ACTUAL, ERROR), strict=False)):
+        chosen = [row for row in rows if row["frequency_rad_per_s"] == frequency]
+        for row in chosen:
+            y = laws.index(row["law"]) + 0.22 * (k - 0.5 * (len(frequencies) - 1))
+            median, worst = row["convergence_median_s"], row["convergence_worst_s"]
+            axes.plot([min(median, edge), min(worst, edge)], [y, y], color=colour, linewidth=1.0, alpha=0.6)
+            axes.plot(min(median, edge), y, "o" if math.isfinite(median) else ">", color=colour, markersize=4.5)
+            axes.plot(min(worst, edge), y, "|" if math.isfinite(worst) else ">", color=colour, markersize=5)
+        axes.plot([], [], "o-", color=colour, markersize=4.5, linewidth=1.0, label=f"ω = {frequency:g} rad/s")
+    axes.set_xscale("log")
+    axes.set(xlabel="convergence: median (dot) to worst of the starts [s]", ylim=(len(laws) - 0.5, -0.5))
+    axes.set_yticks(range(len(laws)), laws)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else ""))

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -72,7 +72,8 @@ class Batch:
     def joined(cls, batches: Sequence["Batch"]) -> "Batch":
         """All motions of batches of one loop, one after the other."""
         named = ("aims", "desired", "q0", "v0", "tau_d")
-        return replace(batches[0], **{name: np.concatenate([getattr(b, name) for b in batches]) for name in named})
+        joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in batches]) for name in named}
+        return replace(batches[0], **joined)
 
     def __len__(self) -> int:
         return len(self.q0)
@@ -83,23 +84,30 @@ def engine_for(controller: Controller, loop: Loop) -> Engine:
     return "torch" if _scene(controller, loop) is None or not _on_cpu(controller) else "kernels"
 
 
-def motions(controller: Controller, batch: Batch, engine: Engine | None = None) -> Motions:
-    """The motions of the batch under the controller, differentiable in its parameters.
+def motions(
+    controller: Controller,
+    batch: Batch,
+    engine: Engine | None = None,
+    tau_d: Float[torch.Tensor, "B T n"] | None = None,
+) -> Motions:
+    """The motions of the batch under the controller, differentiable in its parameters and in the disturbance.
 
-    engine: None takes `engine_for`; the two agree to 1e-9, in values and in gradients.
+    engine: None takes `engine_for`; the two agree to 1e-9, in values and in gradients. tau_d: takes the place of the
+    batch's disturbance [N·m].
     Raises ArgumentError for kernels where there are none, or a plant that cannot be differentiated.
     """
     check_plant(batch.loop)
     engine = engine_for(controller, batch.loop) if engine is None else engine
+    torque = torch.as_tensor(batch.tau_d) if tau_d is None else tau_d
     if engine == "torch":
-        return _by_torch(controller, batch)
+        return _by_torch(controller, batch, torque)
     scene = _scene(controller, batch.loop)
     if scene is None:
         raise ArgumentError(
             f"{type(controller).__name__} on {batch.loop.plant!r} has no kernels; take engine='torch', as any law can."
         )
     law = controller.packed_law(numpy=False)
-    return Motions(*_ByKernels.apply(law.weights, law.layout, batch, scene))  # type: ignore[no-untyped-call]
+    return Motions(*_ByKernels.apply(law.weights, torque, law.layout, batch, scene))  # type: ignore[no-untyped-call]
 
 
 def running_cost(motion: Motions, batch: Batch, cost: StageCost) -> Float[torch.Tensor, " B"]:
@@ -161,9 +169,10 @@ class _ByKernels(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, weights: torch.Tensor, layout: np.ndarray, batch: Batch, scene: Scene
+        ctx: Any, weights: torch.Tensor, torque: torch.Tensor, layout: np.ndarray, batch: Batch, scene: Scene
     ) -> tuple[torch.Tensor, ...]:
-        count, steps, n = batch.tau_d.shape
+        tau_d = np.ascontiguousarray(torque.detach().numpy())
+        count, steps, n = tau_d.shape
         law = Packed(layout, np.ascontiguousarray(weights.detach().numpy()))
         q, v = np.empty((2, count, steps + 1, n))
         command, memory = np.empty((count, steps, n)), np.empty((count, steps + 1, 2, n))
@@ -173,18 +182,16 @@ class _ByKernels(torch.autograd.Function):
         def run(part: slice) -> None:
             work = np.zeros(size)
             for k in range(count)[part]:
-                rollout(
-                    batch.aims[k], batch.leads, batch.tau_d[k], scene, *law, work, q[k], v[k], command[k], memory[k]
-                )  # fmt: skip
+                rollout(batch.aims[k], batch.leads, tau_d[k], scene, *law, work, q[k], v[k], command[k], memory[k])
 
         over_cores(run, count, fewest=1)
-        ctx.saved = law, batch, scene, q, v, command, memory
+        ctx.saved = law, batch, tau_d, scene, q, v, command, memory
         return torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(command)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        law, batch, scene, q, v, command, memory = ctx.saved
+        law, batch, tau_d, scene, q, v, command, memory = ctx.saved
         q_bar, v_bar, command_bar = (np.array(x.numpy(), order="C") for x in cotangents)
         weights_bar, tau_d_bar = np.zeros((len(batch), len(law.weights))), np.empty(command.shape)
         size = rollout_workspace(law, scene)
@@ -193,21 +200,20 @@ class _ByKernels(torch.autograd.Function):
             work = np.zeros(size)
             for k in range(len(batch))[part]:
                 rollout_adjoint(
-                    batch.aims[k], batch.leads, batch.tau_d[k], scene, *law, q[k], v[k], command[k], memory[k], work,
+                    batch.aims[k], batch.leads, tau_d[k], scene, *law, q[k], v[k], command[k], memory[k], work,
                     q_bar[k], v_bar[k], command_bar[k], tau_d_bar[k], weights_bar[k],
                 )  # fmt: skip
 
         over_cores(run, len(batch), fewest=1)
-        return torch.from_numpy(weights_bar.sum(axis=0)), None, None, None
+        return torch.from_numpy(weights_bar.sum(axis=0)), torch.from_numpy(tau_d_bar), None, None, None
 
 
-def _by_torch(controller: Controller, batch: Batch) -> Motions:
+def _by_torch(controller: Controller, batch: Batch, tau_d: torch.Tensor) -> Motions:
     """The same loop as it is written, one torch operation after the other."""
-    loop, plant = batch.loop, batch.loop.plant
+    loop, plant = batch.loop, cast(DynamicsPlant, batch.loop.plant)
     device = next((p.device for p in controller.parameters()), torch.device("cpu"))  # type: ignore[attr-defined]
-    aims, q, v, tau_d, limit = (
-        torch.as_tensor(x, device=device) for x in (batch.aims, batch.q0, batch.v0, batch.tau_d, loop.limit)
-    )
+    given = (batch.aims, batch.q0, batch.v0, loop.limit, tau_d)
+    aims, q, v, limit, tau_d = (torch.as_tensor(x, device=device) for x in given)
     memory = controller.initial_memory(q)
     states, commands = [(q, v)], []
     for k, lead in enumerate(batch.leads.tolist()):
@@ -219,4 +225,4 @@ def _by_torch(controller: Controller, batch: Batch) -> Motions:
             q, v = plant.step(q, v, tau, loop.step)
         states.append((q, v))
         commands.append(command)
-    return Motions(*(torch.stack(x, dim=1) for x in (*zip(*states, strict=True), commands)))
+    return Motions(*(torch.stack(list(x), dim=1) for x in (*zip(*states, strict=True), commands)))

@@ -36,7 +36,7 @@ class TorqueAware:
     """
 
     limit: Float[torch.Tensor, " n"]
-    rate: float = 0.05
+    rate: float = 0.02
     excess: float = 1e-2
     effort: float = 1e-4
 
@@ -66,15 +66,19 @@ class TorqueAware:
 
 @dataclass(frozen=True)
 class TimeOutside:
-    """‖z1‖² / (‖z1‖² + threshold): about 1 while the arm is outside the ball and 0 inside, so its integral is a time.
+    """‖z1‖²/(‖z1‖² + threshold) + pull·‖z1‖²: about 1 outside the ball and 0 inside, so its integral is nearly a time.
 
-    threshold [rad²]: 0.01 is the paper's mark of convergence. Raises ArgumentError unless it is positive.
+    threshold [rad²]: 0.01 is the paper's mark of convergence. pull [1/rad²]: what far errors, whose first term is flat,
+    still feel. Raises ArgumentError for numbers out of range.
     """
 
     threshold: float = 0.01
+    pull: float = 0.1
 
     def __post_init__(self) -> None:
         positive("TimeOutside's threshold", self.threshold, "rad²")
+        if self.pull != 0.0:
+            positive("TimeOutside's pull", self.pull, "1/rad²")
 
     def __call__(
         self,
@@ -84,4 +88,4 @@ class TimeOutside:
     ) -> Float[torch.Tensor, "*batch"]:
         """The cost per second."""
         squared = (z1 * z1).sum(-1)
-        return squared / (squared + self.threshold)
+        return squared / (squared + self.threshold) + self.pull * squared

@@ -2,10 +2,11 @@
 
 import copy
 import hashlib
+import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -16,12 +17,13 @@ from torch import nn
 
 from nbs_pin.checkpoints import TrainingState, read_checkpoint, write_checkpoint
 from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.descriptions import describe
 from nbs_pin.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.learning.closed_loop import Batch, Engine, check_plant, engine_for, motions, running_cost
 from nbs_pin.learning.costs import StageCost, TorqueAware
 from nbs_pin.learning.optimisers import (
     LEARNING_RATES,
-    OptimiserName,
+    RISE,
     optimiser,
     packed_state,
     scheduled_rate,
@@ -39,7 +41,6 @@ Stop: TypeAlias = Literal["epochs", "patience", "interrupted"]
 """Why training ended: all epochs done, no progress on the held-out motions, or Ctrl-C."""
 SAVE_EVERY = 10
 """Epochs between two checkpoints."""
-_RETREATS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ class Training:
     """The controller as it was at its best epoch; the one given to `train` is left alone."""
     history: Float[np.ndarray, " epochs"]
     """Mean cost of the training motions before each epoch's step, and after the last."""
-    held_out: Float[np.ndarray, " epochs"]
+    held_out: Float[np.ndarray, " checked"]
     """Mean cost of the held-out motions at the same instants; empty without any."""
     best_epoch: int
     """Row of the controller that is given: the lowest held-out cost, or the lowest cost without held-out motions."""
@@ -78,7 +79,7 @@ def train(
     regulariser: Regulariser | None = None,
     gains: bool = True,
     epochs: int = 200,
-    optimiser: OptimiserName = "adam",
+    optimiser: str = "cautious",
     learning_rate: float | None = None,
     patience: int | None = None,
     seed: int = 0,
@@ -96,9 +97,9 @@ def train(
     a pair (q0, v0), or how many to draw, each joint within ±start_error [rad] of the reference's start. held_out: the
     same for motions that are never trained on and that choose the best epoch; None draws a quarter as many (none when
     starts are given). plant_step [s]: None takes one step per period, unlike `simulate`. disturbance: constant torque.
-    cost: l; None takes `TorqueAware` with the effort limits. gains: whether S, Λ and D₀ are trained too, never
-    below their `least_share`. optimiser, learning_rate: see `optimisers.py`. patience: epochs without a better held-out
-    cost after which to stop. seed: of the starts drawn. checkpoint: a file that is kept up to date, from which
+    cost: l; None takes `TorqueAware` with the effort limits. gains: whether S, Λ and D₀ are trained too, never below
+    their `least_share`. optimiser: "cautious", "adam" or "lbfgs" (`learning/optimisers.py`). patience: epochs without a
+    better held-out cost after which to stop. seed: of the starts drawn. checkpoint: a file kept up to date, from which
     `resume` goes on bit for bit. engine: None takes the fastest (`closed_loop.engine_for`).
     Ctrl-C ends training early and keeps the best.
 
@@ -182,6 +183,7 @@ class _Task:
                 digest.update(np.ascontiguousarray(array).tobytes())
         loop = self.training.loop
         digest.update(loop.limit.tobytes())
+        digest.update(json.dumps(describe(self.controller)[0], sort_keys=True).encode())
         stated = (loop.period, loop.substeps, repr(loop.plant), self.gains, self.epochs, self.optimiser)
         digest.update(repr((*stated, self.learning_rate, type(self.cost).__name__, self.engine)).encode())
         return digest.hexdigest()
@@ -220,19 +222,22 @@ class _Trainer:
         """The epochs that are left."""
         stopped: Stop = "epochs"
         began, before = time.perf_counter(), self.at.seconds
+        mark = self._mark()
         try:
             for _ in tracked(range(self.at.epoch, self.task.epochs), self._label, progress):
+                if self.task.patience is not None and self.at.epoch - self.at.best_epoch > self.task.patience:
+                    stopped = "patience"
+                    break
+                mark = self._mark()
                 self._epoch()
                 self.at.seconds = before + time.perf_counter() - began
                 if self.at.epoch % SAVE_EVERY == 0:
                     self._save()
-                if self.task.patience is not None and self.at.epoch - self.at.best_epoch > self.task.patience:
-                    stopped = "patience"
-                    break
             with torch.no_grad():
-                self._note(float(self.task.loss()))
+                self._note(self.at.epoch, float(self.task.loss()))
         except KeyboardInterrupt:
             stopped = "interrupted"
+            self._go_back(mark)
         self.at.seconds = before + time.perf_counter() - began
         self._save()
         return self._result(stopped)
@@ -242,7 +247,7 @@ class _Trainer:
         return f"training, cost {history[-1]:.4g} from {history[0]:.4g}" if history else "training"
 
     def _epoch(self) -> None:
-        """One step of the optimiser, or a retreat to the best parameters when the motions left the finite numbers."""
+        """One step of the optimiser, or a retreat to the best parameters."""
         at, task = self.at, self.task
         for group in self.optimiser.param_groups:
             group["lr"] = at.rate_scale * scheduled_rate(task.optimiser, task.learning_rate, at.epoch, task.epochs)
@@ -250,12 +255,22 @@ class _Trainer:
         try:
             value = float(self.optimiser.step(self._closure))
         except _NotFinite:
-            return self._retreat()
+            value = math.nan
+        at.epoch += 1
         stepped = [p.detach().clone() for p in self.parameters]
         self._set(before)
-        self._note(value)
-        self._set(stepped)
-        at.epoch += 1
+        self._note(at.epoch - 1, value)
+        if self._has_risen(value):
+            self._retreat()
+        else:
+            self._set(stepped)
+
+    def _has_risen(self, value: float) -> bool:
+        """Whether this cost calls for a retreat: always when not finite; else for "cautious" alone."""
+        if not math.isfinite(value):
+            return True
+        lowest = self.at.history[self.at.best_epoch]
+        return self.task.optimiser == "cautious" and lowest is not None and value > RISE * lowest
 
     def _closure(self) -> float:
         self.optimiser.zero_grad()
@@ -265,9 +280,10 @@ class _Trainer:
         loss.backward()  # type: ignore[no-untyped-call]
         return float(loss.detach())
 
-    def _note(self, value: float) -> None:
+    def _note(self, row: int, value: float) -> None:
         """Write the cost of the present parameters down, and keep them when they are the best so far."""
         at, task = self.at, self.task
+        del at.history[row:], at.held_out[row:]  # the last of a training that had ended and goes on
         at.history.append(value if math.isfinite(value) else None)
         score = value
         if task.held_out is not None:
@@ -286,13 +302,20 @@ class _Trainer:
                 " starts nearer to the reference, or softer gains."
             )
         self.at.rate_scale *= 0.5
-        if self.at.rate_scale < 0.5**_RETREATS:
-            raise SimulationDiverged(
-                f"training left the finite numbers {_RETREATS + 1} times; give a learning rate below"
-                f" {self.task.learning_rate * self.at.rate_scale:.2g}."
-            )
         self.task.controller.load_state_dict(self.at.best)
         self.optimiser = self._fresh()
+
+    def _mark(self) -> tuple[_Progress, list[torch.Tensor], Any, dict[str, torch.Tensor]]:
+        """Where training stands, as `_go_back` takes it: Ctrl-C may come in the middle of a step."""
+        tensors: dict[str, torch.Tensor] = {}
+        state = packed_state(self.optimiser.state_dict(), tensors)
+        at = replace(self.at, history=[*self.at.history], held_out=[*self.at.held_out])
+        return at, [p.detach().clone() for p in self.parameters], state, tensors
+
+    def _go_back(self, mark: tuple[_Progress, list[torch.Tensor], Any, dict[str, torch.Tensor]]) -> None:
+        self.at, values, state, tensors = mark
+        self._set(values)
+        self.optimiser.load_state_dict(unpacked_state(state, tensors))
 
     def _fresh(self) -> torch.optim.Optimizer:
         return optimiser(self.task.optimiser, self.parameters, self.task.learning_rate)
@@ -313,7 +336,7 @@ class _Trainer:
         return Training(best, history, held_out, at.best_epoch, stopped, at.seconds)
 
     def _save(self) -> None:
-        if self.task.checkpoint is None:
+        if self.task.checkpoint is None or not self.at.history:
             return
         tensors = {f"best.{name}": x for name, x in self.at.best.items()}
         facts = {k: v for k, v in vars(self.at).items() if k != "best"}

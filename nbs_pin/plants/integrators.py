@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from typing import Literal, TypeAlias
 
-import numpy as np
+from nbs_pin.arrays import Array
 
-Vector: TypeAlias = np.ndarray
+Vector: TypeAlias = Array
 Acceleration: TypeAlias = Callable[[Vector, Vector], Vector]
 """a(q, v) [rad/s²] with the torque held."""
 Integrator: TypeAlias = Callable[[Acceleration, Vector, Vector, float], tuple[Vector, Vector]]

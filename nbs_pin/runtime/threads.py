@@ -12,7 +12,7 @@ FEWEST_ROWS = 64
 
 
 def over_cores(function: Callable[[slice], None], rows: int, fewest: int = FEWEST_ROWS) -> None:
-    """`function` of slices of at least `fewest` rows that make up all, at once; NUMBA_NUM_THREADS bounds their number."""
+    """`function` of slices of at least `fewest` rows, which make up all, at once; at most NUMBA_NUM_THREADS of them."""
     parts = min(
         numba.config.NUMBA_NUM_THREADS,  # type: ignore[attr-defined]  # read from the environment
         rows // fewest,

@@ -1,0 +1,340 @@
+"""Training through the closed loop: exact gradients, one loop by two engines, and what training promises."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+import nbs_pin as nbs
+from nbs_pin.checkpoints import read_checkpoint
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.learning.closed_loop import Batch, engine_for, motions, recorded, running_cost
+from nbs_pin.learning.costs import TimeOutside, TorqueAware, squared_error
+from nbs_pin.loop import Loop
+from nbs_pin.studies.tracking import build_controller
+
+LAWS = ("nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid")
+PERIOD = 0.01
+
+
+def arm(name, effort=None):
+    robot = nbs.load_robot(name)
+    return robot if effort is None else robot.with_effort_limit(effort)
+
+
+def problem(robot, steps=8, starts=2, *, integrator="rk4", substeps=1, friction=None, error=0.5, **given):
+    """A batch of motions of the arm from random starts."""
+    plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot), integrator, friction)
+    settings = {"plant_step": PERIOD / substeps, "effort_limit": None, "lookahead": None} | given
+    loop = Loop.of(plant, robot.nv, steps * PERIOD, PERIOD, **settings)
+    reference = nbs.Sinusoid.for_robot(robot, 2.0)
+    draw = np.random.default_rng(3)
+    q0 = reference(0.0).q + draw.uniform(-error, error, (starts, robot.nv))
+    return Batch.of(loop, reference, q0, draw.normal(size=q0.shape), draw.normal(size=robot.nv))
+
+
+def law_for(robot, name="nbs", **settings):
+    controller = build_controller(name, robot, period=PERIOD, bandwidth=4.0, **settings)
+    draw = torch.Generator().manual_seed(5)
+    with torch.no_grad():  # gains off their nominal values, so that every term of their derivative counts
+        for parameter in controller.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=draw, dtype=torch.float64)
+    return controller
+
+
+def value_and_gradient(controller, batch, cost, engine):
+    controller.zero_grad()
+    value = running_cost(motions(controller, batch, engine), batch, cost).mean()
+    value.backward()
+    return float(value.detach()), torch.cat([p.grad.ravel() for p in controller.parameters()])
+
+
+def assert_engines_agree(controller, batch, cost):
+    assert engine_for(controller, batch.loop) == "kernels"
+    fast, slow = (value_and_gradient(controller, batch, cost, engine) for engine in ("kernels", "torch"))
+    assert fast[0] == pytest.approx(slow[0], rel=1e-9)
+    assert float(torch.linalg.norm(fast[1] - slow[1])) <= 1e-9 * float(torch.linalg.norm(slow[1]))
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_both_engines_are_one_loop_for_every_law(name):
+    robot = arm("two_link", 30.0)
+    assert_engines_agree(law_for(robot, name), problem(robot), TorqueAware.for_robot(robot))
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "semi_implicit_euler", "euler"])
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_both_engines_are_one_loop_for_every_integrator_with_friction(integrator, substeps):
+    robot = arm("two_link")
+    friction = nbs.JointFriction(np.array([0.3, 0.2]), np.array([0.4, 0.0]), 0.5)
+    batch = problem(robot, steps=5, integrator=integrator, substeps=substeps, friction=friction)
+    assert_engines_agree(law_for(robot, friction=friction), batch, squared_error)
+
+
+@pytest.mark.parametrize("name", ["panda", "kinova", "double_pendulum"])
+def test_both_engines_are_one_loop_on_larger_and_continuous_arms(name):
+    robot = nbs.load_robot(name, zero_limits="unlimited")
+    assert_engines_agree(law_for(robot), problem(robot, steps=3), TorqueAware.for_robot(robot))
+
+
+@pytest.mark.parametrize("name", ["two_link", "three_link", "panda"])
+@pytest.mark.parametrize("law", ["nbs", "slotine-li"])
+def test_gradients_are_those_of_finite_differences(name, law):
+    """Along random directions of all parameters, by sixth-order differences, with joints at their limits.
+
+    Not for the paper's ψ: its torque jumps, so its motions do, and no difference across a jump is a derivative.
+    """
+    robot = arm(name, 40.0 if name != "panda" else None)
+    controller, batch, cost = law_for(robot, law), problem(robot, steps=40, starts=3), TorqueAware.for_robot(robot)
+    _, gradient = value_and_gradient(controller, batch, cost, "kernels")
+    parameters = list(controller.parameters())
+    theta = torch.nn.utils.parameters_to_vector(parameters).detach()
+    draw = torch.Generator().manual_seed(1)
+
+    def along(direction, size):
+        torch.nn.utils.vector_to_parameters(theta + size * direction, parameters)
+        with torch.no_grad():
+            return float(running_cost(motions(controller, batch, "kernels"), batch, cost).mean())
+
+    for _ in range(3):
+        direction = torch.randn(theta.shape, generator=draw, dtype=torch.float64)
+        h = 1e-5
+        steps = [(along(direction, k * h) - along(direction, -k * h)) / (2 * k * h) for k in (1, 2, 3)]
+        expected = 1.5 * steps[0] - 0.6 * steps[1] + 0.1 * steps[2]
+        assert float(direction @ gradient) == pytest.approx(expected, rel=1e-6)
+
+
+def test_disturbances_are_differentiable_too():
+    robot = arm("two_link")
+    controller, batch = law_for(robot), problem(robot)
+    gradients = []
+    for engine in ("kernels", "torch"):
+        tau_d = torch.tensor(batch.tau_d, requires_grad=True)
+        running_cost(motions(controller, batch, engine, tau_d), batch, squared_error).sum().backward()
+        gradients.append(tau_d.grad)
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-15)
+    assert float(gradients[0].abs().min()) > 0.0
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_motion_is_the_run_that_simulate_gives(name):
+    robot = arm("two_link", 20.0)
+    controller, batch = law_for(robot, name), problem(robot, steps=30, starts=1, lookahead=0.004)
+    with torch.no_grad():
+        run = recorded(motions(controller, batch), batch, "law")
+    known = nbs.simulate(
+        batch.loop.plant,
+        controller,
+        nbs.Sinusoid.for_robot(robot, 2.0),
+        30 * PERIOD,
+        PERIOD,
+        q0=batch.q0[0],
+        v0=batch.v0[0],
+        plant_step=PERIOD,
+        lookahead=0.004,
+        disturbance=nbs.ConstantTorque(batch.tau_d[0, 0]),
+    )
+    for field in ("q", "v", "q_ref", "v_ref", "a_ref"):
+        np.testing.assert_allclose(getattr(run, field)[:, 0], getattr(known, field), rtol=1e-9, atol=1e-11)
+    for field in ("tau", "tau_command", "disturbance"):
+        np.testing.assert_allclose(getattr(run, field)[:-1, 0], getattr(known, field)[:-1], rtol=1e-9, atol=1e-9)
+    assert np.any(np.abs(known.tau_command) > 20.0) or name == "pid"
+
+
+def test_threads_do_not_change_a_bit(monkeypatch):
+    import numba
+
+    robot = arm("two_link")
+    controller, batch = law_for(robot), problem(robot, starts=5)
+    several = value_and_gradient(controller, batch, squared_error, "kernels")
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
+    one = value_and_gradient(controller, batch, squared_error, "kernels")
+    assert several[0] == one[0]
+    assert torch.equal(several[1], one[1])
+
+
+def test_parts_from_outside_go_by_torch():
+    class Other(nbs.NeuralBackstepping):
+        def torque(self, q, v, q_ref, v_ref, a_ref):
+            return 0.5 * super().torque(q, v, q_ref, v_ref, a_ref)
+
+    robot = arm("two_link")
+    batch = problem(robot, steps=2)
+    other = Other.for_robot(robot, period=PERIOD)
+    assert engine_for(other, batch.loop) == "torch"
+    with pytest.raises(ArgumentError, match="no kernels; take engine='torch'"):
+        motions(other, batch, "kernels")
+    half, whole = motions(other, batch), motions(nbs.NeuralBackstepping.for_robot(robot, period=PERIOD), batch)
+    torch.testing.assert_close(half.command[:, 0], 0.5 * whole.command[:, 0])
+
+
+def quick(controller, robot, **settings):
+    plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot))
+    given = {"starts": 4, "duration": 0.4, "epochs": 12} | settings
+    return nbs.train(controller, plant, [nbs.Sinusoid.for_robot(robot)], **given)
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("optimiser", ["cautious", "adam", "lbfgs"])
+def test_training_lowers_the_held_out_cost_and_leaves_the_given_law_alone(name, optimiser):
+    robot = arm("two_link")
+    controller = build_controller(name, robot, period=PERIOD)
+    before = {k: x.clone() for k, x in controller.state_dict().items()}
+    result = quick(controller, robot, optimiser=optimiser, cost=squared_error)
+    assert result.held_out[result.best_epoch] == np.nanmin(result.held_out) < result.held_out[0]
+    assert result.stopped == "epochs"
+    assert len(result.history) == len(result.held_out) == 13
+    assert all(torch.equal(x, before[k]) for k, x in controller.state_dict().items())
+    assert all(p.grad is None for p in result.controller.parameters())
+
+
+def test_the_given_controller_is_the_one_of_the_best_epoch():
+    robot = arm("two_link")
+    result = quick(build_controller("nbs", robot, period=PERIOD), robot, held_out=0, epochs=5)
+    plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot))
+    loop = Loop.of(plant, 2, 0.4, PERIOD, plant_step=PERIOD, effort_limit=None, lookahead=None)
+    q0 = nbs.Sinusoid.for_robot(robot)(0.0).q + np.random.default_rng(0).uniform(-0.5, 0.5, (4, 2))
+    batch = Batch.of(loop, nbs.Sinusoid.for_robot(robot), q0)
+    cost = running_cost(motions(result.controller, batch), batch, TorqueAware.for_robot(robot)).mean()
+    assert float(cost.detach()) == result.history[result.best_epoch]
+
+
+def test_gains_stay_above_their_share_and_can_be_left_alone():
+    robot = arm("two_link")
+    controller = build_controller("nbs", robot, period=PERIOD)
+    moved = quick(controller, robot, learning_rate=0.02).controller
+    assert not np.array_equal(moved.rate.numpy(), controller.rate.numpy())
+    for gain, nominal in ((moved.rate, controller.rate), (moved.damping.floor, controller.damping.floor)):
+        least = gain.numpy() - float(gain.least_share) * nominal.numpy()
+        assert np.all(np.linalg.eigvalsh(least if least.ndim == 2 else np.diag(least)) > 0.0)
+    fixed = quick(controller, robot, gains=False).controller
+    np.testing.assert_array_equal(fixed.rate.numpy(), controller.rate.numpy())
+    np.testing.assert_array_equal(fixed.potential.stiffness.numpy(), controller.potential.stiffness.numpy())
+    with pytest.raises(ArgumentError, match="nothing is left to train"):
+        quick(build_controller("pid", robot, period=PERIOD), robot, gains=False)
+
+
+def test_a_regulariser_keeps_weights_small():
+    robot = arm("two_link")
+    controller = build_controller("nbs", robot, period=PERIOD)
+
+    def size(law):
+        return sum((p**2).sum() for p in law.potential.network.parameters())
+
+    free, bound = (quick(controller, robot, held_out=0, regulariser=r) for r in (None, lambda law: 10.0 * size(law)))
+    assert float(size(bound.controller).detach()) < 0.9 * float(size(free.controller).detach())
+    assert bound.history[0] == pytest.approx(free.history[0] + 10.0 * float(size(controller).detach()))
+
+
+@pytest.mark.parametrize("optimiser", ["cautious", "adam", "lbfgs"])
+def test_a_resumed_training_is_the_same_to_the_last_bit(optimiser, tmp_path, monkeypatch):
+    robot = arm("two_link")
+    controller = build_controller("nbs", robot, period=PERIOD)
+    settings = {"optimiser": optimiser, "epochs": 25, "starts": 2, "duration": 0.2, "learning_rate": 0.05}
+    whole = quick(controller, robot, **settings, checkpoint=tmp_path / "whole.ckpt")
+    stop_at(monkeypatch, epoch=13)
+    stopped = quick(controller, robot, **settings, checkpoint=tmp_path / "part.ckpt")
+    assert stopped.stopped == "interrupted"
+    assert len(stopped.history) < len(whole.history)
+    monkeypatch.undo()
+    resumed = quick(controller, robot, **settings, checkpoint=tmp_path / "part.ckpt", resume=True)
+    np.testing.assert_array_equal(resumed.history, whole.history)
+    np.testing.assert_array_equal(resumed.held_out, whole.held_out)
+    for name, x in whole.controller.state_dict().items():
+        assert torch.equal(x, resumed.controller.state_dict()[name]), name
+
+
+def stop_at(monkeypatch, epoch):
+    """Ctrl-C, as a signal, in the middle of that epoch."""
+    count = iter(range(10_000))
+
+    def rollouts(*arguments):
+        if next(count) == 2 * epoch:
+            os.kill(os.getpid(), signal.SIGINT)
+        return motions(*arguments)
+
+    monkeypatch.setattr("nbs_pin.learning.training.motions", rollouts)
+
+
+def test_ctrl_c_keeps_the_best(monkeypatch, tmp_path):
+    robot = arm("two_link")
+    controller = build_controller("nbs", robot, period=PERIOD)
+    stop_at(monkeypatch, epoch=6)
+    result = quick(controller, robot, checkpoint=tmp_path / "c.ckpt")
+    assert result.stopped == "interrupted"
+    assert result.held_out[result.best_epoch] == result.held_out.min()
+    saved, _ = read_checkpoint(tmp_path / "c.ckpt")
+    assert isinstance(saved, ModelLaw)
+
+
+def test_patience_ends_a_training_that_gains_nothing():
+    robot = arm("two_link")
+    result = quick(build_controller("nbs", robot, period=PERIOD), robot, optimiser="adam", learning_rate=1.0, epochs=40,
+                   patience=3)  # fmt: skip
+    assert result.stopped == "patience"
+    assert len(result.history) < 41
+
+
+def test_a_checkpoint_of_another_training_or_arm_is_refused(tmp_path):
+    robot, path = arm("two_link"), tmp_path / "a.ckpt"
+    controller = build_controller("nbs", robot, period=PERIOD)
+    quick(controller, robot, checkpoint=path, epochs=2)
+    for change in ({"epochs": 3}, {"starts": 5}, {"seed": 1}, {"learning_rate": 0.5}, {"cost": squared_error}):
+        with pytest.raises(ArgumentError, match="not a checkpoint of this training"):
+            quick(controller, robot, **{"checkpoint": path, "epochs": 2, "resume": True} | change)
+    other = arm("three_link")
+    with pytest.raises(ArgumentError, match="two_link"):
+        quick(build_controller("nbs", other, period=PERIOD), other, checkpoint=path, epochs=2, resume=True)
+
+
+def test_what_cannot_be_trained_is_refused_in_one_sentence():
+    robot = arm("two_link")
+    controller, reference = build_controller("nbs", robot, period=PERIOD), nbs.Sinusoid.for_robot(robot)
+    plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot))
+    with pytest.raises(ArgumentError, match="has no derivatives; train on DynamicsPlant"):
+        nbs.train(controller, nbs.MujocoPlant(robot), [reference])
+    with pytest.raises(ArgumentError, match="has no parameters to train"):
+        nbs.train(controller.compile(), plant, [reference])
+    with pytest.raises(ArgumentError, match="optimiser 'sgd' is unknown"):
+        quick(controller, robot, optimiser="sgd")
+    for given, message in (
+        ({"epochs": 0}, "epochs is 0"),
+        ({"starts": 0}, "at least one"),
+        ({"starts": np.zeros((3, 5))}, "q0 has shape"),
+        ({"starts": np.full((3, 2), np.nan)}, "finite"),
+        ({"learning_rate": -1.0}, "learning_rate"),
+        ({"duration": 0.123456}, "whole number"),
+        ({"resume": True}, "without a checkpoint"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            quick(controller, robot, **given)
+    with pytest.raises(ArgumentError, match="references is empty"):
+        nbs.train(controller, plant, [])
+    with pytest.raises(ArgumentError, match="2 joints and the plant 3"):
+        nbs.train(controller, nbs.DynamicsPlant(nbs.PinocchioDynamics(arm("three_link"))), [reference])
+
+
+def test_motions_that_leave_the_finite_numbers_are_reported():
+    robot = arm("two_link", np.inf)
+    wild = nbs.ComputedTorque(nbs.PinocchioDynamics(robot), kp=1e9, kd=1e9)
+    with pytest.raises(SimulationDiverged, match="before anything was trained"):
+        quick(wild, robot, duration=1.0)
+
+
+def test_stage_costs_are_what_they_say():
+    z, dz = torch.tensor([[0.3, 0.4]], dtype=torch.float64), torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    tau = torch.tensor([[15.0, -5.0]], dtype=torch.float64)
+    assert float(squared_error(z, dz, tau)) == pytest.approx(0.25)
+    priced = TorqueAware(torch.tensor([10.0, np.inf]), rate=0.1, excess=2.0, effort=3.0)
+    assert float(priced(z, dz, tau)) == pytest.approx(0.25 + 0.01 + 2.0 * 0.25 + 3.0 * 2.25)
+    assert float(TimeOutside(0.25, pull=0.0)(z, dz, tau)) == pytest.approx(0.5)
+    for bad in (
+        lambda: TorqueAware(torch.ones(2), rate=-1.0),
+        lambda: TimeOutside(0.0),
+        lambda: TimeOutside(0.1, -1.0),
+    ):
+        with pytest.raises(ArgumentError):
+            bad()
