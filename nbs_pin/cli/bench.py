@@ -25,6 +25,7 @@ _COLUMNS = {
     "plant step": {"p50\n[µs]": "p50_us"},
     "simulate": {"steps\nper s": "steps_per_s", "recorded\n[MB]": "recorded_MB"},
     "joints": {"joints": "joints", "p50\n[µs]": "p50_us", "÷ two\nRNEA": "over_two_rnea"},
+    "training epoch": {"p50\n[ms]": "p50_ms", "torch\n÷ it": "torch_over_kernels"},
     "endurance": {
         "motion\n[s]": "duration_s",
         "wall\n[s]": "wall_s",

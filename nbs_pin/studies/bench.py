@@ -25,6 +25,7 @@ from nbs_pin.references import Sinusoid
 from nbs_pin.robot import Robot, load_robot
 from nbs_pin.simulation import simulate, stream
 from nbs_pin.state import Reference
+from nbs_pin.studies.bench_training import training_epochs
 from nbs_pin.studies.chains import serial_chain
 from nbs_pin.studies.tracking import ControllerName, build_controller
 from nbs_pin.versions import versions
@@ -57,7 +58,7 @@ def bench(
     chains: tuple[int, ...] = CHAINS,
     long: bool = False,
 ) -> Iterator[Row]:
-    """Rows as they are measured: control steps, plant steps, simulation, and cost against the number of joints.
+    """Rows as they are measured: control steps, plant steps, simulation, cost against joints, and training epochs.
 
     calls: how often a control step is timed. A step is timed alone, with the garbage collector off, on one core.
     chains: numbers of joints of the generated arms. long: also an hour of motion and a thousand starts, a few minutes.
@@ -73,6 +74,8 @@ def bench(
         yield simulation_row(robot)
     for joints in chains:
         yield control_row(serial_chain(joints), "nbs", max(1000, calls // 4), what="joints")
+    for (arm, size), figures in training_epochs().items():
+        yield Row("training epoch", arm, size, figures)
     if long:
         yield endurance_row(load_robot("panda"))
         yield workers_row(load_robot("panda"))
