@@ -84,3 +84,13 @@ def test_the_gradient_of_a_motion_is_right_and_lowers_its_cost(tmp_path, epochs)
     assert disagreement < 1e-6
     assert len(costs) == epochs
     assert costs[-1] < 0.75 * costs[0]
+
+
+def test_a_trained_controller_is_faster_and_its_storage_still_falls(tmp_path):
+    figures, printed = run_demo("train_and_track", tmp_path, "main(epochs=15)")
+    assert figures["share"] < 0.9
+    assert figures["after"] < figures["before"]
+    assert figures["rise"] < 1e-9
+    folder = tmp_path / "out" / "demo" / "train"
+    assert sorted(path.name for path in folder.iterdir()) == ["controller.nbs", "learning.png"]
+    assert "lower the held-out cost by" in printed

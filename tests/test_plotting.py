@@ -32,15 +32,20 @@ def png_size(path):
     return struct.unpack(">II", content[16:24])
 
 
-def drawn_figure(run, path, monkeypatch, **options):
-    """The matplotlib figure that plot_tracking saves."""
+def drawn(draw, monkeypatch):
+    """The matplotlib figure that the call saves."""
     from matplotlib.figure import Figure
 
     figures = []
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda figure, *a, **k: (figures.append(figure), save(figure, *a, **k))[1])
-    plot_tracking(run, path, **options)
+    draw()
     return figures[0]
+
+
+def drawn_figure(run, path, monkeypatch, **options):
+    """The matplotlib figure that plot_tracking saves."""
+    return drawn(lambda: plot_tracking(run, path, **options), monkeypatch)
 
 
 def curve(axes, color):

@@ -35,8 +35,19 @@ def made(folder: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def check_folder(folder: Path, names: tuple[str, ...], same: Mapping[str, Any], force: bool) -> None:
-    """Raises OptionError when the folder holds results that are not those of the very same run, unless forced."""
+def check_folder(
+    folder: Path,
+    names: tuple[str, ...],
+    same: Mapping[str, Any],
+    force: bool,
+    *,
+    whose: str = "another run",
+    remedy: str = "give another --out",
+) -> None:
+    """Raises OptionError when the folder holds results that are not those of the very same run, unless forced.
+
+    names: the files that count as results. same: what summary.json must say. whose, remedy: words of the error.
+    """
     if folder.exists() and not folder.is_dir():
         raise OptionError(f"--out '{folder}' is a file; give a folder.")
     present = [name for name in names if (folder / name).exists()]
@@ -44,9 +55,7 @@ def check_folder(folder: Path, names: tuple[str, ...], same: Mapping[str, Any], 
         return
     summary = summary_in(folder)  # results without a readable summary are another run's
     if {key: summary.get(key) for key in same} != same:
-        raise OptionError(
-            f"'{folder}' holds {present[0]} of another run; give another --out, or --force to replace it."
-        )
+        raise OptionError(f"'{folder}' holds {present[0]} of {whose}; {remedy}, or --force to replace it.")
 
 
 def summary_in(folder: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ class Train:
     Ctrl-C stops early and keeps the best epoch; --resume goes on from there. Track with the result:
     nbs-pin track panda --controller out/train-panda/controller.nbs
 
-    Example: nbs-pin train panda --epochs 60 --out out/panda
+    Example: nbs-pin train panda --epochs 200 --out out/panda
     """
 
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
@@ -33,21 +33,22 @@ class Train:
     """Sinusoids to follow, fitted to the arm: their frequencies [rad/s], split by commas."""
     starts: Annotated[int, integer("--starts", least=1, most=100_000)] = 32
     """Starts to train from, shared out over the frequencies; a quarter as many are held out to choose the epoch."""
-    start_error: Annotated[float, number("--start-error", above=0.0, most=math.pi, unit="rad")] = 0.5
+    start_error: Annotated[float, number("--start-error", above=0.0, most=math.pi, unit="rad")] = 0.3
     """Starts are at rest, each joint within this of the motion's start [rad]."""
     duration: Annotated[float, number("--duration", above=0.0, most=1000.0, unit="s")] = 1.0
     """Length of the motions trained on, a whole number of periods [s]."""
     period: Annotated[float, number("--period", least=1e-4, most=0.1, unit="s")] = 0.005
     """Control period [s]."""
-    epochs: Annotated[int, integer("--epochs", least=1, most=1_000_000)] = 60
+    epochs: Annotated[int, integer("--epochs", least=1, most=1_000_000)] = 80
     """Steps of the optimiser."""
     cost: Literal["torque-aware", "squared-error", "time-outside"] = "torque-aware"
     """What is made small: error, its rate and torque beyond the limits; the error alone, as in the paper; or the time
     spent 0.1 rad and more away."""
-    optimiser: Literal["adam", "lbfgs"] = "lbfgs"
-    """How: L-BFGS with line search, or Adam with its step halved five times in all."""
+    optimiser: Literal["cautious", "adam", "lbfgs"] = "cautious"
+    """How: Adam that retreats with half the step when the cost rises, Adam with its step halved five times in all as
+    in the paper, or L-BFGS with line search."""
     learning_rate: Annotated[
-        float | None, number("--learning-rate", above=0.0, most=100.0, unit=""), default("adam 0.01, lbfgs 1")
+        float | None, number("--learning-rate", above=0.0, most=100.0, unit=""), default("0.01, lbfgs 1")
     ] = None
     """Step of the optimiser."""
     patience: Annotated[int | None, integer("--patience", least=1, most=1_000_000), default("all epochs")] = None
@@ -86,8 +87,9 @@ class Train:
         folder = folder_for(self.out, "train", robot.name)
         facts = {"settings": self._settings(robot.source), "versions": versions(), "robot_sha256": robot.sha256}
         if not self.resume:
-            whole = facts | {"interrupted": False}
-            check_folder(folder, (training.CHECKPOINT, *training.FILES), whole, self.force)
+            whole, names = facts | {"interrupted": False}, (training.CHECKPOINT, *training.FILES)
+            whose, remedy = "another or an unfinished training", "give another --out, --resume to go on with it"
+            check_folder(folder, names, whole, self.force, whose=whose, remedy=remedy)
         with made(folder):
             result = training.train_robot(
                 robot,

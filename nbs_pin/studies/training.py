@@ -50,7 +50,7 @@ def train_robot(
     bandwidth: float = 8.0,
     frequencies: tuple[float, ...] = (0.5, 1.0, 2.0),
     starts: int = 32,
-    start_error: float = 0.5,
+    start_error: float = 0.3,
     duration: float = 1.0,
     period: float = 0.005,
     cost: str = "torque-aware",
@@ -64,7 +64,8 @@ def train_robot(
     the frequencies. cost: by name (`stage_cost`). folder: where `CHECKPOINT` is kept, None for nowhere. duration,
     period [s], start_error [rad], and settings (epochs, optimiser, resume, …): as `train` has them.
     The fresh motions last three times longer, from `FRESH_STARTS` starts per frequency that training never saw.
-    Raises ArgumentError for settings that do not fit and a motion outside the arm's limits; errors of `train` else.
+    Raises ArgumentError for settings that do not fit and a motion outside the arm's limits, KeyboardInterrupt when
+    Ctrl-C comes before the first epoch is over; errors of `train` else.
     """
     references = [Sinusoid.for_robot(robot, frequency) for frequency in frequencies]
     for reference in references:
@@ -86,6 +87,8 @@ def train_robot(
         checkpoint=None if folder is None else folder / CHECKPOINT,
         **settings,
     )
+    if not training.history.size:
+        raise KeyboardInterrupt
     steps = _LONGER * round(duration / period)
     loop = Loop.of(plant, robot.nv, steps * period, period, plant_step=period, effort_limit=None, lookahead=None)
     fresh = fresh_batch(loop, references, start_error, seed)

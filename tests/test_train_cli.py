@@ -1,0 +1,281 @@
+"""`nbs-pin train`: what it writes and prints, what it refuses, and that Ctrl-C and --resume lose nothing."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import nbs_pin as nbs
+from nbs_pin import cli
+from nbs_pin.charts import plot_training
+from nbs_pin.learning import training as learning
+from nbs_pin.studies import training
+from nbs_pin.versions import versions
+from tests.test_plotting import drawn, png_size, sinusoid_run
+
+QUICK = ("--starts", "6", "--duration", "0.3", "--frequencies", "1,2", "--epochs", "6", "--bandwidth", "4")
+FILES = ["controller.nbs", "learning.png", "summary.json", "training.ckpt"]
+
+
+def train(folder, *options, robot="two_link"):
+    return cli.main(["train", robot, *QUICK, "--out", str(folder), *options])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where two_link was trained."""
+    folder = tmp_path_factory.mktemp("trained") / "two_link"
+    assert train(folder) == 0
+    return folder
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def outcome(folder):
+    """Everything that a training decides: weights, and the cost of every epoch."""
+    weights = nbs.load(folder / "controller.nbs").state_dict()
+    curves = summary(folder)
+    return {k: x.numpy().tobytes() for k, x in weights.items()}, curves["history"], curves["held_out"]
+
+
+# Results.
+
+
+def test_the_summary_holds_every_figure(folder):
+    said = summary(folder)
+    assert sorted(contents(folder)) == FILES
+    assert said["versions"] == versions()
+    assert said["robot_sha256"] == nbs.load_robot("two_link").sha256
+    assert not said["interrupted"]
+    figures = said["figures"]
+    assert (figures["epochs"], figures["stopped"], figures["fresh_starts"]) == (6, "epochs", 40)
+    assert len(said["history"]) == len(said["held_out"]) == 7
+    best = figures["best_epoch"]
+    assert figures["held_out_cost"] == [said["held_out"][0], said["held_out"][best]]
+    assert figures["training_cost"] == [said["history"][0], said["history"][best]]
+    assert said["held_out"][best] == min(said["held_out"]) < said["held_out"][0]
+    assert figures["held_out_cost_lowered_by"] == 1.0 - said["held_out"][best] / said["held_out"][0]
+
+
+def test_the_table_is_the_summary(tmp_path, capsys):
+    assert train(tmp_path / "run", "--epochs", "2", "--optimiser", "lbfgs") == 0
+    printed, figures = capsys.readouterr().out, summary(tmp_path / "run")["figures"]
+    for before, after in (figures["training_cost"], figures["held_out_cost"]):
+        assert f"{before:.4g}   {after:.4g}" in " ".join(printed.split()).replace(" ", "   ")
+    for name, form in (("peak_torque_Nm", "{:.4g}"), ("saturated_fraction", "{:.2%}"), ("rms_torque_Nm", "{:.4g}")):
+        for when in ("before", "after"):
+            assert form.format(figures[when][name]) in printed
+    assert f"lowered by {figures['held_out_cost_lowered_by']:.1%}" in printed
+    assert printed.splitlines()[-3:] == [str(tmp_path / "run" / name) for name in training.FILES]
+
+
+def test_fresh_starts_are_judged_as_simulate_would(folder):
+    """One of the fresh motions again by `simulate`, and the figures from it alone."""
+    robot = nbs.load_robot("two_link")
+    law = nbs.load(folder / "controller.nbs", robot)
+    plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot))
+    references = [nbs.Sinusoid.for_robot(robot, w) for w in (1.0, 2.0)]
+    loop = training.Loop.of(plant, 2, 0.9, 0.005, plant_step=0.005, effort_limit=None, lookahead=None)
+    batch = training.fresh_batch(loop, references, 0.3, seed=0)
+    run = training.compared(law, batch)
+    times = nbs.metrics.convergence_time(run)
+    assert summary(folder)["figures"]["after"]["convergence_time_worst_s"] == times.max()
+    for k, reference in ((3, references[0]), (31, references[1])):
+        again = nbs.simulate(plant, law, reference, 0.9, 0.005, q0=batch.q0[k], plant_step=0.005)
+        np.testing.assert_allclose(run.q[:, k], again.q, atol=1e-9)
+        assert np.abs(again.q[0] - again.q_ref[0]).max() <= 0.3
+
+
+def test_a_trained_controller_can_be_tracked_and_trained_on(folder, tmp_path, capsys):
+    saved = str(folder / "controller.nbs")
+    assert (
+        cli.main(["track", "two_link", "--controller", saved, "--duration", "0.1", "--out", str(tmp_path / "a")]) == 0
+    )
+    assert len(summary(tmp_path / "a")["settings"]["controller_sha256"]) == 64
+    run = nbs.Run.load(tmp_path / "a" / "run.npz")
+    state = (run.q[5], run.v[5], run.q_ref[5], run.v_ref[5], run.a_ref[5])
+    plain = nbs.simulate(nbs.MujocoPlant(nbs.load_robot("two_link")), nbs.load(saved), nbs.Sinusoid.for_robot(
+        nbs.load_robot("two_link")), 0.1, 0.001)  # fmt: skip
+    np.testing.assert_array_equal(run.tau, plain.tau)
+    assert np.isfinite(state).all()
+    assert train(tmp_path / "b", "--controller", saved, "--epochs", "1") == 0
+    assert summary(tmp_path / "b")["history"][0] == summary(folder)["history"][summary(folder)["figures"]["best_epoch"]]
+
+
+@pytest.mark.parametrize("law", ["nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid"])
+def test_every_law_by_name_learns(tmp_path, capsys, law):
+    assert train(tmp_path / law, "--controller", law, "--epochs", "3", "--learning-rate", "0.003") == 0
+    history = summary(tmp_path / law)["history"]
+    assert min(history) < history[0]
+
+
+@pytest.mark.parametrize("cost", ["squared-error", "time-outside"])
+def test_options_reach_the_training(tmp_path, capsys, cost, folder):
+    options = ("--cost", cost, "--no-effort-limit", "--fixed-gains", "--patience", "5", "--learning-rate", "0.001")
+    assert train(tmp_path / "run", *options) == 0
+    before, after = (nbs.load(path / "controller.nbs") for path in (folder, tmp_path / "run"))
+    assert before.rate.change.abs().min() > 0.0
+    assert not after.rate.change.any()
+    figures = summary(tmp_path / "run")["figures"]
+    assert figures["after"]["saturated_fraction"] == 0.0
+    assert figures["held_out_cost"][0] != summary(folder)["figures"]["held_out_cost"][0]
+
+
+# Stopping and going on.
+
+
+@pytest.mark.parametrize(("optimiser", "call"), [("cautious", 4), ("cautious", 11), ("cautious", 13), ("lbfgs", 9)])
+def test_ctrl_c_at_any_moment_and_resume_are_one_training(folder, tmp_path, capsys, monkeypatch, optimiser, call):
+    """Interrupted in the middle of a cost or a gradient, --resume goes on to the same last bit."""
+    calls, cost = [], learning.running_cost
+
+    def counted(*arguments):
+        calls.append(1)
+        value = cost(*arguments)
+        if len(calls) == call:
+            raise KeyboardInterrupt
+        return value
+
+    options = ("--optimiser", optimiser)
+    whole = folder
+    if optimiser == "lbfgs":
+        whole = tmp_path / "whole"
+        assert train(whole, *options) == 0
+    monkeypatch.setattr(learning, "running_cost", counted)
+    assert train(tmp_path / "parts", *options) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert summary(tmp_path / "parts")["interrupted"]
+    assert len(summary(tmp_path / "parts")["history"]) in range(1, 7)
+    assert train(tmp_path / "parts", *options) == 2  # neither --resume nor --force
+    assert "--resume to go on with it" in capsys.readouterr().err
+    assert train(tmp_path / "parts", *options, "--resume") == 0
+    assert outcome(tmp_path / "parts") == outcome(whole)
+
+
+def test_resuming_what_is_done_changes_nothing(folder, tmp_path, capsys):
+    before = outcome(folder)
+    assert train(folder, "--resume") == 0
+    assert outcome(folder) == before
+
+
+def test_ctrl_c_before_the_first_epoch_leaves_nothing(tmp_path, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(learning, "running_cost", interrupted)
+    assert train(tmp_path / "run") == 130
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_real_ctrl_c_at_a_terminal(tmp_path):
+    """The bar says the cost and the time left; the signal ends the training within an epoch, results written."""
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "nbs_pin.cli", "train", "two_link", *QUICK, "--epochs", "100000"]
+    process = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "run")], stderr=theirs, env=os.environ | {"COLUMNS": "120"}
+    )
+    os.close(theirs)
+    shown = b""
+    while b"cost" not in shown or not (tmp_path / "run" / "training.ckpt").exists():
+        shown += os.read(ours, 4096)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+    os.close(ours)
+    assert b"from 0.0" in shown
+    assert sorted(contents(tmp_path / "run")) == FILES
+    figures = summary(tmp_path / "run")["figures"]
+    assert figures["stopped"] == "interrupted"
+    assert figures["epochs"] == len(summary(tmp_path / "run")["history"]) >= 5
+
+
+# Refusals.
+
+
+def test_results_of_another_training_are_kept_unless_forced(tmp_path, capsys):
+    assert train(tmp_path, "--epochs", "1") == 0
+    before = contents(tmp_path)
+    assert train(tmp_path, "--epochs", "1", "--seed", "2") == 2
+    assert "training.ckpt of another or an unfinished training" in capsys.readouterr().err
+    assert contents(tmp_path) == before
+    assert train(tmp_path, "--epochs", "1") == 0  # the very same
+    assert train(tmp_path, "--epochs", "1", "--seed", "2", "--force") == 0
+    assert summary(tmp_path)["settings"]["seed"] == 2
+
+
+@pytest.mark.parametrize("change", ["--seed=1", "--bandwidth=7", "--starts=8", "--effort-limit=50", "--epochs=7"])
+def test_a_resume_of_another_training_is_refused(folder, capsys, change):
+    before = contents(folder)
+    assert train(folder, "--resume", change) == 2
+    assert "not a checkpoint of this training" in " ".join(capsys.readouterr().err.split())
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("command", ["track", "train"])
+def test_a_controller_of_another_arm_is_refused_in_a_sentence(folder, tmp_path, capsys, command):
+    saved = str(folder / "controller.nbs")
+    assert cli.main([command, "panda", "--controller", saved, "--out", str(tmp_path / "run")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is for the arm 'two_link'" in line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--frequencies 1,,2", "--frequencies is '1,,2'; give numbers above 0"),
+        ("--frequencies -1", "frequencies"),
+        ("--frequencies 500", "the reference needs the torque"),
+        ("--starts 0", "give a whole number from 1"),
+        ("--epochs 0", "give a whole number from 1"),
+        ("--duration 0.3001", "expected a whole number; take for instance 0.3 s"),
+        ("--period 0.2", "--period is '0.2'"),
+        ("--learning-rate 0", "--learning-rate is '0'"),
+        ("--controller nsb", "no controller 'nsb'; did you mean nbs?"),
+        ("--controller none.nbs", "none.nbs"),
+        ("--cost time", "time"),
+        ("--effort-limit 5 --no-effort-limit", "choose one"),
+        ("--bandwidth 200", "at most 100 rad/s"),
+        ("--resume", "training.ckpt"),
+        ("--controller computed-torque --fixed-gains", "nothing is left to train"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_in_a_sentence(tmp_path, capsys, options, words):
+    assert train(tmp_path / "run", *options.split()) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "warning" not in line]
+    assert line.startswith("nbs-pin: error: ")
+    assert words in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_help_shows_an_example(capsys):
+    assert cli.main(["train", "--help"]) == 0
+    assert "Example: nbs-pin train panda" in capsys.readouterr().out
+
+
+# The picture.
+
+
+@pytest.mark.parametrize("held_out", [np.array([0.5, 0.3, 0.4]), np.empty(0)])
+def test_the_picture_marks_the_best_epoch_and_draws_median_and_worst(tmp_path, monkeypatch, held_out):
+    history, run = np.array([1.0, 0.5, 0.4]), sinusoid_run(2, batch=(5,))
+    run.q[:] += 0.01 * np.arange(5)[:, None]
+    figure = drawn(lambda: plot_training(history, held_out, run, run, tmp_path / "a.png"), monkeypatch)
+    assert png_size(tmp_path / "a.png") == (1320, 504)
+    costs, errors = figure.axes
+    chosen = held_out if held_out.size else history
+    marked = next(line for line in costs.lines if line.get_marker() == "o")
+    assert marked.get_xydata().tolist() == [[int(chosen.argmin()), chosen.min()]]
+    size = np.sqrt(nbs.metrics.squared_error(run))
+    np.testing.assert_allclose(errors.lines[0].get_ydata(), np.median(size, axis=1))
+    np.testing.assert_allclose(errors.lines[1].get_ydata(), size.max(axis=1))
