@@ -36,7 +36,7 @@ HOMES = {
     "trimesh": {"meshes", "visuals", "replay_page"},
     "scipy": {"reference_files", "visuals"},
     "xacrodoc": {"urdf_source"},
-    "numba": {"studies.bench", "runtime.jit", "runtime.laws", "runtime.threads"},
+    "numba": {"studies.bench", "runtime.jit", "runtime.laws", "runtime.tree_laws", "runtime.threads"},
 }
 
 

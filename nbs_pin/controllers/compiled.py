@@ -10,25 +10,30 @@ from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.runtime.laws import compile_laws, law_row, law_rows
-from nbs_pin.runtime.layout import COMPUTED_TORQUE, PD_GRAVITY, Packed
+from nbs_pin.runtime.layout import Packed
 from nbs_pin.runtime.threads import over_cores
+from nbs_pin.runtime.tree_laws import compile_tree_laws, tree_law, tree_law_workspace, tree_laws
 
 
 class CompiledController(MemorylessController):
-    """τ = M(q) a_r + C(q, v) v_r + G(q) + feedback: the law from a kernel, the model by its provider's shortest route.
+    """τ = M(q) a_r + C(q, v) v_r + G(q) + feedback as machine code.
 
-    What `compile()` of a memoryless law gives: a snapshot, which later changes of that controller do not reach.
-    Numpy only; batches run over all cores. NaN in gives NaN out. Each owns scratch space: use one per thread.
+    Where the model is a rigid tree (`DynamicsProvider.packed_tree`) one kernel does it all; any other model's own
+    `reference_torque` is called beside the law's kernel. A snapshot, which later changes of the controller it came from
+    do not reach. Numpy only; batches run over all cores. NaN in gives NaN out. Each owns scratch space: one per thread.
 
     law: constants and weights as numpy arrays (`Controller.packed_law`). dynamics: what the law believes of the arm.
     """
 
     def __init__(self, law: Packed, dynamics: DynamicsProvider) -> None:
-        compile_laws()
-        self.law, self.dynamics = law, dynamics
-        self._model = _model_route(int(law.layout[0]), dynamics)
-        self._v_r, self._a_r, self._feedback = np.empty((3, dynamics.nv))
-        self._packed = (law.layout, law.weights, np.empty(int(law.layout[7])))
+        self.law, self.dynamics, self._tree = law, dynamics, dynamics.packed_tree()
+        if self._tree is None:
+            compile_laws()
+            self._packed: tuple[np.ndarray, ...] = (*law, np.empty(int(law.layout[7])))
+            self._signals = np.empty((3, dynamics.nv))
+        else:
+            compile_tree_laws()
+            self._packed = (*law, *self._tree, np.empty(tree_law_workspace(law, self._tree)))
         one, two = np.zeros(dynamics.nv), np.zeros((2, dynamics.nv))
         for x in (one, two):  # so that no first call, of whatever the model compiles, happens inside a control loop
             self.torque(x, x, x, x, x)
@@ -52,13 +57,26 @@ class CompiledController(MemorylessController):
         Raises ArgumentError when shapes do not fit, or for tensors: those belong to the controller this one came from.
         """
         if isinstance(q, np.ndarray) and q.ndim == 1:
+            tau = np.empty(self.nv)
             try:
-                fits = law_row(q, v, q_ref, v_ref, a_ref, *self._packed, self._v_r, self._a_r, self._feedback)
+                fits = self._one(q, v, q_ref, v_ref, a_ref, tau)
             except TypeError:  # not all contiguous float64 vectors: converted and checked below
                 fits = False
             if fits:
-                return self._model(q, v, self._v_r, self._a_r) + self._feedback
+                return tau
         return self._torques(*as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref))
+
+    def _one(
+        self, q: np.ndarray, v: np.ndarray, q_ref: np.ndarray, v_ref: np.ndarray, a_ref: np.ndarray, tau: np.ndarray
+    ) -> bool:
+        """The torque of one state → tau; False, and nothing done, unless all have length nv."""
+        if self._tree is not None:
+            return tree_law(q, v, q_ref, v_ref, a_ref, *self._packed, tau)
+        v_r, a_r, feedback = self._signals
+        if not law_row(q, v, q_ref, v_ref, a_ref, *self._packed, v_r, a_r, feedback):
+            return False
+        tau[:] = self.dynamics.reference_torque(q, v, v_r, a_r) + feedback
+        return True
 
     def _torques(self, *states: Array) -> Float[np.ndarray, "*batch n"]:
         if is_torch_array(states[0]):
@@ -68,27 +86,14 @@ class CompiledController(MemorylessController):
             )
         shape, n = states[0].shape, self.nv
         rows = [np.array(x, dtype=float, order="C").reshape(-1, n) for x in states]
-        v_r, a_r, feedback = np.empty((3, *rows[0].shape))
-        layout, weights, work = self._packed
+        tau, (*packed, work) = np.empty(rows[0].shape), self._packed
+        if self._tree is not None:
 
-        def evaluate(part: slice) -> None:
-            given, signals = (x[part] for x in rows), (x[part] for x in (v_r, a_r, feedback))
-            law_rows(*given, layout, weights, np.empty_like(work), *signals)
+            def evaluate(part: slice) -> None:
+                tree_laws(*(x[part] for x in rows), *packed, np.empty_like(work), tau[part])
 
-        over_cores(evaluate, len(v_r))
-        return (self._model(rows[0], rows[1], v_r, a_r) + feedback).reshape(shape)
-
-
-def _gravity(route: Any, q: np.ndarray) -> np.ndarray:
-    zero = np.zeros(q.shape)
-    return route(q, zero, zero, zero)
-
-
-def _model_route(law: int, dynamics: DynamicsProvider) -> Any:
-    """(q, v, v_r, a_r) -> M a_r + C v_r + G by the shortest way that this law allows."""
-    route = dynamics.compiled_reference_torque()
-    if law == PD_GRAVITY:
-        return lambda q, v, v_r, a_r: _gravity(route, q)
-    if law == COMPUTED_TORQUE:  # v_r is v, and the provider may see it
-        return lambda q, v, v_r, a_r: route(q, v, v, a_r)
-    return route
+            over_cores(evaluate, len(tau))
+            return tau.reshape(shape)
+        v_r, a_r, feedback = np.empty((3, *tau.shape))
+        law_rows(*rows, *packed, work, v_r, a_r, feedback)
+        return (self.dynamics.reference_torque(rows[0], rows[1], v_r, a_r) + feedback).reshape(shape)

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, array_namespace
-from nbs_pin.dynamics.provider import DynamicsProvider, ReferenceTorque
+from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
 from nbs_pin.runtime.layout import Packed
@@ -72,21 +72,6 @@ class AnalyticDynamics(DynamicsProvider):
         xp = array_namespace(q)
         elbow = self._weights[1] * xp.cos(q[..., 0] + q[..., 1])
         return xp.stack([self._weights[0] * xp.cos(q[..., 0]) + elbow, elbow], axis=-1)
-
-    def compiled_reference_torque(self) -> ReferenceTorque:
-        """The equations above as machine code; a subclass's own `reference_torque`."""
-        if type(self) is not AnalyticDynamics:
-            return self.reference_torque
-        from nbs_pin.runtime.models import two_link_torques
-
-        constants = np.array([self._shoulder, self._forearm, self._coupling, *self._weights])
-
-        def route(q: np.ndarray, v: np.ndarray, v_r: np.ndarray, a_r: np.ndarray) -> np.ndarray:
-            tau = np.empty(q.shape)
-            two_link_torques(*(x.reshape(-1, 2) for x in (q, v, v_r, a_r)), constants, tau.reshape(-1, 2))
-            return tau
-
-        return route
 
     def packed_tree(self) -> Packed | None:
         """Two point masses on joints about z, with gravity along −y; None for a subclass."""

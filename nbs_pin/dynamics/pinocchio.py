@@ -9,7 +9,7 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, as_vectors, is_torch_array, over_rows
-from nbs_pin.dynamics.provider import DynamicsProvider, ReferenceTorque
+from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
 from nbs_pin.runtime.layout import Packed
@@ -91,10 +91,6 @@ class PinocchioDynamics(DynamicsProvider):
     ) -> Float[Array, "*batch n"]:
         """v̇ [rad/s²] by the articulated body algorithm."""
         return self._evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q=q, v=v, tau=tau)
-
-    def compiled_reference_torque(self) -> ReferenceTorque:
-        """The two RNEA on scratch space of its own, one where v_r is v itself; a subclass's own `reference_torque`."""
-        return _TwoRnea(self._model, self._weightless) if type(self) is PinocchioDynamics else self.reference_torque
 
     def packed_tree(self) -> Packed | None:
         """The arm's joints and bodies; None for a subclass, which may have changed an equation."""
@@ -194,25 +190,3 @@ def pack_model(model: pin.Model) -> Packed:
         place = (model.parents[i], slides, axis, at.rotation, at.translation)
         links.append(Link(*place, body.mass, body.lever, body.inertia, float(model.armature[i - 1])))
     return pack_tree(links, model.gravity.linear)
-
-
-class _TwoRnea:
-    """`PinocchioDynamics.reference_torque` for numpy, without a check or an array to spare."""
-
-    def __init__(self, model: pin.Model, weightless: pin.Model) -> None:
-        from nbs_pin.runtime.models import halves
-
-        self._model, self._weightless, self._data, self._halves = model, weightless, model.createData(), halves
-        self._mean, self._half, self._zero = np.zeros((3, model.nv))
-
-    def __call__(self, q: Row, v: Row, v_r: Row, a_r: Row) -> Row:
-        if q.ndim > 1:
-            same = v_r is v
-            rows = zip(q, v, v if same else v_r, a_r, strict=True)
-            return np.array([self(x, w, w if same else w_r, b) for x, w, w_r, b in rows]).reshape(q.shape)
-        if v_r is v:
-            return pin.rnea(self._model, self._data, q, v, a_r)
-        self._halves(v, v_r, self._mean, self._half)
-        tau = pin.rnea(self._model, self._data, q, self._mean, a_r)
-        tau -= pin.rnea(self._weightless, self._data, q, self._half, self._zero)
-        return tau

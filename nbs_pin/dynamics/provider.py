@@ -1,17 +1,12 @@
 """The protocol of every dynamics model: four ingredients, from which every equation follows."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import TypeAlias
 
 from jaxtyping import Float
 
 from nbs_pin.arrays import Array, array_namespace, matvec
 from nbs_pin.robot import Robot, configuration_difference
 from nbs_pin.runtime.layout import Packed
-
-ReferenceTorque: TypeAlias = Callable[[Array, Array, Array, Array], Array]
-"""(q, v, v_r, a_r) -> M(q) a_r + C(q, v) v_r + G(q) [N·m]."""
 
 
 class DynamicsProvider(ABC):
@@ -61,13 +56,6 @@ class DynamicsProvider(ABC):
     ) -> Float[Array, "*batch n"]:
         """M(q) a_r + C(q, v) v_r + G(q) [N·m], the one quantity a passivity-based law needs (docs/theory.md §1)."""
         return matvec(self.mass_matrix(q), a_r) + matvec(self.coriolis_matrix(q, v), v_r) + self.gravity(q)
-
-    def compiled_reference_torque(self) -> ReferenceTorque:
-        """`reference_torque` for numpy arrays (..., nv) by this model's fastest route: what compiled laws call.
-
-        Whatever that route compiles is compiled when it is first called. It may own scratch space.
-        """
-        return self.reference_torque
 
     def packed_tree(self) -> Packed | None:
         """The model as a rigid tree for the kernels of `runtime/trees.py`, or None when it is none."""

@@ -91,7 +91,7 @@ def train(
     """The controller whose parameters make the mean of ∫ l(z1, v − v_d, τ) dt + regulariser smallest over many motions.
 
     The loop is that of `simulate`, with its arguments `duration`, `period`, `effort_limit` and `lookahead`, and the
-    gradient is the exact one, through law, model, torque limits and integrator. Source: paper eq. (13), docs/theory.md §7.
+    gradient is the exact one, through law, model, torque limits and integrator. Source: paper eq. (13), theory.md §7.
 
     plant: a `DynamicsPlant`. references: each is followed from every start. starts: configurations (starts, n) at rest,
     a pair (q0, v0), or how many to draw, each joint within ±start_error [rad] of the reference's start. held_out: the

@@ -17,10 +17,10 @@ from nbs_pin.runtime.adjoints import adjoint_workspace, law_adjoint, pid_adjoint
 from nbs_pin.runtime.jit import kernel
 from nbs_pin.runtime.laws import law_row, pid
 from nbs_pin.runtime.layout import PID, Packed
+from nbs_pin.runtime.tree_laws import tree_law
 from nbs_pin.runtime.trees import (
     tree_acceleration,
     tree_acceleration_adjoint,
-    tree_torque,
     tree_torque_adjoint,
     tree_workspace,
 )
@@ -161,25 +161,15 @@ def _ask(
 ) -> None:
     """The torque the law asks for, and what it remembers afterwards."""
     n = len(q)
-    q_seen, v_seen, v_r, a_r, feedback = (
-        work[:n],
-        work[n : 2 * n],
-        work[2 * n : 3 * n],
-        work[3 * n : 4 * n],
-        work[4 * n : 5 * n],
-    )
-    room = work[8 * n :]
+    q_seen, v_seen, room = work[:n], work[n : 2 * n], work[5 * n :]
     _ahead(q, v, aim[0], lead, q_seen, v_seen)
     if layout[0] == PID:
-        out = work[5 * n : 8 * n].reshape(3, n)
-        gains = weights.reshape(6, n)
+        out, gains = work[2 * n : 5 * n].reshape(3, n), weights.reshape(6, n)
         pid(memory[0], memory[1], q_seen, v_seen, aim[1], aim[2], scene.clock[0], gains, out)
         command[:], after[0], after[1] = out[0], out[1], out[2]
         return
-    law_row(q_seen, v_seen, aim[1], aim[2], aim[3], layout, weights, room, v_r, a_r, feedback)
-    tree_torque(q_seen, v_seen, v_r, a_r, scene.belief[0], scene.belief[1], room, command)
-    for i in range(n):
-        command[i] += feedback[i]
+    tree, bodies = scene.belief
+    tree_law(q_seen, v_seen, aim[1], aim[2], aim[3], layout, weights, tree, bodies, room, command)
 
 
 @kernel
