@@ -195,7 +195,7 @@ def test_results_of_another_run_are_kept_unless_forced(two_link, capsys):
 # Refusals: exit code 2 and one sentence.
 
 REFUSED = {
-    "": "Expected one of {track, replay, bench, robots}",
+    "": f"Expected one of {{{', '.join(cli.NAMES)}}}",
     "trak panda": "no command 'trak'; did you mean track?",
     "track": "ROBOT",
     "track pand": "did you mean panda?",
