@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from nbs_pin.metrics import PAPER_THRESHOLD, squared_error
-from nbs_pin.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, TORQUE, picture
+from nbs_pin.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
 from nbs_pin.state import Run
 
 
@@ -51,7 +51,7 @@ def _draw_costs(axes: Axes, history: Float[np.ndarray, " epochs"], held_out: Flo
     chosen = held_out if held_out.size else history
     best, colour = int(np.nanargmin(chosen)), REFERENCE if held_out.size else ACTUAL
     lowered = f"best, {1.0 - chosen[best] / chosen[0]:.0%} lower"
-    axes.plot(best, chosen[best], "o", color=colour, markersize=5, label=lowered)
+    axes.plot(best, chosen[best], "o", color=colour, markersize=5, clip_on=False, label=lowered)
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
@@ -112,3 +112,67 @@ def _draw_comparison(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.set_yticks(range(len(laws)), laws)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else ""))
+
+
+def plot_motions(columns: Mapping[str, Mapping[str, Sequence[Run]]], path: str | Path, *, until: float) -> Path:
+    """Draws two-joint motions side by side and writes the picture (PNG); returns its path.
+
+    columns: title -> label -> runs, each with any batch of starts; a colour per label, joint 1 solid, joint 2 dashed.
+    Rows: angles and tracking errors up to the time `until` [s], then ‖z1‖² over all of it, both axes logarithmic.
+    """
+    with picture(path, 1.2 + 4.2 * max(len(columns), 1.6), 8.4) as figure:
+        grid = figure.subplots(3, len(columns), squeeze=False, sharey="row")
+        for axes, (title, runs) in zip(grid.T, columns.items(), strict=True):
+            for (label, several), colour in zip(runs.items(), (ACTUAL, ERROR, TORQUE, REFERENCE), strict=False):
+                _draw_motions(axes, several, colour, label, until)
+            axes[0].set_title(title, loc="left")
+            axes[0].legend(frameon=False, loc="best")
+        for axes, name in zip(grid[:, 0], ("angles [rad]", "tracking errors z1 [rad]", "‖z1‖² [rad²]"), strict=True):
+            axes.set_ylabel(name)
+    return Path(path)
+
+
+def _draw_motions(axes: np.ndarray, runs: Sequence[Run], colour: str, label: str, until: float) -> None:
+    """A column of `plot_motions`: the motions of one colour."""
+    angles, errors, squares = axes
+    for run in runs:
+        shown, starts = run.t <= until, run.q.reshape(len(run.t), -1, run.nv)
+        z1 = starts - run.q_ref.reshape(starts.shape)
+        width = 1.2 if starts.shape[1] * len(runs) == 1 else 0.7
+        for joint, style in ((0, "-"), (1, "--")):
+            angles.plot(run.t[shown], starts[shown, :, joint], style, color=colour, linewidth=width)
+            errors.plot(run.t[shown], z1[shown, :, joint], style, color=colour, linewidth=width)
+            wanted = run.q_ref.reshape(starts.shape)[shown, 0, joint]
+            angles.plot(run.t[shown], wanted, style, color="#1d2733", linewidth=0.9, zorder=3)
+        squares.loglog(run.t[1:], (z1**2).sum(-1)[1:], color=colour, linewidth=width)
+    angles.plot([], [], color=colour, label=label)
+    squares.axhline(PAPER_THRESHOLD, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
+    for panel, end in ((angles, until), (errors, until), (squares, None)):
+        panel.set(xlabel="time [s]", xlim=(run.period if end is None else 0.0, end))
+
+
+def plot_bounds(
+    alpha: Float[np.ndarray, " alphas"],
+    panels: Mapping[str, Mapping[str, Float[np.ndarray, " alphas"]]],
+    path: str | Path,
+) -> Path:
+    """Draws ‖z1‖² [rad²] against α, a panel per title, and writes the picture (PNG); returns its path.
+
+    panels: title -> name -> values; a name that speaks of a bound is a line, every other one a row of dots.
+    """
+    with picture(path, 5.6 * len(panels), 4.6) as figure:
+        grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+        for axes, (title, series) in zip(grid, panels.items(), strict=True):
+            bounds = iter((LIMIT, REFERENCE))
+            measured = iter((ACTUAL, TORQUE, SATURATED, ERROR))
+            for name, values in series.items():
+                if "bound" in name:
+                    axes.plot(alpha, values, color=next(bounds), linewidth=1.8, label=name)
+                else:
+                    axes.plot(alpha, values, "o", color=next(measured), markersize=3.2, label=name)
+            axes.set_yscale("log")
+            axes.set(xlabel="α", xlim=(0.0, 1.02 * float(alpha.max())))
+            axes.set_title(title, loc="left")
+            axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
+        grid[0].set_ylabel("‖z1‖² [rad²]")
+    return Path(path)
