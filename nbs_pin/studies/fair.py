@@ -1,7 +1,5 @@
 """The fair comparison: every law tuned alike on the same motions, and judged on starts that none of them has seen."""
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -14,7 +12,6 @@ import torch
 from nbs_pin import metrics
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.files import write_whole
 from nbs_pin.learning.closed_loop import Batch, motions, recorded
 from nbs_pin.learning.costs import TimeOutside
 from nbs_pin.learning.training import Training, train
@@ -23,6 +20,7 @@ from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.progress import tracked
 from nbs_pin.references import DesiredMotion, Sinusoid
 from nbs_pin.robot import Robot, load_robot
+from nbs_pin.studies.pages import Section, markdown_table, plain, write_csv
 from nbs_pin.studies.tracking import build_controller
 
 FREQUENCIES = (0.1, 1.0, 3.0)
@@ -194,26 +192,18 @@ def judge(setting: Setting, name: str, law: Any, *, count: int, seed: int) -> li
     return rows
 
 
-def fair_part(folder: Path, seed: int, progress: bool) -> list[tuple[str, str]]:
+def fair_part(folder: Path, seed: int, progress: bool) -> list[Section]:
     """Runs the comparison, writes `fair.csv` and `fair.png` into the folder, and returns sections for the page."""
     from nbs_pin.charts import plot_comparison
 
     rows = compare_fairly(seed=seed, progress=progress)
-    write_whole(folder / "fair.csv", table_csv(rows).encode())
+    write_csv(folder / "fair.csv", list(asdict(rows[0])), [list(asdict(row).values()) for row in rows])
     plot_comparison([asdict(row) for row in rows], folder / "fair.png")
-    return [("The fair comparison", _protocol(rows))] + [
-        (setting.title, _tables([r for r in rows if (r.arm, r.period_s) == (setting.arm, setting.period)]))
+    figures = plain([asdict(row) for row in rows])
+    return [Section("The fair comparison", _protocol(rows), {"fair": figures})] + [
+        Section(setting.title, _tables([r for r in rows if (r.arm, r.period_s) == (setting.arm, setting.period)]))
         for setting in SETTINGS
     ]
-
-
-def table_csv(rows: Sequence[Row]) -> str:
-    """The rows as CSV."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(asdict(rows[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    return text.getvalue()
 
 
 def _built(setting: Setting, name: str, robot: Robot, seed: int) -> Any:
@@ -258,15 +248,22 @@ def _findings(rows: Sequence[Row]) -> str:
 
 
 def _tables(rows: Sequence[Row]) -> str:
-    head = (
-        "| ω [rad/s] | law | convergence, median [s] | worst [s] | steady error [rad²] | RMS torque [N·m] "
-        "| peak torque [N·m] | saturated |\n|---|---|---|---|---|---|---|---|\n"
-    )
-    return head + "".join(
-        f"| {r.frequency_rad_per_s:g} | {r.law} | {_time(r.convergence_median_s)} | {_time(r.convergence_worst_s)} "
-        f"| {r.steady_error_rad2:.1e} | {r.rms_torque_Nm:.1f} | {r.peak_torque_Nm:.1f} | {r.saturated_fraction:.1%} |\n"
-        for r in rows
-    )
+    head = ("law", "ω [rad/s]", "convergence, median [s]", "worst [s]", "steady error [rad²]", "RMS torque [N·m]",
+            "peak torque [N·m]", "saturated")  # fmt: skip
+    cells = [
+        (
+            r.law,
+            f"{r.frequency_rad_per_s:g}",
+            _time(r.convergence_median_s),
+            _time(r.convergence_worst_s),
+            f"{r.steady_error_rad2:.1e}",
+            f"{r.rms_torque_Nm:.1f}",
+            f"{r.peak_torque_Nm:.1f}",
+            f"{r.saturated_fraction:.1%}",
+        )
+        for r in sorted(rows, key=lambda r: r.frequency_rad_per_s)
+    ]
+    return markdown_table(head, cells)
 
 
 def _time(value: float) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from nbs_pin.files import write_whole
 
 
@@ -56,7 +58,7 @@ def plain(values: Any) -> Any:
     """Arrays and numbers as JSON can store them, None for what is not finite."""
     if isinstance(values, Mapping):
         return {key: plain(value) for key, value in values.items()}
-    if hasattr(values, "tolist"):
+    if isinstance(values, np.ndarray | np.generic):
         values = values.tolist()
     if isinstance(values, list | tuple):
         return [plain(value) for value in values]
