@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -31,6 +32,18 @@ def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = Tru
                 bar.update(task, description=_text(label), completed=done, visible=True, refresh=True)
                 drawn = now
             yield item
+
+
+@contextmanager
+def waiting(label: str, show: bool = True) -> Iterator[None]:
+    """A spinner on stderr while work without parts goes on, if stderr is a terminal."""
+    if not (show and sys.stderr.isatty()):
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(label):
+        yield
 
 
 def _text(label: str | Callable[[], str]) -> str:

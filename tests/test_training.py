@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import nbs_pin as nbs
-from nbs_pin.checkpoints import read_checkpoint
+from nbs_pin.checkpoints import about, read_checkpoint
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.learning.closed_loop import Batch, engine_for, motions, recorded, running_cost
@@ -117,6 +117,26 @@ def test_disturbances_are_differentiable_too():
         gradients.append(tau_d.grad)
     torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-15)
     assert float(gradients[0].abs().min()) > 0.0
+
+
+def test_disturbances_of_another_size_are_refused_before_any_kernel_runs():
+    robot = arm("two_link")
+    controller, batch = law_for(robot), problem(robot)
+    for shape in ((2, 5, 2), (2, 9, 2), (1, 8, 2), (2, 8, 3)):
+        with pytest.raises(ArgumentError, match="tau_d is"):
+            motions(controller, batch, None, torch.zeros(shape, dtype=torch.float64))
+    for torque in (np.zeros(3), [1.0, np.nan], "much"):
+        with pytest.raises(ArgumentError, match="disturbance"):
+            Batch.of(batch.loop, nbs.Sinusoid.for_robot(robot), tau_d=torque)
+
+
+def test_gradients_of_many_starts_are_the_sum_of_those_of_few(monkeypatch):
+    robot = arm("two_link")
+    controller, batch = law_for(robot), problem(robot, starts=7)
+    whole = value_and_gradient(controller, batch, squared_error, "kernels")
+    monkeypatch.setattr("nbs_pin.learning.closed_loop._TOGETHER", 3)
+    parts = value_and_gradient(controller, batch, squared_error, "kernels")
+    torch.testing.assert_close(parts[1], whole[1], rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -256,7 +276,7 @@ def stop_at(monkeypatch, epoch):
             os.kill(os.getpid(), signal.SIGINT)
         return motions(*arguments)
 
-    monkeypatch.setattr("nbs_pin.learning.training.motions", rollouts)
+    monkeypatch.setattr("nbs_pin.learning.trainer.motions", rollouts)
 
 
 def test_ctrl_c_keeps_the_best(monkeypatch, tmp_path):
@@ -282,12 +302,71 @@ def test_a_checkpoint_of_another_training_or_arm_is_refused(tmp_path):
     robot, path = arm("two_link"), tmp_path / "a.ckpt"
     controller = build_controller("nbs", robot, period=PERIOD)
     quick(controller, robot, checkpoint=path, epochs=2)
-    for change in ({"epochs": 3}, {"starts": 5}, {"seed": 1}, {"learning_rate": 0.5}, {"cost": squared_error}):
+    changes = (
+        {"epochs": 3},
+        {"starts": 5},
+        {"seed": 1},
+        {"learning_rate": 0.5},
+        {"cost": squared_error},
+        {"cost": TorqueAware(torch.tensor(robot.effort_limit), effort=1e-3)},
+        {"regulariser": lambda law: sum((p**2).sum() for p in law.parameters())},
+    )
+    for change in changes:
         with pytest.raises(ArgumentError, match="not a checkpoint of this training"):
             quick(controller, robot, **{"checkpoint": path, "epochs": 2, "resume": True} | change)
+    stiffer = build_controller("nbs", robot, period=PERIOD, bandwidth=7.0)
+    with pytest.raises(ArgumentError, match="not a checkpoint of this training"):
+        quick(stiffer, robot, checkpoint=path, epochs=2, resume=True)
+    assert about(path)["info"] == {"seed": 0}
     other = arm("three_link")
     with pytest.raises(ArgumentError, match="two_link"):
         quick(build_controller("nbs", other, period=PERIOD), other, checkpoint=path, epochs=2, resume=True)
+
+
+def test_a_training_whose_plant_is_another_arm_than_the_law_believes_is_resumed(tmp_path):
+    robot, heavier = arm("two_link"), nbs.load_robot("two_link", gravity=12.0)
+    controller = build_controller("nbs", robot, period=PERIOD)
+    plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(heavier))
+    settings = {"starts": 2, "duration": 0.2, "epochs": 3, "effort_limit": 50.0, "checkpoint": tmp_path / "c.ckpt"}
+    first = nbs.train(controller, plant, [nbs.Sinusoid.for_robot(robot)], **settings)
+    again = nbs.train(controller, plant, [nbs.Sinusoid.for_robot(robot)], **settings, resume=True)
+    np.testing.assert_array_equal(first.history, again.history)
+
+
+def test_what_no_checkpoint_can_hold_is_known_before_the_first_epoch(tmp_path):
+    class Mine(nbs.NeuralBackstepping):
+        pass
+
+    robot = arm("two_link")
+    with pytest.raises(ArgumentError, match="Mine"):
+        quick(Mine.for_robot(robot, period=PERIOD), robot, checkpoint=tmp_path / "c.ckpt", duration=0.02, epochs=1)
+
+
+def test_gradients_that_are_no_numbers_do_not_reach_the_parameters(tmp_path):
+    """A cost that is finite, with a derivative that is not from the third evaluation on."""
+    count = iter(range(1000))
+
+    def kinked(z1, dz1, tau):
+        return (z1 * z1).sum(-1) + (torch.sqrt(0.0 * z1[..., 0]) if next(count) > 8 else 0.0)
+
+    robot = arm("two_link")
+    result = quick(build_controller("nbs", robot, period=PERIOD), robot, cost=kinked, checkpoint=tmp_path / "c.ckpt")
+    assert all(bool(p.isfinite().all()) for p in result.controller.parameters())
+    assert result.history[1] < result.history[0]
+
+
+def test_costs_may_be_negative():
+    robot = arm("two_link")
+    result = quick(build_controller("nbs", robot, period=PERIOD), robot, cost=lambda z, dz, tau: (z * z).sum(-1) - 1.0)
+    assert result.history[0] < 0.0
+    assert len(set(result.history)) > 6
+
+
+def test_held_out_motions_that_are_never_finite_are_named():
+    robot = arm("two_link", np.inf)
+    far = np.full((1, 2), 1e200)
+    with pytest.raises(SimulationDiverged, match="the held-out motions left the finite numbers"):
+        quick(build_controller("nbs", robot, period=PERIOD), robot, held_out=far)
 
 
 def test_what_cannot_be_trained_is_refused_in_one_sentence():
@@ -303,6 +382,8 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence():
     for given, message in (
         ({"epochs": 0}, "epochs is 0"),
         ({"starts": 0}, "at least one"),
+        ({"start_error": -1.0}, "start_error"),
+        ({"disturbance": np.nan}, "disturbance"),
         ({"starts": np.zeros((3, 5))}, "q0 has shape"),
         ({"starts": np.full((3, 2), np.nan)}, "finite"),
         ({"learning_rate": -1.0}, "learning_rate"),
@@ -320,7 +401,7 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence():
 def test_motions_that_leave_the_finite_numbers_are_reported():
     robot = arm("two_link", np.inf)
     wild = nbs.ComputedTorque(nbs.PinocchioDynamics(robot), kp=1e9, kd=1e9)
-    with pytest.raises(SimulationDiverged, match="before anything was trained"):
+    with pytest.raises(SimulationDiverged, match="the training motions left the finite numbers"):
         quick(wild, robot, duration=1.0)
 
 

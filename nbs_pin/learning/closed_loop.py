@@ -7,8 +7,10 @@ from typing import Any, Literal, NamedTuple, TypeAlias, cast
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import nn
 from torch.autograd.function import once_differentiable
 
+from nbs_pin.checks import floats
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.exceptions import ArgumentError
@@ -24,6 +26,9 @@ from nbs_pin.state import Reference, Run
 
 Engine: TypeAlias = Literal["kernels", "torch"]
 """Compiled kernels with adjoints written by hand, or the law and the plant in torch as they are written."""
+
+
+_TOGETHER = 256  # gradients of so many starts are kept apart, so that no thread waits and their sum is always the same
 
 
 class Motions(NamedTuple):
@@ -65,7 +70,7 @@ class Batch:
         q, v = (np.array(x).reshape(-1, loop.plant.nv) for x in loop.start(reference, q0, v0))
         aim = np.stack([desired.a, target.q, target.v, target.a], axis=1)[:-1]
         aims, wanted = (np.tile(x, (len(q), 1, 1, 1)) for x in (aim, np.stack(desired, axis=1)))
-        torque = np.zeros((len(q), loop.steps, loop.plant.nv)) + (0.0 if tau_d is None else np.asarray(tau_d, float))
+        torque = np.zeros((len(q), loop.steps, loop.plant.nv)) + _constant_torque(tau_d, loop.plant.nv)
         return cls(loop, leads[:-1], aims, wanted, q, v, torque)
 
     @classmethod
@@ -74,6 +79,13 @@ class Batch:
         named = ("aims", "desired", "q0", "v0", "tau_d")
         joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in batches]) for name in named}
         return replace(batches[0], **joined)
+
+    def beginning(self) -> "Batch":
+        """The first period of the first motion."""
+        one = {name: getattr(self, name)[:1] for name in ("q0", "v0")}
+        rows = {name: getattr(self, name)[:1, :k] for name, k in (("aims", 1), ("desired", 2), ("tau_d", 1))}
+        first: dict[str, Any] = {name: np.ascontiguousarray(x) for name, x in (one | rows).items()}
+        return replace(self, leads=self.leads[:1], **first)
 
     def __len__(self) -> int:
         return len(self.q0)
@@ -99,10 +111,15 @@ def motions(
     check_plant(batch.loop)
     engine = engine_for(controller, batch.loop) if engine is None else engine
     torque = torch.as_tensor(batch.tau_d) if tau_d is None else tau_d
+    if torque.shape != batch.tau_d.shape or torque.dtype != torch.float64:
+        raise ArgumentError(
+            f"tau_d is {torque.dtype} of shape {tuple(torque.shape)}, expected float64 of shape {batch.tau_d.shape};"
+            " give a torque for every motion, period and joint."
+        )
     if engine == "torch":
         return _by_torch(controller, batch, torque)
     scene = _scene(controller, batch.loop)
-    if scene is None:
+    if scene is None or not _on_cpu(controller):
         raise ArgumentError(
             f"{type(controller).__name__} on {batch.loop.plant!r} has no kernels; take engine='torch', as any law can."
         )
@@ -142,6 +159,14 @@ def check_plant(loop: Loop) -> None:
 
 def _on_cpu(controller: Any) -> bool:
     return all(p.device.type == "cpu" for p in controller.parameters())
+
+
+def _constant_torque(tau_d: Any, nv: int) -> np.ndarray:
+    """The torque as an array; raises ArgumentError unless it is finite, a number or one per joint."""
+    torque = floats("disturbance", 0.0 if tau_d is None else tau_d)
+    if torque.shape not in ((), (nv,)) or not np.isfinite(torque).all():
+        raise ArgumentError(f"disturbance is {tau_d}, expected one finite torque or {nv}, one per joint [N·m].")
+    return torque
 
 
 def _scene(controller: Controller, loop: Loop) -> Scene | None:
@@ -193,25 +218,31 @@ class _ByKernels(torch.autograd.Function):
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         law, batch, tau_d, scene, q, v, command, memory = ctx.saved
         q_bar, v_bar, command_bar = (np.array(x.numpy(), order="C") for x in cotangents)
-        weights_bar, tau_d_bar = np.zeros((len(batch), len(law.weights))), np.empty(command.shape)
+        tau_d_bar, total = np.empty(command.shape), np.zeros(len(law.weights))
+        weights_bar = np.empty((min(len(batch), _TOGETHER), len(law.weights)))
         size = rollout_workspace(law, scene)
 
         def run(part: slice) -> None:
             work = np.zeros(size)
-            for k in range(len(batch))[part]:
+            for k in range(first, len(batch))[part]:
                 rollout_adjoint(
                     batch.aims[k], batch.leads, tau_d[k], scene, *law, q[k], v[k], command[k], memory[k], work,
-                    q_bar[k], v_bar[k], command_bar[k], tau_d_bar[k], weights_bar[k],
+                    q_bar[k], v_bar[k], command_bar[k], tau_d_bar[k], weights_bar[k - first],
                 )  # fmt: skip
 
-        over_cores(run, len(batch), fewest=1)
-        return torch.from_numpy(weights_bar.sum(axis=0)), torch.from_numpy(tau_d_bar), None, None, None
+        for first in range(0, len(batch), _TOGETHER):
+            together = min(_TOGETHER, len(batch) - first)
+            weights_bar[:] = 0.0
+            over_cores(run, together, fewest=1)
+            total += weights_bar[:together].sum(axis=0)
+        return torch.from_numpy(total), torch.from_numpy(tau_d_bar), None, None, None
 
 
 def _by_torch(controller: Controller, batch: Batch, tau_d: torch.Tensor) -> Motions:
     """The same loop as it is written, one torch operation after the other."""
     loop, plant = batch.loop, cast(DynamicsPlant, batch.loop.plant)
-    device = next((p.device for p in controller.parameters()), torch.device("cpu"))  # type: ignore[attr-defined]
+    parameters: list[Any] = list(controller.parameters()) if isinstance(controller, nn.Module) else []
+    device = parameters[0].device if parameters else torch.device("cpu")
     given = (batch.aims, batch.q0, batch.v0, loop.limit, tau_d)
     aims, q, v, limit, tau_d = (torch.as_tensor(x, device=device) for x in given)
     memory = controller.initial_memory(q)

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 
 from nbs_pin.checks import positive
+from nbs_pin.exceptions import ArgumentError
 from nbs_pin.robot import Robot
 
 StageCost: TypeAlias = Callable[
@@ -44,7 +45,10 @@ class TorqueAware:
         for name in ("rate", "excess", "effort"):
             if getattr(self, name) != 0.0:
                 positive(f"TorqueAware's {name}", getattr(self, name), "")
-        object.__setattr__(self, "limit", torch.as_tensor(self.limit, dtype=torch.float64))
+        limit = torch.as_tensor(self.limit, dtype=torch.float64)
+        if not bool((limit > 0.0).all()):
+            raise ArgumentError(f"TorqueAware's limit is {limit.tolist()}, expected torques > 0 [N·m]; inf means none.")
+        object.__setattr__(self, "limit", limit)
 
     @classmethod
     def for_robot(cls, robot: Robot) -> "TorqueAware":

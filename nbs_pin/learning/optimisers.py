@@ -9,15 +9,16 @@ from nbs_pin.checks import positive
 from nbs_pin.exceptions import ArgumentError
 
 OptimiserName: TypeAlias = Literal["cautious", "adam", "lbfgs"]
-"""Adam that goes back to the best parameters with half the step whenever the cost has risen above `RISE` times theirs;
-Adam with its step halved five times in all, as in the paper; or L-BFGS with a strong Wolfe line search.
+"""Adam that goes back to the best parameters with half the step whenever the cost has risen by `RISE` of theirs;
+Adam with its step halved after every fifth of the epochs, as in the paper; or L-BFGS with a strong Wolfe line search.
 
 A sampled loop has cliffs, where gains become too high for the period and the cost leaps. Adam steps over them and then
 searches on the far side; a line search stops before them for good."""
 LEARNING_RATES: dict[str, float] = {"cautious": 1e-2, "adam": 1e-2, "lbfgs": 1.0}
 """Step of each unless another is asked for; the paper takes 1e-3 for Adam."""
-RISE = 1.02
-HALVINGS = 5
+RISE = 0.02
+"""Share of the lowest cost by which "cautious" lets the cost rise."""
+STAGES = 5
 
 
 def optimiser(name: str, parameters: Sequence[torch.nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
@@ -42,7 +43,7 @@ def optimiser(name: str, parameters: Sequence[torch.nn.Parameter], learning_rate
 
 def scheduled_rate(name: str, learning_rate: float, epoch: int, epochs: int) -> float:
     """Adam's step at an epoch: halved after every fifth of the epochs (the paper: every 40 of 200)."""
-    return learning_rate * 0.5 ** (epoch * HALVINGS // epochs) if name == "adam" else learning_rate
+    return learning_rate * 0.5 ** (epoch * STAGES // epochs) if name == "adam" else learning_rate
 
 
 def packed_state(state: Any, tensors: dict[str, torch.Tensor], path: str = "optimiser") -> Any:
