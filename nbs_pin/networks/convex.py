@@ -47,7 +47,7 @@ class FICNN(nn.Module):
 
     def layers(self, *, numpy: bool) -> tuple[ConvexLayer, ...]:
         """The layers' effective weights: tensors, differentiable in the parameters, or numpy arrays."""
-        named = {k: p.detach().numpy() if numpy and p is not None else p for k, p in self._parameters.items()}
+        named = {k: p.numpy(force=True) if numpy and p is not None else p for k, p in self._parameters.items()}
         return tuple(
             ConvexLayer(self._nonnegative(named[f"wy{i}"]) if i else None, named[f"wx{i}"], named[f"b{i}"])
             for i in range(self.depth)

@@ -110,7 +110,7 @@ class Damping(nn.Module):
         return pack_damping(networks, self.form == "paper", self.m, r, d0)
 
     def _constants(self, *, numpy: bool) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-        r = self.scale.numpy() if numpy else self.scale
+        r = self.scale.numpy(force=True) if numpy else self.scale
         zero = array_namespace(r).zeros((self.nv, self.nv), dtype=r.dtype, device=device(r))
         return zero if self.floor is None else self.floor.like(r), r
 
@@ -128,7 +128,7 @@ class _FCNN(nn.Module):
             self.register_parameter(f"b{i}", nn.Parameter(torch.zeros(out, dtype=torch.float64)))
 
     def layers(self, *, numpy: bool) -> list[tuple[Array, Array]]:
-        named = {k: p.detach().numpy() if numpy else p for k, p in self._parameters.items() if p is not None}
+        named = {k: p.numpy(force=True) if numpy else p for k, p in self._parameters.items() if p is not None}
         return [(named[f"w{i}"], named[f"b{i}"]) for i in range(self.depth)]
 
     def output(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:

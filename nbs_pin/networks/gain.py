@@ -42,7 +42,7 @@ class Gain(nn.Module):
     def value(self, *, numpy: bool) -> Float[Array, " n"] | Float[Array, "n n"]:
         """G: a numpy array, or a tensor that is differentiable in s."""
         parts = self.nominal, self.change, self.least_share
-        nominal, s, share = (x.detach().numpy() for x in parts) if numpy else parts
+        nominal, s, share = (x.numpy(force=True) for x in parts) if numpy else parts
         e = array_namespace(s).exp(s)
         squares = e * e if nominal.ndim == 1 else e[:, None] * e
         return nominal * (share + (1.0 - share) * squares)  # at s = 0 the bracket is 1 exactly, for every φ

@@ -74,7 +74,7 @@ class Potential(nn.Module):
     ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch n"], Float[Array, "*batch n"]]:
         """Φ(z) [J], ∇Φ(z) [N·m] and ∇²Φ(z) dz, in the kind of z."""
         xp = array_namespace(z)
-        s, r = self.stiffness.like(z), self.scale if is_torch_array(z) else self.scale.numpy()
+        s, r = self.stiffness.like(z), self.scale if is_torch_array(z) else self.scale.numpy(force=True)
         value, gradient, product = self._psi(r * z, r * dz)
         force, force_rate = 2.0 * matvec(s, z), 2.0 * matvec(s, dz)
         return value + 0.5 * xp.sum(z * force, axis=-1), r * gradient + force, r * product + force_rate
@@ -94,7 +94,7 @@ class Potential(nn.Module):
         activation = self.network.activation
         if activation.kernel is None:
             raise ArgumentError(f"{activation} has no compiled form; take SmoothedReLU or Squareplus.")
-        layers, r = self.network.layers(numpy=numpy), self.scale.numpy() if numpy else self.scale
+        layers, r = self.network.layers(numpy=numpy), self.scale.numpy(force=True) if numpy else self.scale
         tangent = None
         if self.form == "smooth" and not numpy:
             tangent = convex_terms(layers, activation, 0.0 * r, 0.0 * r)[:2]
