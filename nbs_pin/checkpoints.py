@@ -61,6 +61,7 @@ def load(path: str | Path, robot: Robot | None = None) -> Controller:
     """The controller that `save` wrote to the file.
 
     robot: the arm it is for, with effort limits as wished; None loads it as it was loaded then, with the limits it had.
+    A PID still saturates at its own `effort_limit`, and one built without an arm is for its number of joints alone.
     Raises FileNotFoundError for no file, FileFormatError for one that is damaged or no checkpoint, ArgumentError for
     another arm than the file is for, RobotNotFound when its description is no longer there, and RobotError when that
     has changed.

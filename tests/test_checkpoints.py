@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from torch.overrides import TorchFunctionMode
 
 import nbs_pin as nbs
 from nbs_pin.archives import read_archive, write_archive
@@ -169,6 +170,41 @@ def test_the_same_controller_is_the_same_file(tmp_path):
     assert files[0] == files[1]
 
 
+class FarAway(TorchFunctionMode):
+    """Every tensor as if it lay on another device, where `.numpy()` is refused unless it fetches."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if func is torch.Tensor.numpy and not kwargs.get("force"):
+            raise TypeError("can't convert a tensor on another device to numpy")
+        return func(*args, **kwargs)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_weights_are_fetched_from_another_device(tmp_path, law):
+    controller = scrambled(LAWS[law](TWO_LINK))
+    expected = torques(controller)
+    with FarAway():
+        with pytest.raises(TypeError, match="another device"):
+            torch.zeros(2).numpy()
+        np.testing.assert_array_equal(torques(controller), expected)
+        np.testing.assert_allclose(torques(controller.compile()), expected, rtol=1e-9, atol=1e-9)
+        nbs.save(controller, tmp_path / "arm.nbs")
+    np.testing.assert_array_equal(torques(nbs.load(tmp_path / "arm.nbs")), expected)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("law", LAWS)
+def test_a_controller_on_a_gpu_gives_the_same_torques(tmp_path, law):
+    controller = scrambled(LAWS[law](TWO_LINK))
+    expected = torques(controller)
+    controller.to("cuda")
+    np.testing.assert_allclose(torques(controller), expected, rtol=1e-12)
+    np.testing.assert_allclose(torques(controller.compile()), expected, rtol=1e-9, atol=1e-9)
+    nbs.save(controller, tmp_path / "arm.nbs")
+    np.testing.assert_allclose(torques(nbs.load(tmp_path / "arm.nbs")), expected, rtol=1e-12)
+
+
 # The arm
 
 
@@ -192,11 +228,33 @@ def test_another_arm_is_refused(tmp_path, other):
         nbs.load(saved(tmp_path / "arm.nbs", PANDA), robot)
 
 
-def test_a_law_without_a_model_is_for_its_number_of_joints(tmp_path):
-    nbs.save(PID.for_robot(PANDA), tmp_path / "arm.nbs")
-    assert nbs.load(tmp_path / "arm.nbs", PANDA).nv == 7
+def test_a_pid_knows_its_arm(tmp_path):
+    weak = PANDA.with_effort_limit(50.0)
+    nbs.save(PID.for_robot(weak), tmp_path / "arm.nbs")
+    again = nbs.load(tmp_path / "arm.nbs")
+    assert (again.robot.sha256, again.robot.effort_limit.tolist()) == (PANDA.sha256, [50.0] * 7)
+    assert nbs.load(tmp_path / "arm.nbs", PANDA).robot is PANDA
+    for other in (load_robot("panda", gravity=1.62), load_robot("xarm7"), load_robot("ur5")):
+        with pytest.raises(ArgumentError, match=r"is for the arm 'panda' .* has other links, joints"):
+            nbs.load(tmp_path / "arm.nbs", other)
+
+
+def test_a_pid_for_ur5_is_refused_for_ur10(tmp_path):
+    nbs.save(PID.for_robot(load_robot("ur5")), tmp_path / "arm.nbs")
+    with pytest.raises(ArgumentError, match=r"is for the arm 'ur5' .* and ur10 .* give that arm"):
+        nbs.load(tmp_path / "arm.nbs", load_robot("ur10"))
+
+
+def test_a_pid_by_hand_is_for_its_number_of_joints(tmp_path):
+    pid = PID(kp=np.full(7, 50.0), ki=20.0, kd=10.0, effort_limit=np.inf)
+    nbs.save(pid, tmp_path / "arm.nbs")
+    again = nbs.load(tmp_path / "arm.nbs", PANDA)
+    np.testing.assert_array_equal(torques(again), torques(pid))
+    assert again.robot is None
     with pytest.raises(ArgumentError, match="is for 7 joints and ur5 has 6"):
         nbs.load(tmp_path / "arm.nbs", load_robot("ur5"))
+    with pytest.raises(ArgumentError, match="the gains are for 7 joints and two_link has 2"):
+        PID(kp=np.full(7, 50.0), ki=20.0, kd=10.0, effort_limit=np.inf, robot=TWO_LINK)
 
 
 def test_an_arm_whose_file_is_gone_is_asked_for(tmp_path):
@@ -436,6 +494,8 @@ def test_tensors_that_make_no_controller_are_refused(path, change, message):
             r"gravity is .1.0, 2.0.",
         ),
         (lambda d: d.update(controller=[]), "kind None is unknown"),
+        (lambda d: d.update(controller=d["controller"]["potential"]), "a Potential is no controller"),
+        (lambda d: d.update(controller=d["controller"]["dynamics"]["robot"]), "a Robot is no controller"),
         (lambda d: d.update(more=1), "not what we write"),
         (lambda d: d.pop("versions"), "not what we write"),
     ],

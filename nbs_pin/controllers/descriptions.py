@@ -72,7 +72,7 @@ def describe(controller: Controller) -> tuple[Settings, Tensors]:
     settings = cast(Settings, _described(controller))
     module = cast(nn.Module, controller)
     tensors = Tensors({name: x.detach().cpu().clone().contiguous() for name, x in module.state_dict().items()})
-    robot = attrgetter("dynamics.robot")(controller) if "dynamics" in settings else None
+    robot = attrgetter("dynamics.robot" if "dynamics" in settings else "robot")(controller)
     copy = cast(nn.Module, rebuild(settings, tensors, robot))
     for mine, theirs in zip(module.modules(), copy.modules(), strict=True):
         if type(mine) is not type(theirs):
@@ -85,14 +85,15 @@ def described_robot(description: Any) -> Settings | None:
 
     Raises ArgumentError for a description that `describe` would not give.
     """
-    if "dynamics" not in _kind_of(description).parts:
+    law = _kind_of(description)
+    if not issubclass(cast(type, law.make), Controller):
+        raise ArgumentError(f"a {description['kind']} is no controller")
+    knowing = description["dynamics"] if "dynamics" in law.parts else description
+    if "robot" not in _kind_of(knowing).parts or knowing["robot"] is None:
         return None
-    _kind_of(description["dynamics"])
-    robot = description["dynamics"].get("robot")
-    if robot is None:
-        return None
+    robot = knowing["robot"]
     if _kind_of(robot).make is not Robot:
-        raise ArgumentError(f"the arm of the dynamics is a {robot['kind']}")
+        raise ArgumentError(f"the arm is a {robot['kind']}")
     kinds = {"name": str, "source": str, "options": dict, "sha256": str, "effort_limit": list}
     wrong = [name for name, kind in kinds.items() if not isinstance(robot[name], kind)]
     if wrong:
@@ -189,7 +190,7 @@ def _same(*names: str, **elsewhere: str) -> dict[str, str]:
 
 
 def _gains(*names: str) -> Callable[[Tensors], Mapping[str, Any]]:
-    return lambda t: {name: t[f"gains.{name}.nominal"].numpy() for name in names}
+    return lambda t: {name: t[f"gains.{name}.nominal"].numpy(force=True) for name in names}
 
 
 def _backstepping(t: Tensors) -> Mapping[str, Any]:
@@ -216,7 +217,7 @@ _KINDS: dict[str, _Kind] = {
         _Kind(SlotineLi, {}, _LAW, _gains("rate", "gain")),
         _Kind(ComputedTorque, {}, _LAW, _gains("kp", "kd")),
         _Kind(PD, _same("feedforward"), _LAW, _gains("kp", "kd")),
-        _Kind(PID, _same("effort_limit", "filter_time", "continuous"), {}, _gains("kp", "ki", "kd")),
+        _Kind(PID, _same("effort_limit", "filter_time", "continuous"), _same("robot"), _gains("kp", "ki", "kd")),
         _Kind(Potential, _same("form"), _same(activation="network.activation"), _potential),
         _Kind(Damping, _same("form", "m"), {}, _damping),
         _Kind(SmoothedReLU, _same("d")),

@@ -33,7 +33,8 @@ class PID(Controller, nn.Module):
     The integral rests while the torque is saturated and the error would drive it further (Åström and Hägglund 2006,
     section 3.5). kp [N·m/rad], ki [N·m/(rad·s)], kd [N·m·s/rad]: (n,), positive, parameters. filter_time: T_f ≥ 0 [s].
     effort_limit: where saturation begins [N·m], (n,). continuous: joints whose error wraps, (n,) or None.
-    Raises ArgumentError for gains, limits or a filter time out of range.
+    robot: the arm it is for, which its checkpoint remembers, or None.
+    Raises ArgumentError for gains, limits or a filter time out of range, or an arm of another number of joints.
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class PID(Controller, nn.Module):
         effort_limit: PerJoint,
         filter_time: float = 0.0,
         continuous: np.ndarray | None = None,
+        robot: Robot | None = None,
     ) -> None:
         super().__init__()
         nv = np.size(kp)
@@ -56,6 +58,9 @@ class PID(Controller, nn.Module):
         self.continuous = np.zeros(nv, dtype=bool) if continuous is None else np.asarray(continuous, dtype=bool)
         if self.continuous.shape != (nv,):
             raise ArgumentError(f"continuous has {self.continuous.size} entries, expected {nv}: one per joint.")
+        if robot is not None and robot.nv != nv:
+            raise ArgumentError(f"the gains are for {nv} joints and {robot.name} has {robot.nv}; give one per joint.")
+        self.robot = robot
 
     @classmethod
     def for_robot(cls, robot: Robot, *, bandwidth: float = 8.0, period: float = 0.001) -> "PID":
@@ -68,6 +73,7 @@ class PID(Controller, nn.Module):
             effort_limit=robot.effort_limit,
             filter_time=2.0 * period,
             continuous=robot.continuous,
+            robot=robot,
         )
 
     @property
