@@ -14,6 +14,9 @@ from nbs_pin.metrics import PAPER_THRESHOLD, squared_error
 from nbs_pin.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
 from nbs_pin.state import Run
 
+FAR = 1000.0
+"""‖z1‖ beyond which a motion is not drawn [rad]."""
+
 
 def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]], path: str | Path) -> Path:
     """Draws cost [µs] against number of joints, a line per series, and writes the picture (PNG); returns its path."""
@@ -29,6 +32,7 @@ def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]],
 def plot_training(
     history: Float[np.ndarray, " epochs"],
     held_out: Float[np.ndarray, " checked"],
+    best_epoch: int,
     before: Run,
     after: Run,
     path: str | Path,
@@ -36,20 +40,22 @@ def plot_training(
     """Draws what training changed and writes the picture (PNG); returns its path.
 
     Left: mean cost of the training and the held-out motions by epoch (`Training`), the best epoch marked. Right:
-    ‖z1‖ over time of the same motions under the controller before and after, their median, and the worst, at each time.
+    ‖z1‖ over time of the same motions under the controller before and after, their median, and the worst, at each time;
+    a line ends where its motion leaves `FAR` or the finite numbers.
     """
     with picture(path, 11.0, 4.2) as figure:
         costs, errors = figure.subplots(1, 2)
-        _draw_costs(costs, history, held_out)
+        _draw_costs(costs, history, held_out, best_epoch)
         _draw_errors(errors, {"before": before, "after": after})
     return Path(path)
 
 
-def _draw_costs(axes: Axes, history: Float[np.ndarray, " epochs"], held_out: Float[np.ndarray, " checked"]) -> None:
+def _draw_costs(
+    axes: Axes, history: Float[np.ndarray, " epochs"], held_out: Float[np.ndarray, " checked"], best: int
+) -> None:
     for name, values, colour in (("training", history, ACTUAL), ("held out", held_out, REFERENCE)):
         axes.plot(values, color=colour, label=name)
-    chosen = held_out if held_out.size else history
-    best, colour = int(np.nanargmin(chosen)), REFERENCE if held_out.size else ACTUAL
+    chosen, colour = (held_out, REFERENCE) if held_out.size else (history, ACTUAL)
     lowered = f"best, {1.0 - chosen[best] / chosen[0]:.0%} lower"
     axes.plot(best, chosen[best], "o", color=colour, markersize=5, clip_on=False, label=lowered)
     axes.set_yscale("log")
@@ -63,10 +69,13 @@ def _draw_costs(axes: Axes, history: Float[np.ndarray, " epochs"], held_out: Flo
 
 def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
     for (name, run), colour in zip(runs.items(), (LIMIT, ACTUAL), strict=True):
-        size = np.sqrt(squared_error(run)).reshape(len(run.t), -1)
-        axes.plot(run.t, np.median(size, axis=1), color=colour, linewidth=1.8, label=f"{name}, median")
-        axes.plot(run.t, size.max(axis=1), color=colour, linewidth=1.0, linestyle=(0, (4, 2)), label=f"{name}, worst")
-        axes.fill_between(run.t, np.median(size, axis=1), size.max(axis=1), color=colour, alpha=0.12, linewidth=0)
+        with np.errstate(over="ignore", invalid="ignore"):  # of motions that diverge
+            size = np.sqrt(squared_error(run)).reshape(len(run.t), -1)
+            size = np.where(size <= FAR, size, np.inf)
+            median, worst = (np.where(np.isfinite(x), x, np.nan) for x in (np.median(size, axis=1), size.max(axis=1)))
+        axes.plot(run.t, median, color=colour, linewidth=1.8, label=f"{name}, median")
+        axes.plot(run.t, worst, color=colour, linewidth=1.0, linestyle=(0, (4, 2)), label=f"{name}, worst")
+        axes.fill_between(run.t, median, worst, color=colour, alpha=0.12, linewidth=0)
     mark = float(np.sqrt(PAPER_THRESHOLD))
     axes.axhline(mark, color=ERROR, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.annotate("converged", (1.0, mark), xycoords=("axes fraction", "data"), ha="right", va="bottom", color=ERROR)

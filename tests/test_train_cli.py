@@ -270,7 +270,8 @@ def test_help_shows_an_example(capsys):
 def test_the_picture_marks_the_best_epoch_and_draws_median_and_worst(tmp_path, monkeypatch, held_out):
     history, run = np.array([1.0, 0.5, 0.4]), sinusoid_run(2, batch=(5,))
     run.q[:] += 0.01 * np.arange(5)[:, None]
-    figure = drawn(lambda: plot_training(history, held_out, run, run, tmp_path / "a.png"), monkeypatch)
+    best = int((held_out if held_out.size else history).argmin())
+    figure = drawn(lambda: plot_training(history, held_out, best, run, run, tmp_path / "a.png"), monkeypatch)
     assert png_size(tmp_path / "a.png") == (1320, 504)
     costs, errors = figure.axes
     chosen = held_out if held_out.size else history
@@ -279,3 +280,63 @@ def test_the_picture_marks_the_best_epoch_and_draws_median_and_worst(tmp_path, m
     size = np.sqrt(nbs.metrics.squared_error(run))
     np.testing.assert_allclose(errors.lines[0].get_ydata(), np.median(size, axis=1))
     np.testing.assert_allclose(errors.lines[1].get_ydata(), size.max(axis=1))
+
+
+# Motions that diverge.
+
+
+def test_fresh_motions_that_diverge_are_told_and_not_counted(tmp_path, capsys):
+    """A finite training of 0.1 s whose fresh motions of 0.3 s are not."""
+    options = ("--controller", "computed-torque", "--period", "0.05", "--duration", "0.1", "--no-effort-limit")
+    wide = ("--bandwidth", "10", "--start-error", "2", "--starts", "2", "--frequencies", "1", "--epochs", "1")
+    assert train(tmp_path / "run", *options, *wide) == 0
+    figures = summary(tmp_path / "run")["figures"]
+    for when in ("before", "after"):
+        assert {figures[when][name] for name in ("peak_torque_Nm", "rms_torque_Nm", "saturated_fraction")} == {None}
+        assert figures[when]["convergence_time_worst_s"] is None
+    assert capsys.readouterr().out.count("not finite") == 6
+
+
+@pytest.mark.parametrize("without_kernels", [False, True])
+def test_one_motion_that_diverges_leaves_the_others_their_figures(monkeypatch, without_kernels):
+    robot = nbs.load_robot("two_link").with_effort_limit(np.inf)
+    plant, law = (
+        nbs.DynamicsPlant(nbs.PinocchioDynamics(robot)),
+        nbs.ComputedTorque(nbs.PinocchioDynamics(robot), kp=25.0, kd=10.0),
+    )
+    loop = training.Loop.of(plant, 2, 0.8, 0.05, plant_step=0.05, effort_limit=None, lookahead=None)
+    batch = training.fresh_batch(loop, [nbs.Sinusoid.for_robot(robot, 1.0)], 0.1, seed=0, starts=5)
+    batch.v0[2] = 1e3
+    if without_kernels:
+        moved = training.motions
+        monkeypatch.setattr(training, "motions", lambda law, batch: moved(law, batch, "torch"))
+    figures = training.fresh_figures(training.compared(law, batch))
+    assert np.isfinite(figures["convergence_time_median_s"])
+    assert figures["convergence_time_worst_s"] == np.inf
+    for name in ("steady_error_rad2", "peak_torque_Nm", "rms_torque_Nm", "saturated_fraction"):
+        assert np.isnan(figures[name])
+
+
+def test_figures_of_fresh_motions_are_those_of_the_metrics():
+    run = sinusoid_run(2, batch=(4,))
+    run.q[:] += 0.03 * np.arange(4)[:, None]
+    figures = training.fresh_figures(run)
+    times = nbs.metrics.convergence_time(run)
+    assert figures["convergence_time_median_s"] == np.median(times)
+    assert figures["convergence_time_worst_s"] == times.max()
+    assert figures["steady_error_rad2"] == nbs.metrics.steady_error(run).max()
+    assert figures["rms_torque_Nm"] == pytest.approx(np.sqrt(np.mean(np.sum(run.tau[:-1] ** 2, axis=-1))))
+    assert figures["peak_torque_Nm"] == np.abs(run.tau[:-1]).max()
+
+
+def test_the_picture_ends_where_motions_diverge(tmp_path, monkeypatch):
+    history, run = np.array([1.0, np.nan]), sinusoid_run(2, batch=(3,))
+    middle = len(run.t) // 2
+    run.q[middle:, 0] = np.nan
+    run.q[middle:, 1] = 1e200
+    figure = drawn(lambda: plot_training(history, np.empty(0), 0, run, run, tmp_path / "a.png"), monkeypatch)
+    median, worst = (line.get_ydata() for line in figure.axes[1].lines[:2])
+    assert np.isfinite(median[:middle]).all()
+    assert np.isfinite(worst[:middle]).all()
+    assert np.isnan(median[middle:]).all()
+    assert np.isnan(worst[middle:]).all()

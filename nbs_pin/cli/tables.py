@@ -36,18 +36,18 @@ def print_training(console: Console, title: str, figures: dict[str, Any]) -> Non
         table.add_column(heading, justify="right", no_wrap=True)
     for name in ("training", "held-out"):
         costs = figures[f"{name.replace('-', '_')}_cost"]
-        table.add_row(Text(f"mean cost of {name} motions"), *(f"{cost:.4g}" for cost in costs))
+        table.add_row(Text(f"mean cost of {name} motions"), *(_number(cost, ".4g") for cost in costs))
     both = figures["before"], figures["after"]
     for name in ("median", "worst"):
         times = (on[f"convergence_time_{name}_s"] for on in both)
         table.add_row(Text(f"converged, {name} [s]"), *("never" if t is None else f"{t:.3f}" for t in times))
-    table.add_row(Text("peak torque [N·m]"), *(f"{on['peak_torque_Nm']:.4g}" for on in both))
-    table.add_row(Text("RMS torque [N·m]"), *(f"{on['rms_torque_Nm']:.4g}" for on in both))
-    table.add_row(Text("some joint at its limit"), *(f"{on['saturated_fraction']:.2%}" for on in both))
+    table.add_row(Text("peak torque [N·m]"), *(_number(on["peak_torque_Nm"], ".4g") for on in both))
+    table.add_row(Text("RMS torque [N·m]"), *(_number(on["rms_torque_Nm"], ".4g") for on in both))
+    table.add_row(Text("some joint at its limit"), *(_number(on["saturated_fraction"], ".2%") for on in both))
     console.print(table)
     ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
     for line in (
-        f"held-out cost lowered by {figures['held_out_cost_lowered_by']:.1%}; "
+        f"held-out cost lowered by {_number(figures['held_out_cost_lowered_by'], '.1%')}; "
         f"converged is ‖error‖ < 0.1 rad to the end, from {figures['fresh_starts']} fresh starts",
         f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
         f"the best after {figures['best_epoch']}",
@@ -59,6 +59,10 @@ def converged(figures: dict[str, Any]) -> str:
     """When the error came to stay below the paper's threshold, in words."""
     time = figures["convergence_time_s"]
     return "not within the run" if time is None else f"{time:.3f} s"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "not finite" if value is None else format(value, form)
 
 
 def _lines(figures: dict[str, Any], wall_time: float) -> list[str]:

@@ -45,8 +45,8 @@ class Train:
     """What is made small: error, its rate and torque beyond the limits; the error alone, as in the paper; or the time
     spent 0.1 rad and more away."""
     optimiser: Literal["cautious", "adam", "lbfgs"] = "cautious"
-    """How: Adam that retreats with half the step when the cost rises, Adam with its step halved five times in all as
-    in the paper, or L-BFGS with line search."""
+    """How: Adam that retreats with half the step when the cost rises, Adam with its step halved after every fifth of
+    the epochs as in the paper, or L-BFGS with line search."""
     learning_rate: Annotated[
         float | None, number("--learning-rate", above=0.0, most=100.0, unit=""), default("0.01, lbfgs 1")
     ] = None

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
@@ -12,9 +13,9 @@ from nbs_pin import metrics
 from nbs_pin.checkpoints import save
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.exceptions import ArgumentError
+from nbs_pin.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.files import write_whole
-from nbs_pin.learning.closed_loop import Batch, motions, recorded
+from nbs_pin.learning.closed_loop import Batch, Motions, motions, recorded
 from nbs_pin.learning.costs import StageCost, TimeOutside, TorqueAware, squared_error
 from nbs_pin.learning.training import Training, train
 from nbs_pin.loop import Loop
@@ -22,6 +23,7 @@ from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.references import DesiredMotion, Sinusoid, check_reference
 from nbs_pin.robot import Robot
 from nbs_pin.state import Run
+from nbs_pin.studies.pages import plain
 from nbs_pin.studies.tracking import build_controller
 
 CostName: TypeAlias = Literal["torque-aware", "squared-error", "time-outside"]
@@ -107,41 +109,74 @@ def stage_cost(name: str, robot: Robot) -> StageCost:
     return known[name]
 
 
-def fresh_batch(loop: Loop, references: Sequence[DesiredMotion], start_error: float, seed: int) -> Batch:
-    """`FRESH_STARTS` motions along each reference, at rest within ±start_error [rad] of its start.
+def fresh_batch(
+    loop: Loop, references: Sequence[DesiredMotion], start_error: float, seed: int, starts: int = FRESH_STARTS
+) -> Batch:
+    """So many motions along each reference, at rest within ±start_error [rad] of its start.
 
     They are drawn apart from those of `train`, whose seed is the number alone.
     """
     draw, batches = np.random.default_rng((seed, 1)), []
     for reference in references:
         begin = loop.schedule(reference, 0, 0).desired.q[0]
-        away = draw.uniform(-start_error, start_error, (FRESH_STARTS, loop.plant.nv))
+        away = draw.uniform(-start_error, start_error, (starts, loop.plant.nv))
         batches.append(Batch.of(loop, reference, begin + away))
     return Batch.joined(batches)
 
 
 def compared(controller: Controller, batch: Batch) -> Run:
-    """The motions of a batch as a run."""
+    """The motions of a batch as a run; what diverges is NaN from there on, or as a whole without kernels."""
     with torch.no_grad():
-        return recorded(motions(controller, batch), batch, type(controller).__name__)
+        try:
+            motion = motions(controller, batch)
+        except SimulationDiverged:  # without kernels the plant refuses to go on, and takes every start along
+            motion = Motions(*(torch.cat(parts) for parts in zip(*_one_by_one(controller, batch), strict=True)))
+    return recorded(motion, batch, type(controller).__name__)
+
+
+def fresh_figures(run: Run) -> dict[str, float]:
+    """Figures over the starts of a run, units in the keys; inf where there is no time of convergence.
+
+    Median and worst time of convergence; the largest ‖z1‖² of the last 30 % of the time; the largest torque, the root
+    mean square over starts and time of ‖τ‖, and the fraction of the time for which some joint is at its limit: NaN for
+    these four when some motion is not finite, which has not converged either.
+    """
+    finite = np.isfinite(run.q).all(axis=(0, -1)) & np.isfinite(run.tau_command).all(axis=(0, -1))
+    with np.errstate(over="ignore", invalid="ignore"):  # of motions on their way out of the finite numbers
+        times = np.where(finite, metrics.convergence_time(run), np.inf)
+        steady, peak, rms, saturated = (
+            np.where(finite, measure(run), np.nan)
+            for measure in (metrics.steady_error, metrics.peak_torque, metrics.rms_torque, metrics.saturated_fraction)
+        )
+    return {
+        "convergence_time_median_s": float(np.median(times)),
+        "convergence_time_worst_s": float(times.max()),
+        "steady_error_rad2": float(steady.max()),
+        "peak_torque_Nm": float(peak.max()),
+        "rms_torque_Nm": float(np.sqrt(np.mean(rms**2))),
+        "saturated_fraction": float(saturated.mean()),
+    }
 
 
 def figures(result: Trained) -> dict[str, Any]:
-    """What training changed, as JSON can store it; None for a time that never came."""
+    """What training changed, as JSON can store it; None for a time that never came and for what is not finite."""
     training = result.training
     held_out, best = training.held_out, training.best_epoch
-    return {
-        "epochs": len(training.history) - (training.stopped != "interrupted"),
-        "best_epoch": best,
-        "stopped": training.stopped,
-        "training_cost": [float(training.history[0]), float(training.history[best])],
-        "held_out_cost": [float(held_out[0]), float(held_out[best])],
-        "held_out_cost_lowered_by": 1.0 - float(held_out[best] / held_out[0]),
-        "seconds": training.seconds,
-        "fresh_starts": result.before.q.shape[1],
-        "before": _on_fresh_starts(result.before),
-        "after": _on_fresh_starts(result.after),
-    }
+    numbers: dict[str, Any] = plain(
+        {
+            "epochs": len(training.history) - (training.stopped != "interrupted"),
+            "best_epoch": best,
+            "stopped": training.stopped,
+            "training_cost": [training.history[0], training.history[best]],
+            "held_out_cost": [held_out[0], held_out[best]],
+            "held_out_cost_lowered_by": 1.0 - held_out[best] / held_out[0],
+            "seconds": training.seconds,
+            "fresh_starts": result.before.q.shape[1],
+            "before": fresh_figures(result.before),
+            "after": fresh_figures(result.after),
+        }
+    )
+    return numbers
 
 
 def write_results(result: Trained, folder: Path, facts: dict[str, Any]) -> dict[str, Any]:
@@ -154,24 +189,23 @@ def write_results(result: Trained, folder: Path, facts: dict[str, Any]) -> dict[
 
     numbers, training = figures(result), result.training
     save(training.controller, folder / "controller.nbs", info={"trained": facts})
-    plot_training(training.history, training.held_out, result.before, result.after, folder / "learning.png")
-    curves = {"history": _plain(training.history), "held_out": _plain(training.held_out)}
+    plot_training(
+        training.history, training.held_out, training.best_epoch, result.before, result.after, folder / "learning.png"
+    )
+    curves = plain({"history": training.history, "held_out": training.held_out})
     text = json.dumps(facts | {"figures": numbers, **curves}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     write_whole(folder / "summary.json", text.encode())
     return numbers
 
 
-def _on_fresh_starts(run: Run) -> dict[str, float | None]:
-    times = np.asarray(metrics.convergence_time(run))
-    median, worst = _plain(np.array([np.sort(times)[len(times) // 2], times.max()]))
-    return {
-        "convergence_time_median_s": median,
-        "convergence_time_worst_s": worst,
-        "peak_torque_Nm": float(np.max(metrics.peak_torque(run))),
-        "rms_torque_Nm": float(np.sqrt(np.mean(np.square(metrics.rms_torque(run))))),
-        "saturated_fraction": float(np.mean(metrics.saturated_fraction(run))),
-    }
-
-
-def _plain(values: np.ndarray) -> list[float | None]:
-    return [float(x) if np.isfinite(x) else None for x in values]
+def _one_by_one(controller: Controller, batch: Batch) -> list[Motions]:
+    """The motions of a batch, each by itself; NaN for one that diverges."""
+    names, done = ("aims", "desired", "q0", "v0", "tau_d"), []
+    for k in range(len(batch)):
+        one = replace(batch, **{name: getattr(batch, name)[k : k + 1] for name in names})
+        try:
+            done.append(motions(controller, one))
+        except SimulationDiverged:
+            state = torch.full((1, batch.loop.steps + 1, batch.loop.plant.nv), torch.nan, dtype=torch.float64)
+            done.append(Motions(state, state, state[:, 1:]))
+    return done
