@@ -105,13 +105,13 @@ def plot_comparison(rows: Sequence[Mapping[str, Any]], path: str | Path) -> Path
 def _draw_comparison(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     laws = list(dict.fromkeys(row["law"] for row in rows))
     frequencies = list(dict.fromkeys(row["frequency_rad_per_s"] for row in rows))
-    times = np.array([[row["convergence_median_s"], row["convergence_worst_s"]] for row in rows])
+    times = np.array([[row["convergence_time_median_s"], row["convergence_time_worst_s"]] for row in rows])
     edge = 1.3 * times[np.isfinite(times)].max(initial=1.0)
     for k, (frequency, colour) in enumerate(zip(frequencies, (TORQUE, ACTUAL, ERROR), strict=False)):
         chosen = [row for row in rows if row["frequency_rad_per_s"] == frequency]
         for row in chosen:
             y = laws.index(row["law"]) + 0.22 * (k - 0.5 * (len(frequencies) - 1))
-            median, worst = row["convergence_median_s"], row["convergence_worst_s"]
+            median, worst = row["convergence_time_median_s"], row["convergence_time_worst_s"]
             axes.plot([min(median, edge), min(worst, edge)], [y, y], color=colour, linewidth=1.0, alpha=0.6)
             axes.plot(min(median, edge), y, "o" if math.isfinite(median) else ">", color=colour, markersize=4.5)
             axes.plot(min(worst, edge), y, "|" if math.isfinite(worst) else ">", color=colour, markersize=5)
