@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.metrics import PAPER_THRESHOLD, squared_error
 from nbs_pin.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
@@ -88,39 +88,49 @@ def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
 def plot_comparison(rows: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
     """Draws the convergence times of the fair comparison and writes the picture (PNG); returns its path.
 
-    rows: those of `studies.fair.Row` as dictionaries. A panel per arm and period; per law, a dot at the median of its
-    starts for each reference and a line to the worst one. What does not converge ends in an arrow at the right edge.
+    rows: those of `studies.fair.Row` as dictionaries. A panel per arm and period, all with one time axis; per law, a
+    dot at the median of its starts for each reference and a line to the worst one. What does not converge ends in an
+    arrow at the right edge.
     """
     panels = list(dict.fromkeys((row["arm"], row["period_s"]) for row in rows))
-    with picture(path, 11.0, 0.6 + 2.4 * math.ceil(len(panels) / 2)) as figure:
+    times = np.array([[row["convergence_time_median_s"], row["convergence_time_worst_s"]] for row in rows])
+    seen = times[np.isfinite(times) & (times > 0.0)]
+    limits = 0.85 * seen.min(initial=1.0), 1.5 * seen.max(initial=1.0)
+    with picture(path, 11.0, 0.6 + 2.6 * math.ceil(len(panels) / 2)) as figure:
         grid = figure.subplots(math.ceil(len(panels) / 2), min(2, len(panels)), squeeze=False).ravel()
         for axes, panel in zip(grid, panels, strict=False):
-            _draw_comparison(axes, [row for row in rows if (row["arm"], row["period_s"]) == panel])
+            _draw_comparison(axes, [row for row in rows if (row["arm"], row["period_s"]) == panel], limits)
             axes.set_title(f"{panel[0]}, control at {1000 * panel[1]:g} ms", loc="left")
+        for axes in grid[-2:]:
+            axes.set_xlabel("time of convergence [s]: median (dot) to worst start (bar), never (arrow)")
         handles, labels = grid[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), frameon=False)
     return Path(path)
 
 
-def _draw_comparison(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+def _draw_comparison(axes: Axes, rows: Sequence[Mapping[str, Any]], limits: tuple[float, float]) -> None:
     laws = list(dict.fromkeys(row["law"] for row in rows))
     frequencies = list(dict.fromkeys(row["frequency_rad_per_s"] for row in rows))
-    times = np.array([[row["convergence_time_median_s"], row["convergence_time_worst_s"]] for row in rows])
-    edge = 1.3 * times[np.isfinite(times)].max(initial=1.0)
+    edge = limits[1] / 1.08
     for k, (frequency, colour) in enumerate(zip(frequencies, (TORQUE, ACTUAL, ERROR), strict=False)):
         chosen = [row for row in rows if row["frequency_rad_per_s"] == frequency]
         for row in chosen:
-            y = laws.index(row["law"]) + 0.22 * (k - 0.5 * (len(frequencies) - 1))
+            y = laws.index(row["law"]) + 0.24 * (k - 0.5 * (len(frequencies) - 1))
             median, worst = row["convergence_time_median_s"], row["convergence_time_worst_s"]
             axes.plot([min(median, edge), min(worst, edge)], [y, y], color=colour, linewidth=1.0, alpha=0.6)
-            axes.plot(min(median, edge), y, "o" if math.isfinite(median) else ">", color=colour, markersize=4.5)
             axes.plot(min(worst, edge), y, "|" if math.isfinite(worst) else ">", color=colour, markersize=5)
+            if math.isfinite(median):
+                axes.plot(median, y, "o", color=colour, markersize=4.5)
         axes.plot([], [], "o-", color=colour, markersize=4.5, linewidth=1.0, label=f"ω = {frequency:g} rad/s")
     axes.set_xscale("log")
-    axes.set(xlabel="convergence: median (dot) to worst of the starts [s]", ylim=(len(laws) - 0.5, -0.5))
+    axes.set(xlim=limits, ylim=(len(laws) - 0.5, -0.5))
     axes.set_yticks(range(len(laws)), laws)
+    axes.grid(False, axis="y")
+    for boundary in range(1, len(laws)):
+        axes.axhline(boundary - 0.5, color=LIMIT, linewidth=0.4, alpha=0.5)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else ""))
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def plot_motions(columns: Mapping[str, Mapping[str, Sequence[Run]]], path: str | Path, *, until: float) -> Path:

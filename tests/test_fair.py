@@ -111,7 +111,9 @@ def test_the_page_the_csv_and_the_figures_carry_one_table(rows, monkeypatch, tmp
     with (tmp_path / "fair.csv").open() as file:
         written = list(csv.DictReader(file))
     tables = "".join(section.markdown for section in sections[1:])
-    assert len(written) == len(rows) == tables.count("\n| ") - 1
+    assert len(written) == len(rows) == tables.count("\n| ") - 2 - len(fair.LAWS)
+    assert tables.count(f"| {rows[3].learning_rate:g} | {rows[3].checking_cost:.4f} |") >= 1
+    assert all(row.checking_cost_tuned <= row.checking_cost for row in rows if row.law != "NBS, untrained")
     for row, entry in zip(rows, written, strict=True):
         assert float(entry["convergence_time_median_s"]) == row.convergence_time_median_s
         assert f"{row.steady_error_rad2:.1e} | {row.rms_torque_Nm:.1f} | {row.peak_torque_Nm:.1f} |" in page
@@ -145,6 +147,7 @@ def test_a_lead_of_less_than_a_period_is_told(second, words):
     other = replace(ours, law="PD+", convergence_time_median_s=second)
     told = fair._findings([other, ours] if second > 0.5 else [ours, other])
     assert words in told
+    assert ", as it was built" in fair._findings([replace(ours, checking_cost=0.2, checking_cost_tuned=0.2)] * 2)
     assert told.endswith("Trained NBS: median 0.500 s, worst start 0.700 s, steady error 1.0e-09 rad².")
 
 
