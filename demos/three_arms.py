@@ -14,6 +14,7 @@ from rich.text import Text
 
 import nbs_pin as nbs
 from nbs_pin.studies import tracking
+from nbs_pin.versions import versions
 
 ARMS = ("two_link", "three_link", "panda")
 START_ERROR = 0.3  # rad, in every joint, with alternating sign
@@ -31,7 +32,7 @@ def main(out: Path = Path("out/demo"), duration: float = 8.0) -> dict[str, dict]
         robot = nbs.load_robot(name)
         run, wall_time = tracking.track(robot, duration=duration, start_error=START_ERROR, progress=True)
         figures = results[name] = tracking.figures(run, robot)
-        tracking.write_results(run, out / name, robot, {"figures": figures, "versions": tracking.versions()})
+        tracking.write_results(run, out / name, robot, {"figures": figures, "versions": versions()})
         table.add_row(
             name,
             str(robot.nv),
