@@ -143,7 +143,7 @@ def follow_authors(law: AuthorsLaw, duration: float, torque: Any = 0.0) -> Run:
 
 
 def train_authors(law: AuthorsLaw, *, epochs: int = 200, torque: Any = 0.0, progress: bool = False) -> None:
-    """The program's training, in place: Σ ‖q(t + h) − q_d(t)‖² over 1 s, Adam at 1e-3, halved five times in all.
+    """The program's training, in place: Σ ‖q(t + h) − q_d(t)‖² over 1 s, Adam at 1e-3, halved every 40 epochs.
 
     A seed whose motion leaves the finite numbers is lost, as in the program, and leaves the others alone.
     """
