@@ -31,7 +31,7 @@ def main(arm: str = "two_link", epochs: int = 60) -> dict[str, float]:
         for law in (untrained, training.controller)
     )
     folder = Path("out") / "demo" / "train"
-    plot_training(training.history, training.held_out, before, after, folder / "learning.png")
+    plot_training(training.history, training.held_out, training.best_epoch, before, after, folder / "learning.png")
     nbs.save(training.controller, folder / "controller.nbs")
 
     best = training.best_epoch

@@ -140,7 +140,7 @@ def test_play_pause_and_scrub(browser, tmp_path):
     browser.click("#play")
     rate = "new Promise(done => { const t = replay.time, n = performance.now(); setTimeout(() => "
     rate += "done((replay.time - t) / (performance.now() - n) * 1000), 500); })"
-    assert browser.evaluate(rate) == pytest.approx(0.1, rel=0.5)  # however late a loaded machine calls back
+    assert 0.0 < browser.evaluate(rate) < 0.15  # a loaded machine drops frames, and time with them, but adds none
 
 
 @pytest.mark.browser
