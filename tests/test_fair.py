@@ -93,6 +93,15 @@ def test_a_longer_training_that_betters_nothing_is_not_taken(monkeypatch):
     assert tuned.learning_rate == score(tuned.training) == min(fair.LEARNING_RATES)
 
 
+def test_ctrl_c_ends_the_comparison_and_not_one_tuning(monkeypatch):
+    def interrupted(*arguments, **settings):
+        return replace(train(*arguments, **settings | {"epochs": 1}), stopped="interrupted")
+
+    monkeypatch.setattr(fair, "train", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fair.compare_fairly([SMALL], held_out_starts=2)
+
+
 def test_a_law_that_diverges_is_not_converged():
     law = fair.tune(SMALL, "NBS, untrained").law
     wild = ComputedTorque(law.dynamics, kp=1e6, kd=1e3)

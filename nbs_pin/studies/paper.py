@@ -169,9 +169,9 @@ takes 29.4; the median takes {np.median(times):.2f} s. *This package* trains the
 exact gradient.
 
 The paper gives no PID gains; two sets are shown. Its last row asks for m = 1 and for α = 1, which changes nothing (see
-the sweep below). The fastest seed takes {disturbed[0]:.2f} s there with the networks of the row above and τ_d switched
-on, and {disturbed[1]:.2f} s with m = 1 as stated. A convergence time says little without the torque that bought it:
-nothing here limits or charges torque."""
+the sweep below). The fastest seed takes {disturbed[0]:.2f} s there with the networks of the row above (m = 0.001) and
+τ_d switched on, and {disturbed[1]:.2f} s with m = 1 and trained under τ_d, as stated. A convergence time says
+little without the torque that bought it: nothing here limits or charges torque."""
 
 
 def _figures_section(seeds: range) -> Section:
@@ -201,9 +201,10 @@ def _alpha_section(flat: AsPrinted, swept: Sweep, seeds: range) -> Section:
     largest = float((np.maximum.reduce(found) / swept.corrected).max())
     text = f"""
 **As printed**, S = I is fixed and the loss has relu(λ_max(αI − ∇²Φ(0))) added. But ∇²Φ ⪰ 2S = 2I for every network, so
-the term is zero for all α ≤ 2: over {len(flat.regulariser)} values of α and {len(seeds)} seeds, before and after
-training, its largest value is {flat.regulariser.max():g}. Trained with α = {swept.alpha[0]:.3g} and with
-α = {swept.alpha[-1]:.3g}, the weights differ by {flat.weights_differ:g}, and the steady errors are
+the term is zero for all α ≤ 2: over {len(flat.regulariser)} values of α, for {len(seeds)} untrained networks and the
+one of seed {seeds[0]} trained at both ends, its largest value is {flat.regulariser.max():g}.
+Trained with α = {swept.alpha[0]:.3g} and with α = {swept.alpha[-1]:.3g},
+the weights differ by {flat.weights_differ:g}, and the steady errors are
 {short(float(flat.steady_error[0]))} and {short(float(flat.steady_error[-1]))} rad²: the sweep sweeps nothing.
 
 **With S = α/2·I** and D = ½I + TᵀT, α does what it should: ∇²Φ ⪰ αI. Steady ‖z1‖² [rad²], aligned, network of seed
@@ -213,11 +214,11 @@ training, its largest value is {flat.regulariser.max():g}. Trained with α = {sw
 
 ![Steady error against α](alpha.png)
 
-The printed bound, ‖z1‖² ≤ d/(2α²) with d = ‖τ_d‖² = 2, is true for a constant τ_d but not for every one: the worst of
-{WAVES} square waves with the same ‖τ_d‖ breaks it at {len(broken["untrained"])} of {count} values of α before training
-and at {len(broken["trained"])} after. The corrected bound (docs/theory.md §5) holds for every τ_d and every weight: V∞
-with D₀ = ½I, κ = ½/a₂, a₂ = 3 + 2√2 the exact upper bound of this arm's M, ε at its best. It is loose: what was found
-reaches at most {short(largest)} of it."""
+The printed bound, ‖z1‖² ≤ d/(2α²) with d = ‖τ_d‖² = 2, holds here under the constant τ_d but not under every
+one: the worst of {WAVES} square waves with the same ‖τ_d‖ breaks it at {len(broken["untrained"])} of {count} values
+of α before training and at {len(broken["trained"])} after. The corrected bound (docs/theory.md §5) holds for every τ_d
+and every weight: V∞ with D₀ = ½I, κ = ½/a₂, a₂ = 3 + 2√2 the exact upper bound of this arm's M, ε at its best. It is
+loose: what was found reaches at most {short(largest)} of it."""
     figures = {name: getattr(swept, name) for name in ("alpha", *names)}
     as_printed = {"regulariser": flat.regulariser, "steady_error": flat.steady_error,
                   "weights_differ": flat.weights_differ}  # fmt: skip

@@ -26,18 +26,15 @@ WAVES = len(SQUARE_WAVES) * len(_DIRECTIONS)
 """Square waves tried: every frequency in every direction."""
 SQUARE_DURATION = 60.0
 """[s]; the second half counts."""
+LARGEST_INERTIA = 3.0 + 2.0 * np.sqrt(2.0)
+"""a₂ with M(q) ⪯ a₂I for the paper's arm, exact [kg·m²].
 
-
-def inertia_bounds() -> tuple[float, float]:
-    """a₁, a₂ with a₁I ⪯ M(q) ⪯ a₂I for the paper's arm, exact [kg·m²].
-
-    With c = cos β₂, M = [[3 + 2c, 1 + c], [1 + c, 1]] has the eigenvalues 2 + c ± √2(1 + c): both ends at c = 1.
-    """
-    return 3.0 - 2.0 * np.sqrt(2.0), 3.0 + 2.0 * np.sqrt(2.0)
+With c = cos β₂, M = [[3 + 2c, 1 + c], [1 + c, 1]] has the eigenvalues 2 + c ± √2(1 + c): the largest at c = 1.
+"""
 
 
 def printed_bound(alpha: Any) -> Any:
-    """‖z1‖² ≤ d/(2α²) with d = ‖τ_d‖² (paper, Theorem 3); true for a constant τ_d, not for every one."""
+    """‖z1‖² ≤ d/(2α²) with d = ‖τ_d‖² (paper, Theorem 3); true at rest on a fixed reference, not for every τ_d."""
     return float(DISTURBANCE @ DISTURBANCE) / (2.0 * alpha**2)
 
 
@@ -47,13 +44,12 @@ def corrected_bound(alpha: float) -> float:
     Source: docs/theory.md §5 with D₀ = d_min I.
 
     ρ = α, κ = d_min/a₂, Δ = d/d_min, V∞ = Δ/(2εc), c = min(2ρ, (2 − ε)κ), ε = 1 if κ ≤ 2ρ else 2 − 2ρ/κ, its best;
-    ‖z1‖² ≤ V∞/λ_min(S), or ‖z2‖²/μ² ≤ (2V∞/a₁)/α², whichever is smaller.
+    ‖z1‖² ≤ V∞/λ_min(S).
     """
-    (a1, a2), delta = inertia_bounds(), float(DISTURBANCE @ DISTURBANCE) / FLOOR
-    rho, kappa = alpha, FLOOR / a2
+    delta, rho, kappa = float(DISTURBANCE @ DISTURBANCE) / FLOOR, alpha, FLOOR / LARGEST_INERTIA
     epsilon = 1.0 if kappa <= 2.0 * rho else 2.0 - 2.0 * rho / kappa
     limit = delta / (2.0 * epsilon * min(2.0 * rho, (2.0 - epsilon) * kappa))
-    return min(limit / (0.5 * alpha), 2.0 * limit / a1 / alpha**2)
+    return limit / (0.5 * alpha)
 
 
 def swept_controller(alpha: float, seed: int) -> NeuralBackstepping:

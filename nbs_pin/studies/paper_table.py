@@ -38,7 +38,10 @@ PRINTED = {
 }
 """The rows of Table I: steady error [rad²] and convergence time [s]."""
 PIDS = {"nearest to the paper's": (400.0, 5.0, 5.0), "best of a grid": (400.0, 100.0, 30.0)}
-"""Gains K_p, K_i, K_d, the same for both joints; the paper names none."""
+"""Gains K_p, K_i, K_d, the same for both joints; the paper names none.
+
+Of 6 × 7 × 5 combinations tried on this task, the ones nearest to the printed row and fastest to converge.
+"""
 
 
 @dataclass(frozen=True, eq=False)
