@@ -382,6 +382,7 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence():
     for given, message in (
         ({"epochs": 0}, "epochs is 0"),
         ({"starts": 0}, "at least one"),
+        ({"patience": 0}, "patience is 0"),
         ({"start_error": -1.0}, "start_error"),
         ({"disturbance": np.nan}, "disturbance"),
         ({"starts": np.zeros((3, 5))}, "q0 has shape"),

@@ -127,7 +127,7 @@ class _Progress:
 class Trainer:
     """One training, from its first epoch or from a checkpoint."""
 
-    def __init__(self, task: Task, resume: bool) -> None:
+    def __init__(self, task: Task, resume: bool, progress: bool) -> None:
         self.task, self.at = task, _Progress()
         modules = task.controller.modules()
         fixed = set() if task.gains else {id(m.change) for m in modules if isinstance(m, Gain)}
@@ -136,6 +136,8 @@ class Trainer:
             raise ArgumentError("nothing is left to train without the gains; give gains=True.")
         self.optimiser = self._fresh()
         self.first: float | None = None
+        with waiting("compiling, once on a machine", progress):
+            task.warm_up()
         # Before anything is trained: a controller that no checkpoint can hold is known now and not at the first save.
         self.fingerprint = "" if task.checkpoint is None else task.fingerprint()
         if resume:
@@ -145,11 +147,6 @@ class Trainer:
         """The epochs that are left."""
         stopped: Stop = "epochs"
         mark = self._mark()
-        try:
-            with waiting("compiling, once on a machine", progress):
-                self.task.warm_up()
-        except KeyboardInterrupt:
-            return self._result("interrupted")
         began, before = time.perf_counter(), self.at.seconds
         try:
             for _ in tracked(range(self.at.epoch, self.task.epochs), self._label, progress):

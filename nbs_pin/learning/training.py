@@ -63,7 +63,7 @@ def train(
     their `least_share`. optimiser: "cautious", "adam" or "lbfgs" (`learning/optimisers.py`). patience: epochs without a
     better held-out cost after which to stop. seed: of the starts drawn. checkpoint: a file kept up to date, from which
     `resume` goes on bit for bit. engine: None takes the fastest (`closed_loop.engine_for`).
-    Ctrl-C ends training early and keeps the best.
+    Ctrl-C ends training early and keeps the best, from the first epoch on.
 
     Raises ArgumentError for arguments that do not fit, a checkpoint of another training or a plant without
     derivatives, and SimulationDiverged when the first motions leave the finite numbers.
@@ -72,6 +72,8 @@ def train(
         raise ArgumentError(f"{type(controller).__name__} has no parameters to train; give one of the package's laws.")
     if epochs < 1 or epochs != int(epochs):
         raise ArgumentError(f"epochs is {epochs}, expected a whole number ≥ 1; the paper takes 200.")
+    if patience is not None and patience < 1:
+        raise ArgumentError(f"patience is {patience} epochs, expected at least one; None takes all epochs.")
     loop = Loop.of(
         plant,
         controller.nv,
@@ -107,7 +109,7 @@ def train(
         engine=engine_for(controller, loop) if engine is None else engine,
         checkpoint=None if checkpoint is None else Path(checkpoint),
     )
-    return Trainer(task, resume).run(progress)
+    return Trainer(task, resume, progress).run(progress)
 
 
 def _motions(
