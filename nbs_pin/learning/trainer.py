@@ -131,7 +131,7 @@ class Trainer:
         self.task, self.at = task, _Progress()
         modules = task.controller.modules()
         fixed = set() if task.gains else {id(m.change) for m in modules if isinstance(m, Gain)}
-        self.parameters = [p for p in task.controller.parameters() if id(p) not in fixed]
+        self.parameters = [p for p in task.controller.parameters() if p.requires_grad and id(p) not in fixed]
         if not self.parameters:
             raise ArgumentError("nothing is left to train without the gains; give gains=True.")
         self.optimiser = self._fresh()

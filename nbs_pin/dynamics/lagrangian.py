@@ -1,0 +1,116 @@
+"""A learned Lagrangian as the model of an arm: numpy and torch alike, machine code where the network has it."""
+
+import copy
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from nbs_pin.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.networks.lagrangian import CompiledTorque, LagrangianNetwork
+from nbs_pin.robot import Robot
+from nbs_pin.runtime.layout import Packed
+
+
+class LagrangianDynamics(DynamicsProvider, nn.Module):
+    """M̂, Ĉ, Ĝ and V̂ of a learned Lagrangian network (docs/theory.md §6).
+
+    The network is copied and its parameters are frozen: no training of a controller changes its model. Where its T̂ is
+    not quadratic, the ingredients are those at rest, and `reference_torque` and `forward_dynamics` are the exact
+    Euler–Lagrange equation with the inertia at (q, v).
+
+    network: float64. robot: the arm whose limits and drawings belong to it, or None. friction: what was learned beside
+    the Lagrangian, for laws that feed it forward; it is no part of M̂, Ĉ, Ĝ. report: how it was learned, for the reader.
+    Raises ArgumentError when robot or friction are for another number of joints, or the network is not in float64.
+    """
+
+    network: LagrangianNetwork
+
+    def __init__(
+        self,
+        network: LagrangianNetwork,
+        robot: Robot | None = None,
+        friction: JointFriction | None = None,
+        report: Any = None,
+    ) -> None:
+        super().__init__()
+        if robot is not None and robot.nv != network.nv:
+            raise ArgumentError(
+                f"the network is for {network.nv} joints and {robot.name} has {robot.nv}; give its own arm."
+            )
+        for name, x in network.named_parameters():
+            if x.dtype != torch.float64:
+                raise ArgumentError(f"parameter '{name}' is {x.dtype}, expected float64; give network.double().")
+        self.network = copy.deepcopy(network).requires_grad_(False)
+        self._robot, self.friction, self.report = robot, friction_of_size(friction, network.nv), report
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self.network.nv
+
+    @property
+    def robot(self) -> Robot | None:
+        """The arm, if one was given."""
+        return self._robot
+
+    def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """M̂(q) [kg·m²]."""
+        return self._evaluate(self.network.mass_matrix, q=q)
+
+    def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """Ĉ(q, v) [N·m·s], the Christoffel one of M̂(q)."""
+        return self._evaluate(self.network.coriolis_matrix, q=q, v=v)
+
+    def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """Ĝ(q) [N·m]."""
+        return self._evaluate(self.network.gravity, q=q)
+
+    def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+        """V̂(q) [J], up to a constant."""
+        return self._evaluate(self.network.potential, q=q)
+
+    def reference_torque(
+        self,
+        q: Float[Array, "*batch n"],
+        v: Float[Array, "*batch n"],
+        v_r: Float[Array, "*batch n"],
+        a_r: Float[Array, "*batch n"],
+    ) -> Float[Array, "*batch n"]:
+        """M̂ a_r + Ĉ(q, v) v_r + Ĝ [N·m], in numpy by the network's machine code where it has one."""
+        vectors = as_vectors(self.nv, q=q, v=v, v_r=v_r, a_r=a_r)
+        if is_torch_array(vectors[0]) or self._machine_code is None:
+            return self._evaluate(self.network.torque, q=q, v=v, v_r=v_r, a_r=a_r)
+        rows = (np.ascontiguousarray(x).reshape(-1, self.nv) for x in vectors)
+        return self._machine_code(*rows).reshape(vectors[0].shape)
+
+    def forward_dynamics(
+        self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
+    ) -> Float[Array, "*batch n"]:
+        """v̇ [rad/s²] that the torque τ [N·m] produces."""
+        return self._evaluate(self.network.acceleration, q=q, v=v, tau=tau)
+
+    def packed_tree(self) -> Packed | None:
+        """The network as a rigid tree, where it is one; None for a subclass, which may have changed an equation."""
+        return self.network.packed_tree() if type(self) is LagrangianDynamics else None
+
+    @cached_property
+    def _machine_code(self) -> CompiledTorque | None:
+        return self.network.compiled()
+
+    def _evaluate(self, function: Callable[..., torch.Tensor], **arguments: Array) -> Array:
+        """The network's function over leading batch axes, in the kind of the arguments."""
+        vectors = as_vectors(self.nv, **arguments)
+        if is_torch_array(vectors[0]):
+            return function(*vectors)
+        # The same array becomes the same tensor: the network knows shorter ways then.
+        tensors = {id(x): torch.from_numpy(np.array(x)) for x in vectors}
+        with torch.no_grad():
+            return function(*(tensors[id(x)] for x in vectors)).numpy()
