@@ -1,0 +1,62 @@
+"""Tanh networks with their tangents and gradients written out, so that training needs one reverse pass alone."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TypeAlias
+
+import torch
+from jaxtyping import Float
+from torch import nn
+
+Tape: TypeAlias = list[torch.Tensor]
+"""Slopes of the hidden layers, as `pull` needs them."""
+
+
+class TanhNetwork(nn.Module):
+    """Hidden layers of tanh, linear output; parameters w0, b0, w1, b1, … in float64.
+
+    sizes: of the input, of every hidden layer and of the output. Starts from N(0, 1/inputs of the layer) without bias,
+    drawn from `generator`; the output layer from a tenth of that.
+    """
+
+    def __init__(self, sizes: Sequence[int], generator: torch.Generator) -> None:
+        super().__init__()
+        self.depth = len(sizes) - 1
+        for i, (size, out) in enumerate(pairwise(sizes)):
+            spread = (0.1 if i == self.depth - 1 else 1.0) / math.sqrt(size)
+            weight = spread * torch.randn(out, size, dtype=torch.float64, generator=generator)
+            self.register_parameter(f"w{i}", nn.Parameter(weight))
+            self.register_parameter(f"b{i}", nn.Parameter(torch.zeros(out, dtype=torch.float64)))
+
+    def layers(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Weights and biases, input to output."""
+        named = {name: p for name, p in self._parameters.items() if p is not None}
+        return [(named[f"w{i}"], named[f"b{i}"]) for i in range(self.depth)]
+
+    def forward(self, x: Float[torch.Tensor, "*batch m"]) -> Float[torch.Tensor, "*batch k"]:
+        """The output at x."""
+        *hidden, (weight, bias) = self.layers()
+        for w, b in hidden:
+            x = torch.tanh(nn.functional.linear(x, w, b))
+        return nn.functional.linear(x, weight, bias)
+
+    def push(
+        self, x: Float[torch.Tensor, "*batch m"], tangents: Sequence[Float[torch.Tensor, "*batch m"]]
+    ) -> tuple[Float[torch.Tensor, "*batch k"], list[Float[torch.Tensor, "*batch k"]], Tape]:
+        """The output at x, its derivatives along the tangents, and what `pull` needs."""
+        *hidden, (weight, bias) = self.layers()
+        slopes = []
+        for w, b in hidden:
+            x = torch.tanh(nn.functional.linear(x, w, b))
+            slopes.append(1.0 - x * x)
+            tangents = [slopes[-1] * nn.functional.linear(dx, w) for dx in tangents]
+        return nn.functional.linear(x, weight, bias), [nn.functional.linear(dx, weight) for dx in tangents], slopes
+
+    def pull(self, tape: Tape, gradient: Float[torch.Tensor, "*batch k"]) -> Float[torch.Tensor, "*batch m"]:
+        """The gradient in the input that belongs to one in the output."""
+        *hidden, (weight, _) = self.layers()
+        gradient = gradient @ weight
+        for (w, _), slope in zip(reversed(hidden), reversed(tape), strict=True):
+            gradient = (slope * gradient) @ w
+        return gradient
