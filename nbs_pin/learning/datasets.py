@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,7 @@ def trajectory_slices(trajectory: Int[np.ndarray, " samples"]) -> list[slice]:
     """The stretch of samples that each trajectory takes, in order."""
     cuts = np.flatnonzero(np.diff(trajectory)) + 1
     bounds = [0, *cuts.tolist(), len(trajectory)]
-    return [slice(begin, end) for begin, end in zip(bounds[:-1], bounds[1:], strict=True) if end > begin]
+    return [slice(begin, end) for begin, end in pairwise(bounds) if end > begin]
 
 
 def _fault(data: Dataset) -> str:
