@@ -83,7 +83,7 @@ class CholeskyNetwork(LagrangianNetwork):
         inner = matvec(factor.mT, a_) + 0.5 * (matvec(along_v.mT, w_) + matvec(along_w.mT, v_))
         inertial = matvec(factor, inner) + 0.5 * (matvec(along_v, at_w) + matvec(along_w, at_v))
         in_factor = v_[..., :, None] * at_w[..., None, :] + w_[..., :, None] * at_v[..., None, :]
-        in_output = -0.5 * in_factor.flatten(-2) @ self._place.T
+        in_output = -0.5 * in_factor.flatten(-2, -1) @ self._place.T
         in_output = in_output + self.scales.energy * self._is_potential
         return root * inertial + self.scales.epsilon * a + self.features.pull(x, self.network.pull(tape, in_output))
 
@@ -98,4 +98,4 @@ class CholeskyNetwork(LagrangianNetwork):
 
     def _factor(self, output: Tensor) -> Tensor:
         """The outputs in their places in L; the last one, V̂, has none."""
-        return (output @ self._place).unflatten(-1, (self.nv, self.nv))
+        return (output @ self._place).reshape(*output.shape[:-1], self.nv, self.nv)

@@ -1,4 +1,4 @@
-"""What a network is given of a configuration: sine and cosine of joints that turn, the position of joints that slide."""
+"""What a network sees of a configuration: sine and cosine of joints that turn, the position of joints that slide."""
 
 from collections.abc import Sequence
 

@@ -1,0 +1,189 @@
+"""Partially input-convex networks for the kinetic energy: the paper's, and the quadratic one made from it."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from nbs_pin.networks.features import JointFeatures
+from nbs_pin.networks.lagrangian import GeneralLagrangianNetwork, LagrangianNetwork, Tensor
+from nbs_pin.networks.scales import Scales
+from nbs_pin.networks.softplus import SoftplusNetwork, paper_spread, softplus
+from nbs_pin.networks.tanh import TanhNetwork
+
+
+class PICNN(nn.Module):
+    """f(x̃, x), convex in x for every parameter value (paper eq. (7), Amos et al. 2017).
+
+    u_{i+1} = s(W̃ u + b̃), u_0 = x̃;
+    y_{i+1} = σ(Wy⁺(y ∘ (Wyu u + by)⁺) + Wx(x ∘ (Wxu u + bx)) + Wu u + b), y_0 = 0, the scalar output linear.
+    Both gate and weights of y must be ≥ 0, or f is not convex: the paper prints neither ⁺ for the gate.
+
+    smooth False: ⁺ clips at 0, s = σ = softplus, and all parameters start from the paper's N(0, ν²).
+    smooth True: ⁺ is softplus for the gate and |·| for the weights, so that no neuron is ever dead, and s = tanh;
+    starts at a curvature of order one.
+    """
+
+    def __init__(
+        self, context: int, inputs: int, widths: Sequence[int], generator: torch.Generator, *, smooth: bool
+    ) -> None:
+        super().__init__()
+        self.smooth, self.depth = smooth, len(widths) + 1
+        sizes, contexts = (*widths, 1), (context, *widths)
+        for i, (size, seen) in enumerate(zip(sizes, contexts, strict=True)):
+            shapes = {"wx": (size, inputs), "wxu": (inputs, seen), "bx": (inputs,), "wu": (size, seen), "b": (size,)}
+            if i < len(widths):
+                shapes |= {"wt": (size, seen), "bt": (size,)}
+            if i:
+                shapes |= {"wy": (size, sizes[i - 1]), "wyu": (sizes[i - 1], seen), "by": (sizes[i - 1],)}
+            for name, shape in shapes.items():
+                start = torch.randn(shape, dtype=torch.float64, generator=generator)
+                start = self._smooth_start(name, start) if smooth else paper_spread(i, sizes) * start
+                self.register_parameter(f"{name}{i}", nn.Parameter(start))
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Sizes of the hidden layers."""
+        return tuple(len(self.get_parameter(f"b{i}")) for i in range(self.depth - 1))
+
+    def forward(self, context: Float[Tensor, "*batch m"], x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """f(x̃, x)."""
+        y = x[..., :0]
+        for i, u in enumerate(self._contexts(context)):
+            a = self._linear("wu", i, u) + self._linear("wx", i, x * self._linear("wxu", i, u, "bx"), None)
+            if i:
+                a = a + nn.functional.linear(y * self._gate(i, u), self._weights(i))
+            y = softplus(a) if i < self.depth - 1 else a
+        return y[..., 0]
+
+    def curvature(self, context: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch n n"]:
+        """∂²f/∂x² at x = 0: one pass forward with gradient J and Hessian H of every neuron.
+
+        a = Wy⁺(y ∘ g) + …;  J ← σ'(a) J_a and H ← σ''(a) J_a J_aᵀ + σ'(a) H_a.
+        """
+        y = gradient = hessian = None
+        for i, u in enumerate(self._contexts(context)):
+            a = self._linear("wu", i, u)
+            in_x = self.get_parameter(f"wx{i}") * self._linear("wxu", i, u, "bx")[..., None, :]
+            bend = None
+            if y is not None and gradient is not None and hessian is not None:
+                through = self._weights(i) * self._gate(i, u)[..., None, :]
+                a, in_x = a + (through @ y[..., None])[..., 0], in_x + through @ gradient
+                bend = (through @ hessian.flatten(-2, -1)).reshape(*a.shape, *hessian.shape[-2:])
+            if i == self.depth - 1:
+                break
+            slope = torch.sigmoid(a)
+            y, gradient = softplus(a), slope[..., None] * in_x
+            hessian = (slope * (1.0 - slope))[..., None, None] * in_x[..., :, None] * in_x[..., None, :]
+            hessian = hessian if bend is None else hessian + slope[..., None, None] * bend
+        assert bend is not None, "a PICNN has a hidden layer"
+        return bend[..., 0, :, :]
+
+    def _contexts(self, u: Tensor) -> list[Tensor]:
+        """The context u of every layer."""
+        found = [u]
+        for i in range(self.depth - 1):
+            a = self._linear("wt", i, found[-1], "bt")
+            found.append(torch.tanh(a) if self.smooth else softplus(a))
+        return found
+
+    def _gate(self, i: int, u: Tensor) -> Tensor:
+        gate = self._linear("wyu", i, u, "by")
+        return softplus(gate) if self.smooth else torch.relu(gate)
+
+    def _weights(self, i: int) -> Tensor:
+        free = self.get_parameter(f"wy{i}")
+        return free.abs() if self.smooth else torch.relu(free)
+
+    def _linear(self, name: str, i: int, x: Tensor, bias: str | None = "b") -> Tensor:
+        shift = None if bias is None else self.get_parameter(f"{bias}{i}")
+        return nn.functional.linear(x, self.get_parameter(f"{name}{i}"), shift)
+
+    @staticmethod
+    def _smooth_start(name: str, start: Tensor) -> Tensor:
+        if name in ("b", "bt"):
+            return 0.0 * start
+        if name in ("bx", "by"):
+            return 0.0 * start + 1.0
+        columns = start.shape[1]
+        return start / (columns if name == "wy" else 1.0 if name == "wx" else columns**0.5)
+
+
+class PaperPicnn(GeneralLagrangianNetwork):
+    """The paper's L = T̂(q, v) − V̂(q): a PICNN of (q, v), convex in v, and an FCNN, both of softplus.
+
+    T̂ is not quadratic, so M̂ depends on v; convex is not strictly convex, so ½ε‖v‖² is added and gates are clipped
+    (docs/theory.md §6). Source: paper, sections II-B and V-B; starts from its ν formula.
+
+    Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
+    """
+
+    def __init__(
+        self,
+        prismatic: Sequence[bool],
+        *,
+        widths: Sequence[int] = (32, 32, 32),
+        epsilon: float = 1e-6,
+        inertia: Sequence[float] | None = None,
+        energy: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.features = JointFeatures(prismatic)
+        self.nv = self.features.nv
+        self.scales = Scales(self.nv, epsilon, inertia, energy)
+        generator = torch.Generator().manual_seed(seed)
+        self.convex = PICNN(self.features.size, self.nv, widths, generator, smooth=False)
+        self.network = SoftplusNetwork(self.features.size, widths, generator)
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Sizes of the hidden layers."""
+        return self.network.widths
+
+    def lagrangian(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """T̂(q, v) − V̂(q) [J]."""
+        x, s = self.features(q), self.scales
+        kinetic = self.convex(x, s.root * v) + 0.5 * s.epsilon * (v * v).sum(-1)
+        return kinetic - s.energy * self.network(x)
+
+
+class HomogenisedPicnn(LagrangianNetwork):
+    """M̂(q) = R ∂²f/∂v²(q, 0) R + εI ⪰ εI of a smooth PICNN f, and V̂ of a tanh network: T̂ is exactly quadratic.
+
+    What the paper's network becomes when its M̂ must not depend on v (docs/theory.md §6).
+    Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
+    """
+
+    def __init__(
+        self,
+        prismatic: Sequence[bool],
+        *,
+        widths: Sequence[int] = (32, 32),
+        epsilon: float = 1e-6,
+        inertia: Sequence[float] | None = None,
+        energy: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.features = JointFeatures(prismatic)
+        self.nv = self.features.nv
+        self.scales = Scales(self.nv, epsilon, inertia, energy)
+        generator = torch.Generator().manual_seed(seed)
+        self.convex = PICNN(self.features.size, self.nv, widths, generator, smooth=True)
+        self.network = TanhNetwork((self.features.size, *widths, 1), generator)
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Sizes of the hidden layers."""
+        return self.convex.widths
+
+    def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+        """M̂(q) [kg·m²]."""
+        root = self.scales.root
+        return root[:, None] * self.convex.curvature(self.features(q)) * root + self.scales.floor
+
+    def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """V̂(q) [J]."""
+        return self.scales.energy * self.network(self.features(q))[..., 0]

@@ -1,0 +1,52 @@
+"""Softplus networks with the start that the paper gives its Lagrangian networks."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import nn
+
+
+def softplus(x: Float[torch.Tensor, "*shape"]) -> Float[torch.Tensor, "*shape"]:
+    """log(1 + eˣ), without the piecewise shortcut of torch's own, so that all derivatives exist."""
+    return torch.logaddexp(x, torch.zeros_like(x))
+
+
+def paper_spread(layer: int, sizes: Sequence[int]) -> float:
+    """ν of a layer's parameters, N(0, ν²): (1/√n)·2.2 for the first layer, 0.58 i for hidden layer i, n for the last.
+
+    sizes: the number n of neurons of every layer, without the input. Source: paper, section II-B, after Cranmer et al.
+    2020, where i counts from 1 behind the first layer.
+    """
+    n, last = sizes[layer], layer == len(sizes) - 1
+    return (n if last else 0.58 * layer if layer else 2.2) / n**0.5
+
+
+class SoftplusNetwork(nn.Module):
+    """A scalar function by hidden layers of softplus and a linear output; parameters w0, b0, … in float64.
+
+    Starts from N(0, ν²), biases included (`paper_spread`), drawn from `generator`.
+    """
+
+    def __init__(self, inputs: int, widths: Sequence[int], generator: torch.Generator) -> None:
+        super().__init__()
+        sizes = (*widths, 1)
+        self.depth = len(sizes)
+        for i, (size, out) in enumerate(pairwise((inputs, *sizes))):
+            spread = paper_spread(i, sizes)
+            for name, shape in ((f"w{i}", (out, size)), (f"b{i}", (out,))):
+                start = spread * torch.randn(shape, dtype=torch.float64, generator=generator)
+                self.register_parameter(name, nn.Parameter(start))
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Sizes of the hidden layers."""
+        return tuple(len(self.get_parameter(f"b{i}")) for i in range(self.depth - 1))
+
+    def forward(self, x: Float[torch.Tensor, "*batch m"]) -> Float[torch.Tensor, "*batch"]:
+        """The value at x."""
+        for i in range(self.depth):
+            x = nn.functional.linear(x, self.get_parameter(f"w{i}"), self.get_parameter(f"b{i}"))
+            x = softplus(x) if i < self.depth - 1 else x
+        return x[..., 0]
