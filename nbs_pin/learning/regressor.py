@@ -1,0 +1,134 @@
+"""The equations of motion of an arm as they depend on its unknowns, linearly: inertias, friction and rotors.
+
+    τ = Y(q, v, v̇) π + viscous·v + coulomb·tanh(v / transition) + rotor·v̇
+
+Y is Pinocchio's regressor and π ten numbers per body, here as coordinates of its pseudo-inertia.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float
+
+from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, PARAMETERS_OF_COORDINATES, coordinates
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.learning.consistent_fit import in_factors
+from nbs_pin.learning.datasets import Dataset
+from nbs_pin.robot import Robot
+
+_CHUNK = 1_000
+"""Samples whose regressors are held in memory at once."""
+_FRICTION_SHARE = 0.05
+"""Expected share of friction, and of the rotors' inertia, in the torque."""
+_STILL = 0.1
+"""A joint slower than this share of the fastest is expected to have the friction of one that moves so fast."""
+
+
+@dataclass(frozen=True)
+class Scalars:
+    """Which unknowns every joint has beside the inertia of its body: those of friction, then the rotor's inertia."""
+
+    friction: bool
+    rotor_inertia: bool
+    transition: float
+    """Speed at which Coulomb friction turns [rad/s]."""
+
+    def factors(
+        self, v: Float[np.ndarray, "samples n"], a: Float[np.ndarray, "samples n"]
+    ) -> Float[np.ndarray, "kinds samples n"]:
+        """What each kind is multiplied by in the torque of its joint."""
+        kinds = [v, np.tanh(v / self.transition)] if self.friction else []
+        return np.array([*kinds, *([a] if self.rotor_inertia else [])]).reshape(-1, *v.shape)
+
+    def names(self, robot: Robot) -> list[str]:
+        """A name for every unknown of the arm, those of the bodies first."""
+        kinds = (["viscous", "coulomb"] if self.friction else []) + (["rotor"] if self.rotor_inertia else [])
+        bodies = [f"{parameter}({joint})" for joint in robot.joint_names for parameter in PARAMETER_NAMES]
+        return bodies + [f"{kind}({joint})" for kind in kinds for joint in robot.joint_names]
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What is expected of each unknown before any data: the units of the fit."""
+
+    bodies: Float[np.ndarray, "n 4 4"]
+    """Lower triangular factors of pseudo-inertias."""
+    scalars: Float[np.ndarray, " scalars"]
+    """Friction coefficients and rotor inertias."""
+
+    def in_units(self, triangles: Float[np.ndarray, "n rows columns"]) -> Float[np.ndarray, "n rows columns"]:
+        """The equations for unknowns in these units."""
+        split = 10 * len(self.bodies)
+        rows = triangles[:, :, :split].reshape(-1, split)
+        bodies = in_factors(rows, self.bodies).reshape(*triangles.shape[:2], -1)
+        return np.concatenate([bodies, triangles[:, :, split:] * np.append(self.scalars, 1.0)], axis=-1)
+
+
+def joint_triangles(robot: Robot, data: Dataset, scalars: Scalars) -> Float[np.ndarray, "n rows columns"]:
+    """The equations of each joint, the torque in the last column, as the triangle of their QR decomposition.
+
+    It is all that least squares needs of them: whatever the number of samples, one row per unknown and one more.
+    """
+    triangles = np.zeros((robot.nv, 0, len(scalars.names(robot)) + 1))
+    for rows in _rows(robot, data, scalars):
+        triangles = triangle(np.concatenate([triangles, rows], axis=1))
+    return triangles
+
+
+def triangle(rows: Float[np.ndarray, "*batch rows columns"]) -> Float[np.ndarray, "*batch fewer columns"]:
+    """R of the QR decomposition: fewer rows that say the same to least squares."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def expectation(
+    robot: Robot, data: Dataset, scalars: Scalars, triangles: Float[np.ndarray, "n rows columns"]
+) -> Expected:
+    """Balls along the links, of one mass that makes torques of the recorded size; a small share of them is friction.
+
+    Raises ArgumentError when no inertia plays a part in the motion: an arm that stays at rest without gravity.
+    """
+    factors, n = np.linalg.cholesky(_balls(robot)), robot.nv
+    size = torque_size(triangles, len(data))
+    balls = coordinates(factors @ factors.swapaxes(1, 2)).ravel()
+    torque = np.linalg.norm(triangles[:, :, : 10 * n] @ balls, axis=1) / np.sqrt(len(data))
+    if not torque.any():
+        raise ArgumentError(f"{data!r} neither moves nor carries weight, expected motions; record some.")
+    mass = np.sqrt(n / np.square(torque / size).sum())
+    speed = np.sqrt(np.square(scalars.factors(data.v, data.a)).mean(axis=1))
+    least = _STILL * speed.max(axis=-1, keepdims=True, initial=1e-9)
+    return Expected(np.sqrt(mass) * factors, (_FRICTION_SHARE * size / np.maximum(speed, least)).ravel())
+
+
+def torque_size(triangles: Float[np.ndarray, "n rows columns"], samples: int) -> Float[np.ndarray, " n"]:
+    """Root mean square torque per joint [N·m], those that hardly have one raised to a millionth of the largest."""
+    size = np.linalg.norm(triangles[:, :, -1], axis=1) / np.sqrt(samples)
+    return np.maximum(size, 1e-6 * size.max())
+
+
+def _rows(robot: Robot, data: Dataset, scalars: Scalars) -> Iterator[np.ndarray]:
+    """Blocks (n, samples, unknowns + 1) of the equations, one per joint and sample, the torque last."""
+    model, scratch, n = robot.model, robot.model.createData(), robot.nv
+    for begin in range(0, len(data), _CHUNK):
+        q, v, a, tau = (x[begin : begin + _CHUNK] for x in (data.q, data.v, data.a, data.tau))
+        states = zip(q, v, a, strict=True)
+        regressor = np.array([pin.computeJointTorqueRegressor(model, scratch, *state) for state in states])
+        bodies = (regressor.reshape(-1, n, n, 10) @ PARAMETERS_OF_COORDINATES).reshape(-1, n, 10 * n)
+        own = np.einsum("ksj,ij->iskj", scalars.factors(v, a), np.eye(n)).reshape(n, len(q), -1)
+        yield np.concatenate([bodies.swapaxes(0, 1), own, tau.T[..., None]], axis=-1)
+
+
+def _balls(robot: Robot) -> Float[np.ndarray, "n 4 4"]:
+    """Pseudo-inertias of homogeneous balls of 1 kg, each midway between its joint and the next ones."""
+    model, n = robot.model, robot.nv
+    places = np.array([model.jointPlacements[i].translation for i in range(1, n + 1)])
+    lengths = np.linalg.norm(places, axis=1)
+    usual = float(lengths[lengths > 1e-6].mean()) if (lengths > 1e-6).any() else 0.1
+    balls = np.zeros((n, 4, 4))
+    for i in range(n):
+        children = [c - 1 for c in range(1, n + 1) if model.parents[c] == i + 1]
+        centre = np.append(0.5 * places[children].mean(axis=0) if children else np.zeros(3), 1.0)
+        radius = max(float(np.linalg.norm(centre[:3])), 0.25 * usual)
+        balls[i] = np.outer(centre, centre) + np.diag([radius**2 / 5.0] * 3 + [0.0])
+    return balls
