@@ -54,7 +54,7 @@ class LagrangianNetwork(nn.Module, ABC):
         self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]
     ) -> Float[Tensor, "*batch n n"]:
         """Christoffel Ĉ(q, v) [N·m·s] of `mass_matrix`: C_ij = ½ Σ_k (∂_k M_ij + ∂_j M_ik − ∂_i M_jk) v_k."""
-        rates = _along_every_joint(self.mass_matrix, q)
+        rates = along_every_joint(self.mass_matrix, q)
         along = torch.einsum("k...ij,...k->...ij", rates, v)
         turned = torch.einsum("j...ik,...k->...ij", rates, v)
         return 0.5 * (along + turned - turned.mT)
@@ -70,8 +70,8 @@ class LagrangianNetwork(nn.Module, ABC):
 
         Ĉ(q, v) w = ½(∂_v M̂ w + ∂_w M̂ v − ∇_q vᵀM̂w): two directional derivatives of M̂ and one gradient.
         """
-        mass, along_v = _with_tangent(self.mass_matrix, (q,), (v,))
-        along_w = along_v if w is v else _along(self.mass_matrix, (q,), (w,))
+        mass, along_v = with_tangent(self.mass_matrix, (q,), (v,))
+        along_w = along_v if w is v else derivative(self.mass_matrix, (q,), (w,))
 
         def lagrangian(x: Tensor) -> Tensor:
             return (0.5 * (v * matvec(self.mass_matrix(x), w)).sum(-1) - self.potential(x)).sum()
@@ -126,7 +126,7 @@ class GeneralLagrangianNetwork(LagrangianNetwork):
 
     def inertia(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
         """∂²L/∂v² at (q, v) [kg·m²]."""
-        columns = _along_every_joint(lambda x: self.momentum(q.expand(x.shape), x), v)
+        columns = along_every_joint(lambda x: self.momentum(q.expand(x.shape), x), v)
         return columns.movedim(0, -1)
 
     def torque(
@@ -137,7 +137,7 @@ class GeneralLagrangianNetwork(LagrangianNetwork):
         a: Float[Tensor, "*batch n"],
     ) -> Float[Tensor, "*batch n"]:
         """d/dt ∂L/∂v − ∂L/∂q + Ĉ (w − v) [N·m]; much cheaper when w is the very tensor v."""
-        rate = _along(self.momentum, (q, v), (v, a))
+        rate = derivative(self.momentum, (q, v), (v, a))
         exact = rate - grad(lambda x: self.lagrangian(x, v).sum())(q)
         return exact if w is v else exact + self._frozen_coriolis(q, v, w - v)
 
@@ -145,14 +145,14 @@ class GeneralLagrangianNetwork(LagrangianNetwork):
         """Ĉ u with the Christoffel matrix of q ↦ ∂²L/∂v²(q, v), v frozen in it."""
 
         def times(x: Tensor, direction: Tensor) -> Tensor:
-            return _along(lambda s: self.momentum(x, s), (v,), (direction,))
+            return derivative(lambda s: self.momentum(x, s), (v,), (direction,))
 
-        along_v = _along(lambda x: times(x, u), (q,), (v,))
-        along_u = _along(lambda x: times(x, v), (q,), (u,))
+        along_v = derivative(lambda x: times(x, u), (q,), (v,))
+        along_u = derivative(lambda x: times(x, v), (q,), (u,))
         return 0.5 * (along_v + along_u - grad(lambda x: (v * times(x, u)).sum())(q))
 
 
-def _with_tangent(
+def with_tangent(
     function: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
     """The function and its directional derivative, differentiable again in both modes."""
@@ -161,13 +161,14 @@ def _with_tangent(
     return value, tangent
 
 
-def _along(function: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor, ...]) -> Tensor:
-    return _with_tangent(function, at, along)[1]
+def derivative(function: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor, ...]) -> Tensor:
+    """The directional derivative alone."""
+    return with_tangent(function, at, along)[1]
 
 
-def _along_every_joint(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+def along_every_joint(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """Derivatives of the function of (..., n) along every coordinate, stacked first: (n, ..., of the function)."""
     n = x.shape[-1]
     unit = torch.eye(n, dtype=x.dtype, device=x.device).reshape(n, *(1,) * (x.ndim - 1), n)
     many = x.expand(n, *x.shape)
-    return _along(function, (many,), (unit.expand(many.shape),))
+    return derivative(function, (many,), (unit.expand(many.shape),))

@@ -5,9 +5,16 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Float
 from torch import nn
+from torch.func import grad
 
 from nbs_pin.networks.features import JointFeatures
-from nbs_pin.networks.lagrangian import GeneralLagrangianNetwork, LagrangianNetwork, Tensor
+from nbs_pin.networks.lagrangian import (
+    GeneralLagrangianNetwork,
+    LagrangianNetwork,
+    Tensor,
+    along_every_joint,
+    derivative,
+)
 from nbs_pin.networks.scales import Scales
 from nbs_pin.networks.softplus import SoftplusNetwork, paper_spread, softplus
 from nbs_pin.networks.tanh import TanhNetwork
@@ -57,28 +64,22 @@ class PICNN(nn.Module):
             y = softplus(a) if i < self.depth - 1 else a
         return y[..., 0]
 
-    def curvature(self, context: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch n n"]:
-        """∂²f/∂x² at x = 0: one pass forward with gradient J and Hessian H of every neuron.
+    def curvature(self, context: Float[Tensor, "*batch m"], x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """d²/ds² of f(x̃, sx) at s = 0: one pass forward with both derivatives ẏ and ÿ of every neuron.
 
-        a = Wy⁺(y ∘ g) + …;  J ← σ'(a) J_a and H ← σ''(a) J_a J_aᵀ + σ'(a) H_a.
+        ẏ = σ'(a) ȧ and ÿ = σ''(a) ȧ² + σ'(a) ä.
         """
-        y = gradient = hessian = None
+        y = dy = ddy = x[..., :0]
         for i, u in enumerate(self._contexts(context)):
-            a = self._linear("wu", i, u)
-            in_x = self.get_parameter(f"wx{i}") * self._linear("wxu", i, u, "bx")[..., None, :]
-            bend = None
-            if y is not None and gradient is not None and hessian is not None:
-                through = self._weights(i) * self._gate(i, u)[..., None, :]
-                a, in_x = a + (through @ y[..., None])[..., 0], in_x + through @ gradient
-                bend = (through @ hessian.flatten(-2, -1)).reshape(*a.shape, *hessian.shape[-2:])
-            if i == self.depth - 1:
-                break
+            a, da, dda = self._linear("wu", i, u), self._linear("wx", i, x * self._linear("wxu", i, u, "bx"), None), y
+            if i:
+                gate, weight = self._gate(i, u), self._weights(i)
+                rises = (nn.functional.linear(part * gate, weight) for part in (y, dy, ddy))
+                a, da, dda = (part + rise for part, rise in zip((a, da, 0.0 * a), rises, strict=True))
             slope = torch.sigmoid(a)
-            y, gradient = softplus(a), slope[..., None] * in_x
-            hessian = (slope * (1.0 - slope))[..., None, None] * in_x[..., :, None] * in_x[..., None, :]
-            hessian = hessian if bend is None else hessian + slope[..., None, None] * bend
-        assert bend is not None, "a PICNN has a hidden layer"
-        return bend[..., 0, :, :]
+            y, dy, bend = softplus(a), slope * da, slope * (1.0 - slope) * da * da
+            ddy = bend + slope * dda if i else bend
+        return dda[..., 0]
 
     def _contexts(self, u: Tensor) -> list[Tensor]:
         """The context u of every layer."""
@@ -179,11 +180,38 @@ class HomogenisedPicnn(LagrangianNetwork):
         """Sizes of the hidden layers."""
         return self.convex.widths
 
+    def kinetic(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """T̂(q, v) = ½ vᵀM̂(q)v [J], without M̂."""
+        curvature = self.convex.curvature(self.features(q), self.scales.root * v)
+        return 0.5 * (curvature + self.scales.epsilon * (v * v).sum(-1))
+
     def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
         """M̂(q) [kg·m²]."""
-        root = self.scales.root
-        return root[:, None] * self.convex.curvature(self.features(q)) * root + self.scales.floor
+        return along_every_joint(lambda v: self._momentum(q.expand(v.shape), v), torch.zeros_like(q)).movedim(0, -1)
 
     def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """V̂(q) [J]."""
         return self.scales.energy * self.network(self.features(q))[..., 0]
+
+    def torque(
+        self,
+        q: Float[Tensor, "*batch n"],
+        v: Float[Tensor, "*batch n"],
+        w: Float[Tensor, "*batch n"],
+        a: Float[Tensor, "*batch n"],
+    ) -> Float[Tensor, "*batch n"]:
+        """M̂ a + Ĉ(q, v) w + Ĝ [N·m] from T̂ alone; half the work when w is the very tensor v.
+
+        With h(x) = Ĉ(q, x) x: Ĉ(q, v) w = h((v + w)/2) − h((v − w)/2) (docs/theory.md §1).
+        """
+        if w is v:
+            return self._inertial(q, v, a) + self.gravity(q)
+        ahead = self._inertial(q, 0.5 * (v + w), a)
+        return ahead - self._inertial(q, 0.5 * (v - w), torch.zeros_like(a)) + self.gravity(q)
+
+    def _inertial(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """M̂ a + Ĉ(q, v) v = d/dt ∂T̂/∂v − ∂T̂/∂q."""
+        return derivative(self._momentum, (q, v), (v, a)) - grad(lambda x: self.kinetic(x, v).sum())(q)
+
+    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
+        return grad(lambda x: self.kinetic(q, x).sum())(v)
