@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from nbs_pin.exceptions import ArgumentError
 
-CLEAN_WINDOW, QUANTISED_WINDOW = 11, 61
+CLEAN_WINDOW, QUANTISED_WINDOW = 11, 101
 """Samples that a derivative is taken over: of numbers that are exact, and of those an encoder rounds."""
 ORDER = 5
 """Degree of the polynomial fitted to each window."""

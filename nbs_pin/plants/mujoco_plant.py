@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.checks import all_finite
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.plants.plant import Plant
 from nbs_pin.robot import Robot
@@ -16,7 +17,7 @@ from nbs_pin.robot import Robot
 _SCRATCH = ("_data", "_qpos", "_qvel", "_torque", "_warnings")
 _LOGGER = logging.getLogger("nbs_pin.mujoco")
 MujocoIntegrator: TypeAlias = Literal["rk4", "euler", "implicitfast"]
-JointFrictionChoice: TypeAlias = Literal["drop", "keep"]
+JointFrictionChoice: TypeAlias = Literal["drop", "keep"] | JointFriction
 
 _INTEGRATORS = {
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
@@ -26,10 +27,7 @@ _INTEGRATORS = {
 _OFF = mujoco.mjtDisableBit
 # Left on, autoreset silently puts a diverged arm back to its start, and a warm start makes a step depend on the last.
 _ALWAYS_OFF = _OFF.mjDSBL_AUTORESET | _OFF.mjDSBL_WARMSTART | _OFF.mjDSBL_ACTUATION
-_CONSTRAINTS_OFF = {
-    "drop": _OFF.mjDSBL_CONSTRAINT,
-    "keep": _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_CONTACT | _OFF.mjDSBL_EQUALITY,  # dry friction is a constraint
-}
+_ALL_BUT_FRICTION = _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_CONTACT | _OFF.mjDSBL_EQUALITY  # dry friction is a constraint
 # MuJoCo's default lets a tenth of the free acceleration through dry friction, so that a light joint never really
 # sticks nor slides; its hardest setting is Coulomb friction to 1e-4 of the torque.
 _DRY_FRICTION_SOLREF = (0.002, 1.0)
@@ -42,7 +40,7 @@ class MujocoPlant(Plant):
     integrator: "rk4" (fourth order), "euler" (semi-implicit) or "implicitfast" (semi-implicit, damping implicit); None
     takes "rk4" without friction and "implicitfast" with it, since joint damping can be too stiff for explicit steps.
     joint_friction: "drop" leaves out the URDF's damping and dry friction, as Pinocchio does; "keep" has MuJoCo apply
-    both, the dry friction as its hardest constraint.
+    both, the dry friction as its hardest constraint; a `JointFriction` takes their place (its transition is not used).
     Effort limits belong to `simulate`. MuJoCo's own warnings become SimulationDiverged here; for the whole process they
     go to the logger "nbs_pin.mujoco" in place of a file in the working directory. Each plant owns one scratch
     `mujoco.MjData`: use one plant per thread.
@@ -55,10 +53,12 @@ class MujocoPlant(Plant):
         integrator: MujocoIntegrator | None = None,
         joint_friction: JointFrictionChoice = "drop",
     ) -> None:
-        integrator = integrator or ("implicitfast" if joint_friction == "keep" else "rk4")
+        integrator = integrator or ("rk4" if joint_friction == "drop" else "implicitfast")
         if integrator not in _INTEGRATORS:
             raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(_INTEGRATORS)}.")
-        if joint_friction not in _CONSTRAINTS_OFF:
+        if isinstance(joint_friction, JointFriction):
+            friction_of_size(joint_friction, robot.nv)
+        elif joint_friction not in ("drop", "keep"):
             raise ArgumentError(f"joint_friction '{joint_friction}' is unknown; give 'drop' or 'keep'.")
         mujoco.set_mju_user_warning(_LOGGER.info)
         self._robot = robot
@@ -180,15 +180,21 @@ def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: Join
 
     It goes through `MjSpec` and never through MuJoCo's own XML, which prints six digits.
     """
+    other: dict[str, tuple[float, float]] = {}
+    if isinstance(joint_friction, JointFriction):
+        pairs = zip(joint_friction.viscous.tolist(), joint_friction.coulomb.tolist(), strict=True)
+        other = dict(zip(robot.joint_names, pairs, strict=True))
     try:
         spec = mujoco.MjSpec.from_string(robot.urdf.without_geometry().decode())
         for joint in spec.joints:
-            if joint_friction == "drop":
-                joint.damping, joint.frictionloss = np.zeros(3), 0.0
+            if joint_friction != "keep":
+                viscous, dry = other.get(joint.name, (0.0, 0.0))
+                joint.damping, joint.frictionloss = np.array([viscous, 0.0, 0.0]), dry
             joint.solref_friction, joint.solimp_friction = _DRY_FRICTION_SOLREF, _DRY_FRICTION_SOLIMP
         spec.option.gravity = robot.gravity_vector
         spec.option.integrator = _INTEGRATORS[integrator]
-        spec.option.disableflags = _ALWAYS_OFF | _CONSTRAINTS_OFF[joint_friction]
+        off = _OFF.mjDSBL_CONSTRAINT if joint_friction == "drop" else _ALL_BUT_FRICTION
+        spec.option.disableflags = _ALWAYS_OFF | off
         return spec.compile()
     except ValueError as error:
         raise RobotError(
