@@ -88,8 +88,14 @@ class CholeskyNetwork(LagrangianNetwork):
         return root * inertial + self.scales.epsilon * a + self.features.pull(x, self.network.pull(tape, in_output))
 
     def compiled(self) -> CompiledTorque | None:
-        """`torque` as machine code (`runtime/cholesky.py`); None for a subclass."""
-        return None
+        """`torque` as machine code (`runtime/cholesky.py`); None for a subclass, which may have another torque."""
+        if type(self) is not CholeskyNetwork:
+            return None
+        from nbs_pin.runtime.cholesky import CholeskyTorque, pack_cholesky
+
+        layers = [(w.numpy(force=True), b.numpy(force=True)) for w, b in self.network.layers()]
+        scales = self.scales.root.numpy(force=True), float(self.scales.epsilon), float(self.scales.energy)
+        return CholeskyTorque(pack_cholesky(layers, self.features.order, self.features.turning, *scales))
 
     @property
     def _is_potential(self) -> Tensor:

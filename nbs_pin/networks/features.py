@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
@@ -35,6 +36,11 @@ class JointFeatures(nn.Module):
     def nv(self) -> int:
         """Number of joints."""
         return len(self.prismatic)
+
+    @property
+    def order(self) -> np.ndarray:
+        """Joints in the order of the features: those that turn, then those that slide."""
+        return self._joints.numpy(force=True)
 
     @property
     def size(self) -> int:
