@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from nbs_pin.arrays import Array
 from nbs_pin.checks import positive, whole
@@ -17,7 +17,7 @@ from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
-from nbs_pin.learning.datasets import Dataset
+from nbs_pin.learning.datasets import Dataset, joint_tree
 from nbs_pin.learning.excitation import configuration_box, excitation, soft_pd, torque_limits, work
 from nbs_pin.learning.measuring import CLEAN_WINDOW, QUANTISED_WINDOW, Noise, derivative, quantised
 from nbs_pin.plants.mujoco_plant import MujocoPlant
@@ -100,12 +100,6 @@ def collect(
     }
     tau = tau + noise.torque * generator.standard_normal(tau.shape)
     return Dataset(q, v, a, tau, t, np.repeat(np.arange(len(counts)), counts), *joint_tree(robot), robot.name, about)
-
-
-def joint_tree(robot: Robot) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Parents (0 for the base, i + 1 for joint i) and which joints slide: all that a `Dataset` says of an arm."""
-    parents = np.array(list(robot.model.parents)[1:], dtype=np.int64)
-    return parents, np.array([joint.prismatic for joint in robot.joints])
 
 
 class _Idle(MemorylessController):
