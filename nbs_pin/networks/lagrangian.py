@@ -50,11 +50,15 @@ class LagrangianNetwork(nn.Module, ABC):
         """Ĝ(q) = ∂V̂/∂q [N·m]."""
         return grad(lambda x: self.potential(x).sum())(q)
 
+    def mass_rates(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "n *batch n n"]:
+        """∂M̂/∂q_k, stacked over k first."""
+        return along_every_joint(self.mass_matrix, q)
+
     def coriolis_matrix(
         self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]
     ) -> Float[Tensor, "*batch n n"]:
         """Christoffel Ĉ(q, v) [N·m·s] of `mass_matrix`: C_ij = ½ Σ_k (∂_k M_ij + ∂_j M_ik − ∂_i M_jk) v_k."""
-        rates = along_every_joint(self.mass_matrix, q)
+        rates = self.mass_rates(q)
         along = torch.einsum("k...ij,...k->...ij", rates, v)
         turned = torch.einsum("j...ik,...k->...ij", rates, v)
         return 0.5 * (along + turned - turned.mT)

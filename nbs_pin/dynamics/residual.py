@@ -1,0 +1,153 @@
+"""An arm that is nearly known: a nominal model and what a network learned to correct in it."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from nbs_pin.arrays import matvec
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.lagrangian import LagrangianDynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.networks.cholesky import CholeskyNetwork
+from nbs_pin.networks.lagrangian import Tensor
+
+
+class Terms(NamedTuple):
+    """What the torque of an arm follows from at q, over leading batch axes."""
+
+    mass: Tensor
+    """M (..., n, n) [kg·m²]."""
+    rates: Tensor
+    """∂M/∂q_k (..., n, n, n), k first."""
+    gravity: Tensor
+    """G (..., n) [N·m]."""
+
+
+class ResidualNetwork(CholeskyNetwork):
+    """M̂ = κM + (1 − κ)FFᵀ with F = chol M(q) + R ΔL(q), and V̂ = V + ΔV(q); M and V of a nominal model.
+
+    M̂ ⪰ κM ≻ 0 for every parameter value, every arm with M̂ ≻ κM is inside the class, and the untrained network, with
+    ΔL = 0 and ΔV = 0, is the nominal model itself. Gradients in q exist once where the nominal model's do.
+
+    nominal: such as the arm as its URDF states it. prismatic: for every joint whether it slides; None asks the nominal
+    arm, or takes all for revolute. share: κ. inertia, energy: scales as in `CholeskyNetwork`; None takes the nominal
+    inertias and gravity torque. Raises ArgumentError for a share outside (0, 1) or another number of joints.
+    """
+
+    def __init__(
+        self,
+        nominal: DynamicsProvider,
+        prismatic: Sequence[bool] | None = None,
+        *,
+        share: float = 0.01,
+        widths: Sequence[int] = (64, 64),
+        inertia: Sequence[float] | None = None,
+        energy: float | None = None,
+        seed: int = 0,
+    ) -> None:
+        if not 0.0 < share < 1.0:
+            raise ArgumentError(f"share is {share}; give a number between 0 and 1, the least share of the nominal M.")
+        slides = _slides(nominal) if prismatic is None else list(prismatic)
+        if len(slides) != nominal.nv:
+            raise ArgumentError(f"prismatic has {len(slides)} values, expected {nominal.nv}; give one per joint.")
+        home = np.zeros(nominal.nv)
+        given = np.diagonal(nominal.mass_matrix(home)).tolist() if inertia is None else inertia
+        unit = float(np.abs(nominal.gravity(home)).max()) or 1.0
+        super().__init__(slides, widths=widths, inertia=given, energy=unit if energy is None else energy, seed=seed)
+        self.nominal, self.share = nominal, share
+        for weight in self.network.layers()[-1]:
+            nn.init.zeros_(weight)
+
+    def terms(self, q: Float[Tensor, "*batch n"], nominal: Terms | None = None) -> Terms:
+        """M̂, its rates and Ĝ; nominal: `nominal_terms` of the same q, where they are known already."""
+        given = nominal_terms(self.nominal, q) if nominal is None else nominal
+        factor = torch.linalg.cholesky(given.mass)
+        x = self.features(q)
+        unit = torch.eye(self.nv, dtype=q.dtype, device=q.device)
+        output, along, _ = self.network.push(x, [self.features.push(x, e.expand(q.shape)) for e in unit])
+        rates = _factor_rates(factor, given.rates) + self._correction(torch.stack(along, dim=-2))
+        factor = factor + self._correction(output)
+        product = rates @ factor[..., None, :, :].mT
+        gravity = given.gravity + self.scales.energy * torch.stack([o[..., -1] for o in along], dim=-1)
+        mixed = self.share * given.rates + (1.0 - self.share) * (product + product.mT)
+        return Terms(self._mixed(given.mass, factor), mixed, gravity)
+
+    def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+        """M̂(q) [kg·m²]."""
+        mass = self.nominal.mass_matrix(q)
+        return self._mixed(mass, torch.linalg.cholesky(mass) + self._correction(self.network(self.features(q))))
+
+    def mass_rates(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "n *batch n n"]:
+        """∂M̂/∂q_k, stacked over k first."""
+        return self.terms(q).rates.movedim(-3, 0)
+
+    def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """V̂(q) [J]."""
+        return self.nominal.potential_energy(q) + super().potential(q)
+
+    def gravity(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+        """Ĝ(q) [N·m]."""
+        return self.terms(q).gravity
+
+    def torque(
+        self,
+        q: Float[Tensor, "*batch n"],
+        v: Float[Tensor, "*batch n"],
+        w: Float[Tensor, "*batch n"],
+        a: Float[Tensor, "*batch n"],
+        nominal: Terms | None = None,
+    ) -> Float[Tensor, "*batch n"]:
+        """M̂ a + Ĉ(q, v) w + Ĝ [N·m]; nominal: as in `terms`, which spares a training most of the time."""
+        mass, rates, gravity = self.terms(q, nominal)
+        along_v, along_w = (torch.einsum("...kij,...k->...ij", rates, x) for x in (v, w))
+        slope = torch.einsum("...kij,...i,...j->...k", rates, v, w)
+        return matvec(mass, a) + 0.5 * (matvec(along_v, w) + matvec(along_w, v) - slope) + gravity
+
+    def _correction(self, output: Tensor) -> Tensor:
+        """R ΔL."""
+        return self.scales.root[:, None] * self._factor(output)
+
+    def _mixed(self, mass: Tensor, factor: Tensor) -> Tensor:
+        return self.share * mass + (1.0 - self.share) * factor @ factor.mT
+
+
+class ResidualDynamics(LagrangianDynamics):
+    """A nominal model with what a `ResidualNetwork` learned to correct in it; a model like any other.
+
+    network: copied and frozen, its nominal model with it; untrained, it is the nominal model. friction, report: as in
+    `LagrangianDynamics`. Raises ArgumentError when the friction is for another number of joints.
+    """
+
+    def __init__(self, network: ResidualNetwork, friction: JointFriction | None = None, report: Any = None) -> None:
+        super().__init__(network, network.nominal.robot, friction, report)
+
+    @property
+    def nominal(self) -> DynamicsProvider:
+        """The model that is corrected."""
+        nominal: Any = self.network.nominal
+        return nominal
+
+
+def nominal_terms(dynamics: DynamicsProvider, q: Float[Tensor, "*batch n"]) -> Terms:
+    """M, its rates and G of any model: ∂M/∂q_k = C(q, e_k) + C(q, e_k)ᵀ, because Ṁ − 2C is skew."""
+    unit = torch.eye(dynamics.nv, dtype=q.dtype, device=q.device)
+    coriolis = torch.stack([dynamics.coriolis_matrix(q, e.expand(q.shape)) for e in unit], dim=-3)
+    return Terms(dynamics.mass_matrix(q), coriolis + coriolis.mT, dynamics.gravity(q))
+
+
+def _factor_rates(factor: Tensor, rates: Tensor) -> Tensor:
+    """∂L/∂q_k = L Φ(L⁻¹ ∂_kM L⁻ᵀ) of M = LLᵀ, where Φ keeps what is below the diagonal and half of the diagonal."""
+    lower = factor[..., None, :, :]
+    inner = torch.linalg.solve_triangular(lower, rates, upper=False)
+    inner = torch.linalg.solve_triangular(lower, inner.mT, upper=False)
+    return lower @ (inner.tril() - 0.5 * torch.diag_embed(inner.diagonal(dim1=-2, dim2=-1)))
+
+
+def _slides(dynamics: DynamicsProvider) -> list[bool]:
+    robot = dynamics.robot
+    return [False] * dynamics.nv if robot is None else [bool(joint.prismatic) for joint in robot.joints]
