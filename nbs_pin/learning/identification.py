@@ -13,11 +13,10 @@ from jaxtyping import Float
 from nbs_pin.checks import positive
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
-from nbs_pin.dynamics.pinocchio import pack_model
 from nbs_pin.dynamics.pseudo_inertia import PARAMETERS_OF_COORDINATES, coordinates, inertial_parameters
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.learning.consistent_fit import ConsistentFit, consistent_fit, in_factors
-from nbs_pin.learning.datasets import Dataset
+from nbs_pin.learning.datasets import Dataset, joint_tree
 from nbs_pin.learning.regressor import Expected, Scalars, expectation, joint_triangles, torque_size, triangle
 from nbs_pin.robot import Robot
 
@@ -62,7 +61,7 @@ def identify(
     friction: bool = False,
     rotor_inertia: bool = False,
     transition: float = 0.01,
-    regularisation: float = 0.1,
+    regularisation: float = 0.3,
 ) -> IdentifiedDynamics:
     """The arm with those inertias, and friction if wanted, that explain the data best among all that can exist.
 
@@ -73,9 +72,10 @@ def identify(
     friction: also find viscous and Coulomb coefficients ≥ 0 of every joint (`IdentifiedDynamics.friction`), for the
     speed `transition` [rad/s] at which `JointFriction` turns. rotor_inertia: also find rotor inertias ≥ 0, which no
     URDF states. regularisation: γ, how many measurements the expected inertias are worth (homogeneous balls along the
-    links, of a mass that makes torques of the recorded size); it matters where the data say little. `report` of the
-    result is an `IdentificationReport`. Raises ArgumentError for data of another arm, for fewer than two equations per
-    base parameter, and for data without torque, which inertias of every scale explain.
+    links, tapering, of masses that make torques of the recorded size); it matters where the data say little. `report`
+    of the result is an `IdentificationReport`. Raises ArgumentError for data of another arm, for fewer than two
+    equations per base parameter, for an arm that neither moves nor carries weight, and for data without torque, which
+    inertias of every scale explain.
     """
     start = time.perf_counter()
     positive("transition", transition, "rad/s")
@@ -106,8 +106,8 @@ def identify(
 
 def _check_arm(data: Dataset, robot: Robot) -> None:
     """Raise ArgumentError unless the data have the joints of the robot, and torque."""
-    tree = pack_model(robot.model).layout[1:].reshape(-1, 2)
-    if data.nv != robot.nv or (tree != np.column_stack([data.parents, data.prismatic])).any():
+    parents, prismatic = joint_tree(robot)
+    if not (np.array_equal(parents, data.parents) and np.array_equal(prismatic, data.prismatic)):
         raise ArgumentError(
             f"{data!r} does not fit {robot!r}: number, kinds or order of the joints differ; give the arm they are of."
         )

@@ -85,7 +85,7 @@ def triangle(rows: Float[np.ndarray, "*batch rows columns"]) -> Float[np.ndarray
 def expectation(
     robot: Robot, data: Dataset, scalars: Scalars, triangles: Float[np.ndarray, "n rows columns"]
 ) -> Expected:
-    """Balls along the links, of one mass that makes torques of the recorded size; a small share of them is friction.
+    """Balls along the links, of masses that make torques of the recorded size; a small share of these is friction.
 
     Raises ArgumentError when no inertia plays a part in the motion: an arm that stays at rest without gravity.
     """
@@ -95,10 +95,10 @@ def expectation(
     torque = np.linalg.norm(triangles[:, :, : 10 * n] @ balls, axis=1) / np.sqrt(len(data))
     if not torque.any():
         raise ArgumentError(f"{data!r} neither moves nor carries weight, expected motions; record some.")
-    mass = np.sqrt(n / np.square(torque / size).sum())
+    scale = np.sqrt(n / np.square(torque / size).sum())
     speed = np.sqrt(np.square(scalars.factors(data.v, data.a)).mean(axis=1))
     least = _STILL * speed.max(axis=-1, keepdims=True, initial=1e-9)
-    return Expected(np.sqrt(mass) * factors, (_FRICTION_SHARE * size / np.maximum(speed, least)).ravel())
+    return Expected(np.sqrt(scale) * factors, (_FRICTION_SHARE * size / np.maximum(speed, least)).ravel())
 
 
 def torque_size(triangles: Float[np.ndarray, "n rows columns"], samples: int) -> Float[np.ndarray, " n"]:
@@ -120,15 +120,19 @@ def _rows(robot: Robot, data: Dataset, scalars: Scalars) -> Iterator[np.ndarray]
 
 
 def _balls(robot: Robot) -> Float[np.ndarray, "n 4 4"]:
-    """Pseudo-inertias of homogeneous balls of 1 kg, each midway between its joint and the next ones."""
+    """Pseudo-inertias of homogeneous balls, each midway between its joint and the next ones.
+
+    Arms taper: the masses [kg] are as the numbers of joints, counted from each ball to the tip.
+    """
     model, n = robot.model, robot.nv
     places = np.array([model.jointPlacements[i].translation for i in range(1, n + 1)])
     lengths = np.linalg.norm(places, axis=1)
     usual = float(lengths[lengths > 1e-6].mean()) if (lengths > 1e-6).any() else 0.1
-    balls = np.zeros((n, 4, 4))
-    for i in range(n):
+    balls, mass = np.zeros((n, 4, 4)), np.ones(n)
+    for i in reversed(range(n)):
         children = [c - 1 for c in range(1, n + 1) if model.parents[c] == i + 1]
         centre = np.append(0.5 * places[children].mean(axis=0) if children else np.zeros(3), 1.0)
         radius = max(float(np.linalg.norm(centre[:3])), 0.25 * usual)
-        balls[i] = np.outer(centre, centre) + np.diag([radius**2 / 5.0] * 3 + [0.0])
+        mass[i] += mass[children].max(initial=0.0)
+        balls[i] = mass[i] * (np.outer(centre, centre) + np.diag([radius**2 / 5.0] * 3 + [0.0]))
     return balls
