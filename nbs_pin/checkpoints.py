@@ -1,4 +1,4 @@
-"""Controllers in files: settings and weights, the arm they are for, and where a training stood.
+"""Controllers and models in files: settings and weights, the arm they are for, and where a training stood.
 
 A file holds `controller.json` (settings, arm, versions), `controller.safetensors` (the `state_dict`, float64) and, for
 a training that can be resumed, `training.json` and `training.safetensors`, sealed as `archives.py` has it. No pickle.
@@ -17,8 +17,7 @@ import torch
 from safetensors import SafetensorError
 
 from nbs_pin.archives import parse_json, read_archive, write_archive
-from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.descriptions import Settings, describe, described_robot, rebuild
+from nbs_pin.controllers.descriptions import Settings, Stored, describe, described_robot, rebuild
 from nbs_pin.exceptions import ArgumentError, FileFormatError, RobotError, RobotNotFound
 from nbs_pin.robot import Robot, load_robot
 from nbs_pin.versions import versions
@@ -42,23 +41,23 @@ class Checkpoint(NamedTuple):
     """What a checkpoint holds."""
 
     controller: Any
-    """The same law with the same weights: a `Controller` and an `nn.Module`."""
+    """The same law or model with the same weights: a `Controller` or a `DynamicsProvider`."""
     training: TrainingState | None
     """Where its training stood, if it was written during one."""
 
 
-def save(controller: Controller, path: str | Path, *, info: Mapping[str, Any] | None = None) -> None:
-    """Write the controller to one file, which `load` turns into a controller of bit for bit the same torques.
+def save(controller: Stored, path: str | Path, *, info: Mapping[str, Any] | None = None) -> None:
+    """Write a controller or a model to one file, which `load` turns into one of bit for bit the same torques.
 
-    The file holds the old controller or the new one, whatever interrupts the writing; missing folders are made.
+    The file holds the old one or the new one, whatever interrupts the writing; missing folders are made.
     info: free notes (seed, what it was trained for), stored as JSON and given back by `about`.
-    Raises ArgumentError for a controller with parts from outside the package or weights that are not finite.
+    Raises ArgumentError for one with parts from outside the package or weights that are not finite.
     """
     write_checkpoint(path, controller, info=info)
 
 
-def load(path: str | Path, robot: Robot | None = None) -> Controller:
-    """The controller that `save` wrote to the file.
+def load(path: str | Path, robot: Robot | None = None) -> Any:
+    """The `Controller` or the `DynamicsProvider` that `save` wrote to the file; a model's report becomes a dict.
 
     robot: the arm it is for, with effort limits as wished; None loads it as it was loaded then, with the limits it had.
     A PID still saturates at its own `effort_limit`, and one built without an arm is for its number of joints alone.
@@ -79,7 +78,7 @@ def about(path: str | Path) -> dict[str, Any]:
 
 def write_checkpoint(
     path: str | Path,
-    controller: Controller,
+    controller: Stored,
     training: TrainingState | None = None,
     *,
     info: Mapping[str, Any] | None = None,
@@ -88,7 +87,7 @@ def write_checkpoint(
     try:
         settings, tensors = describe(controller)
     except ArgumentError as error:
-        raise ArgumentError(f"the controller was not saved to {path}: {error}; correct that.") from error
+        raise ArgumentError(f"nothing was saved to {path}: {error}; correct that.") from error
     document = {"controller": settings, "versions": versions(), "info": dict(info or {})}
     entries = _entries(_CONTROLLER, document, tensors)
     if training is not None:

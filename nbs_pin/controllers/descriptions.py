@@ -1,12 +1,12 @@
-"""A controller as settings that JSON can store and tensors, and the same controller back.
+"""A controller or a model as settings that JSON can store and tensors, and the same one back.
 
-Every part of a controller is its class and the arguments of its constructor. `_KINDS` says for each class where each
+Every part of it is its class and the arguments of its constructor. `_KINDS` says for each class where each
 argument is found: plain settings and further parts in the description, arrays among the tensors of the `state_dict`.
 """
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from typing import Any, TypeAlias, cast
 
@@ -22,15 +22,25 @@ from nbs_pin.controllers.pid import PID
 from nbs_pin.controllers.slotine_li import SlotineLi
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.identified import IdentifiedDynamics
+from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.networks.activations import SmoothedReLU, Squareplus
+from nbs_pin.networks.cholesky import CholeskyNetwork
 from nbs_pin.networks.damping import Damping
+from nbs_pin.networks.picnn import HomogenisedPicnn, PaperPicnn
 from nbs_pin.networks.potential import Potential
+from nbs_pin.networks.unconstrained import UnconstrainedLagrangian
 from nbs_pin.robot import Robot
 
 Settings: TypeAlias = dict[str, Any]
 """A part in JSON: its `kind`, its settings by name, and its own parts."""
+
+Stored: TypeAlias = Controller | DynamicsProvider
+"""What files hold: a law, or what one believes of an arm."""
 
 
 class Tensors(dict[str, torch.Tensor]):
@@ -64,34 +74,32 @@ class _Kind:
     """What a stored list is handed over as."""
 
 
-def describe(controller: Controller) -> tuple[Settings, Tensors]:
-    """The controller in JSON and copies of the tensors of its `state_dict`: what `rebuild` makes the same one of.
+def describe(stored: Stored) -> tuple[Settings, Tensors]:
+    """The controller or model in JSON and copies of the tensors of its `state_dict`: `rebuild` makes the same of them.
 
-    Raises ArgumentError for a controller with parts that are not the package's own, or numbers that are not finite.
+    Raises ArgumentError for one with parts that are not the package's own, or numbers that are not finite.
     """
-    settings = cast(Settings, _described(controller))
-    module = cast(nn.Module, controller)
-    tensors = Tensors({name: x.detach().cpu().clone().contiguous() for name, x in module.state_dict().items()})
-    robot = attrgetter("dynamics.robot" if "dynamics" in settings else "robot")(controller)
-    copy = cast(nn.Module, rebuild(settings, tensors, robot))
-    for mine, theirs in zip(module.modules(), copy.modules(), strict=True):
+    settings = cast(Settings, _described(stored))
+    state = stored.state_dict() if isinstance(stored, nn.Module) else {}
+    tensors = Tensors({name: x.detach().cpu().clone().contiguous() for name, x in state.items()})
+    robot = attrgetter("dynamics.robot" if "dynamics" in settings else "robot")(stored)
+    copy = rebuild(settings, tensors, robot)
+    for mine, theirs in zip(_modules(stored), _modules(copy), strict=True):
         if type(mine) is not type(theirs):
             raise ArgumentError(f"a {type(mine).__name__} cannot be stored in place of a {type(theirs).__name__}")
     return settings, tensors
 
 
 def described_robot(description: Any) -> Settings | None:
-    """The description of the arm that a controller is for, None where it knows no arm.
+    """The description of the arm that a controller or model is for, None where it knows no arm.
 
     Raises ArgumentError for a description that `describe` would not give.
     """
-    law = _kind_of(description)
-    if not issubclass(cast(type, law.make), Controller):
-        raise ArgumentError(f"a {description['kind']} is no controller")
-    knowing = description["dynamics"] if "dynamics" in law.parts else description
-    if "robot" not in _kind_of(knowing).parts or knowing["robot"] is None:
+    if not issubclass(cast(type, _kind_of(description).make), Controller | DynamicsProvider):
+        raise ArgumentError(f"a {description['kind']} is no controller and no model")
+    robot = _robot_in(description)
+    if robot is None:
         return None
-    robot = knowing["robot"]
     if _kind_of(robot).make is not Robot:
         raise ArgumentError(f"the arm is a {robot['kind']}")
     kinds = {"name": str, "source": str, "options": dict, "sha256": str, "effort_limit": list}
@@ -101,20 +109,33 @@ def described_robot(description: Any) -> Settings | None:
     return robot
 
 
-def rebuild(description: Settings, tensors: Mapping[str, torch.Tensor], robot: Robot | None) -> Controller:
-    """The controller that `describe` described, with these tensors as its `state_dict`.
+def _robot_in(description: Any) -> Any:
+    """The arm of a law is its model's, that of a model which corrects another is the other's."""
+    kind = _kind_of(description)
+    if "robot" in kind.parts:
+        return description["robot"]
+    inner = [description[name] for name in ("dynamics", "network", "nominal") if name in kind.parts]
+    return _robot_in(inner[0]) if inner else None
+
+
+def rebuild(description: Settings, tensors: Mapping[str, torch.Tensor], robot: Robot | None) -> Stored:
+    """What `describe` described, with these tensors as its `state_dict`.
 
     robot: stands where the description has an arm. Raises ArgumentError when description and tensors do not make one
-    controller: a setting or tensor too many or too few, of another shape or kind, or out of its range.
+    controller or model: a setting or tensor too many or too few, of another shape or kind, or out of its range.
     """
     try:
-        controller = _rebuild(description, Tensors(tensors), robot)
+        stored = _rebuild(description, Tensors(tensors), robot)
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:  # constructors given what is none of theirs
-        raise ArgumentError(f"settings and tensors make no controller: {error}") from error
-    module = cast(nn.Module, controller)
+        raise ArgumentError(f"settings and tensors make no controller or model: {error}") from error
+    module = stored if isinstance(stored, nn.Module) else nn.Module()
     _check_tensors(tensors, module)
     module.load_state_dict(tensors)
-    return controller
+    return stored
+
+
+def _modules(stored: Stored) -> list[nn.Module]:
+    return list(stored.modules()) if isinstance(stored, nn.Module) else []
 
 
 def _described(part: Any) -> Settings | None:
@@ -172,7 +193,11 @@ def _check_tensors(tensors: Mapping[str, torch.Tensor], module: nn.Module) -> No
 
 
 def _plain(value: Any) -> Any:
-    """Numbers, text and lists for JSON, which has no infinity: null stands for it."""
+    """Numbers, text, lists and records for JSON, which has no infinity: null stands for it."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {name: _plain(x) for name, x in value.items()}
     if isinstance(value, np.ndarray | tuple):
         return [_plain(x) for x in value]
     if isinstance(value, np.generic):
@@ -209,7 +234,17 @@ def _damping(t: Tensors) -> Mapping[str, Any]:
     return sizes | {"floor": t["floor.nominal"], "least_share": float(t["floor.least_share"])}
 
 
+def _network(t: Tensors) -> Mapping[str, Any]:
+    scales = {name: float(t[f"scales.{name}"]) for name in ("epsilon", "energy")}
+    return scales | {"prismatic": t["features.prismatic"].tolist(), "inertia": t["scales.inertia"].tolist()}
+
+
+def _residual(t: Tensors) -> Mapping[str, Any]:
+    return {name: x for name, x in _network(t).items() if name != "epsilon"}
+
+
 _LAW = _same("dynamics", "friction")
+_WIDE = _same("widths")
 _KINDS: dict[str, _Kind] = {
     kind.make.__name__: kind
     for kind in (
@@ -225,6 +260,14 @@ _KINDS: dict[str, _Kind] = {
         _Kind(JointFriction, _same("viscous", "coulomb", "transition")),
         _Kind(PinocchioDynamics, {}, _same("robot")),
         _Kind(AnalyticDynamics, _same("masses", "lengths", gravity="gravity_constant"), _same("robot"), sequence=tuple),
+        _Kind(IdentifiedDynamics, _same("parameters", "rotor_inertia", "report"), _same("robot", "friction")),
+        _Kind(LagrangianDynamics, _same("report"), _same("network", "robot", "friction")),
+        _Kind(ResidualDynamics, _same("report"), _same("network", "friction")),
+        _Kind(ResidualNetwork, _same("share") | _WIDE, _same("nominal"), _residual, sequence=tuple),
+        *(
+            _Kind(network, _WIDE, arrays=_network, sequence=tuple)
+            for network in (CholeskyNetwork, HomogenisedPicnn, PaperPicnn, UnconstrainedLagrangian)
+        ),
         _Kind(Robot, _same("name", "source", "options", "sha256", "effort_limit")),
     )
 }

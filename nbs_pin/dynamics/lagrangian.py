@@ -49,6 +49,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
             if x.dtype != torch.float64:
                 raise ArgumentError(f"parameter '{name}' is {x.dtype}, expected float64; give network.double().")
         self.network = copy.deepcopy(network).requires_grad_(False)
+        self.register_load_state_dict_post_hook(_forget_machine_code)  # type: ignore[no-untyped-call]
         self._robot, self.friction, self.report = robot, friction_of_size(friction, network.nv), report
 
     @property
@@ -110,7 +111,13 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         vectors = as_vectors(self.nv, **arguments)
         if is_torch_array(vectors[0]):
             return function(*vectors)
+        device = next((x.device for x in self.network.parameters()), None)
         # The same array becomes the same tensor: the network knows shorter ways then.
-        tensors = {id(x): torch.from_numpy(np.array(x)) for x in vectors}
+        tensors = {id(x): torch.from_numpy(np.array(x)).to(device) for x in vectors}
         with torch.no_grad():
-            return function(*(tensors[id(x)] for x in vectors)).numpy()
+            return function(*(tensors[id(x)] for x in vectors)).numpy(force=True)
+
+
+def _forget_machine_code(module: nn.Module, keys: Any) -> None:
+    """Other weights, another machine code."""
+    vars(module).pop("_machine_code", None)

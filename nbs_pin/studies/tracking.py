@@ -126,7 +126,10 @@ def build_controller(
     Raises ArgumentError for an unknown name, numbers out of range or a file for another arm; errors of `load` else.
     """
     if name.endswith(".nbs"):
-        return load(name, robot)
+        stored = load(name, robot)
+        if not isinstance(stored, Controller):
+            raise ArgumentError(f"{name} holds a {type(stored).__name__}, a model; give a file of a controller.")
+        return stored
     if name not in get_args(ControllerName):
         raise ArgumentError(
             f"controller '{name}' is unknown; choose one of {', '.join(get_args(ControllerName))}, a .nbs "
