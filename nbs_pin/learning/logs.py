@@ -153,8 +153,8 @@ def _check_derivatives(path: Path, data: Dataset) -> None:
             said = stated[:, joint]
             ratio = float(change[:, joint] @ said / max(said @ said, np.finfo(float).tiny))
             raise FileFormatError(
-                f"{path}: {name} of joint {joint + 1} is not the derivative of {of}, which changes {ratio:.3g} times as "
-                f"much as {name} says; {_remedy(ratio, name, of)}."
+                f"{path}: {name} of joint {joint + 1} is not the derivative of {of}, which changes {ratio:.3g} times "
+                f"as much as {name} says; {_remedy(ratio, name, of)}."
             )
 
 

@@ -36,12 +36,12 @@ RECORD_STEP = 1e-3
 
 def collect(
     robot: Robot,
-    recipe: Recipe = "excited",
+    recipe: str = "excited",
     samples: int = 10_000,
     seed: int = 0,
     *,
     noise: Noise | None = None,
-    acceleration: Acceleration | None = None,
+    acceleration: str | None = None,
     friction: bool | JointFriction = False,
     sampling: float | None = None,
     duration: float = 3.0,
