@@ -65,4 +65,4 @@ def over_rows(function: Callable[..., np.ndarray], *arguments: np.ndarray) -> np
     rows = [x.reshape(-1, x.shape[-1]) for x in arguments]
     values = [function(*row) for row in zip(*rows, strict=True)]
     shape = values[0].shape if values else function(*(np.zeros(x.shape[-1]) for x in arguments)).shape
-    return np.array(values).reshape(*batch, *shape)
+    return np.array(values).reshape((*batch, *shape))
