@@ -60,10 +60,12 @@ def plot_model_errors(
         growth, last = parts[-1].subplots(2, 3)
         _draw_growth(growth, errors, joints)
         _draw_samples(last[0], errors)
-        _draw_energy(last[1], errors.motion)
+        if errors.motion is None:
+            _leave_out(last[1], "no free motion was run")
+        else:
+            _draw_energy(last[1], errors.motion)
         if errors.mismatch is None:
-            last[2].set_axis_off()
-            last[2].text(0.5, 0.5, missing, ha="center", va="center", color=NOTE, wrap=True)
+            _leave_out(last[2], missing)
         else:
             _draw_mismatch(last[2], errors.mismatch)
     return Path(path)
@@ -107,7 +109,7 @@ def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
         "least eigenvalue of M̂": number(errors.eigenvalue_margin),
         "M̂ is within ±… of M": number(max(1.0 - low, high - 1.0)),
         "best common factor": f"{errors.scale.factor:.5g}",
-        "energy drift": number(errors.energy_drift),
+        "energy drift": _drift(errors),
     }
     head.text(0.012, 0.86, title, fontsize=14, fontweight="bold", color=INK, va="center")
     fast = errors.box.speed
@@ -123,6 +125,12 @@ def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
         axes.axvspan(left, left + 0.94 * width, color=PALE, linewidth=0)
         axes.text(left + 0.05 * width, 0.76, name, color=NOTE, fontsize=7.5, va="center")
         axes.text(left + 0.05 * width, 0.33, value, color=INK, fontsize=12.5, fontweight="bold", va="center")
+
+
+def _drift(errors: ModelErrors) -> str:
+    """The energy drift, as a bound where the integrator drifts as much."""
+    resolved = errors.motion is None or errors.energy_drift > 2.0 * float(errors.motion.floor.max())
+    return f"{'' if resolved else '≤ '}{number(errors.energy_drift)}"
 
 
 def _draw_maps(part: SubFigure, heat: ErrorMap, names: Sequence[str]) -> None:
@@ -255,6 +263,11 @@ def _draw_mismatch(axes: Axes, mismatch: Mismatch) -> None:
     told = f"‖δ‖ ≤ {number(mismatch.a)} ‖q‖ + {number(mismatch.b)} ‖v‖ + {number(mismatch.c)}"
     note = f"{told}   ({mismatch.trajectories} starts)\n{sure}"
     axes.annotate(note, (0.02, 0.985), xycoords="axes fraction", va="top", fontsize=7.8, color=INK)
+
+
+def _leave_out(axes: Axes, why: str) -> None:
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, why, ha="center", va="center", color=NOTE, wrap=True)
 
 
 def number(value: float) -> str:

@@ -38,7 +38,7 @@ def free_motion(
     v: Float[np.ndarray, "starts n"],
     *,
     duration: float = 1.0,
-    step: float = 0.002,
+    step: float = 0.004,
 ) -> FreeMotion:
     """The motions from these starts for `duration` [s] by RK4 with this step [s], joint stops aside."""
     steps = round(duration / step)

@@ -76,11 +76,11 @@ def mismatch(
         raise ArgumentError(f"doubt is {doubt}, expected a chance in (0, 1); 1e-6 is usual.")
     a = accelerations(truth, run, friction)
     q, v = run.q[:-1], run.v[:-1]
-    delta = inverse_dynamics(truth, q, v, a) - inverse_dynamics(model, q, v, a)
+    rows = zip(q, v, a, strict=True)  # one instant at a time: networks need memory for every state they see at once
+    delta = np.array([inverse_dynamics(truth, *row) - inverse_dynamics(model, *row) for row in rows])
     if not np.isfinite(delta).all():
         raise ArgumentError("the model or the run is not finite along the run; give a run that did not diverge.")
-    rows = len(q)
-    norms = [np.linalg.norm(x, axis=-1).reshape(rows, -1) for x in (q, v, delta)]
+    norms = [np.linalg.norm(x, axis=-1).reshape(len(q), -1) for x in (q, v, delta)]
     # Weights that the starts have no part in: the scenario theorem asks for a goal that is fixed before they are drawn.
     weights = [max(float(np.linalg.norm(x, axis=-1).mean()), _LEAST_WEIGHT) for x in (run.q_ref, run.v_ref)]
     constants = _least_bound(norms[0].ravel(), norms[1].ravel(), norms[2].ravel(), weights)

@@ -21,7 +21,7 @@ SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Shares of the box's speed at which `ModelErrors.by_speed` looks."""
 DISTANCES = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 """Sizes of the box, on whose surface `ModelErrors.by_distance` looks."""
-_GROWTH_SAMPLES, _MOTIONS, _RUN_STATES = 500, 10, 5_000
+_GROWTH_SAMPLES, _RUN_STATES = 500, 5_000
 
 
 class Growth(NamedTuple):
@@ -67,7 +67,7 @@ class ModelErrors:
     mass_ratio: tuple[float, float]
     """(lo, hi) with lo·M ⪯ M̂ ⪯ hi·M at every sample; (1, 1) for the truth."""
     energy_drift: float
-    """How far the true energy strays along the model's own free motion, worst start and time (`free_motion.py`)."""
+    """How far the true energy strays along the model's free motion, worst start and time; NaN without motions."""
     scale: Scale
     """The best common factor of all torques."""
     by_speed: Growth
@@ -76,8 +76,8 @@ class ModelErrors:
     """Errors on the surface of the box, shrunk and grown about its middle by these factors."""
     each: Errors
     """The samples' own errors, (samples,) each, as shares of the RMS size."""
-    motion: FreeMotion
-    """Free motions of both from the same starts."""
+    motion: FreeMotion | None
+    """Free motions of both from the same starts, or None where none were asked for."""
     box: Box
     """Where the samples are."""
     samples: int
@@ -103,13 +103,14 @@ def compare(
     seed: int = 1,
     box: tuple[PerJoint, PerJoint] | None = None,
     run: Run | None = None,
+    motions: int = 10,
 ) -> ModelErrors:
     """How far the model is from the truth on `samples` uniform states of a box, beyond it, and along a run.
 
     speed: |v_i| up to this [rad/s], one number or one per joint. box: (lower, upper) [rad], each one number or one per
     joint, for instance where the data of the fit lie; None takes the position limits of the truth's arm, a whole turn
     where they allow it. run: a closed loop with the truth as its plant; several starts make the bound on δ say
-    something of further ones (`mismatch.py`).
+    something of further ones (`mismatch.py`). motions: free ones from random states of the box; 0 saves their time.
     Joints that slide are compared in their own units beside those that turn, as M has them.
     Raises ArgumentError for another number of joints, an empty box, or a model that is not finite at some sample.
     """
@@ -124,7 +125,7 @@ def compare(
     rms, deviation = np.sqrt(np.mean((judged.modelled - judged.true) ** 2, axis=0)), judged.true.std(axis=0)
     margin, ratio = _eigenvalues(model.mass_matrix(state[0]), truth.mass_matrix(state[0]))
     by_speed, by_distance = _growth(model, truth, chosen, rng)
-    motion = free_motion(model, truth, *chosen.states(rng, _MOTIONS)[:2])
+    motion = free_motion(model, truth, *chosen.states(rng, motions)[:2]) if motions else None
     return ModelErrors(
         **judged.errors._asdict(),
         torque_nmse=float(np.mean(share(rms, deviation) ** 2)),
@@ -132,7 +133,7 @@ def compare(
         torque_deviation=deviation,
         eigenvalue_margin=margin,
         mass_ratio=ratio,
-        energy_drift=motion.worst,
+        energy_drift=np.nan if motion is None else motion.worst,
         scale=_scale(judged.true, judged.modelled),
         by_speed=by_speed,
         by_distance=by_distance,

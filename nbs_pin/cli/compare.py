@@ -88,7 +88,7 @@ class Compare:
         folder = folder_for(self.out, "compare", robot.name)
         facts = {"settings": self._settings(robot.source), "versions": versions(), "robot_sha256": robot.sha256}
         check_folder(folder, comparison.FILES, facts, self.force, whose="another comparison")
-        with made(folder), notes.status("comparing"):
+        with made(folder):
             result = comparison.compare_models(
                 model,
                 robot,
@@ -99,9 +99,11 @@ class Compare:
                 run=run,
                 trajectories=self.trajectories,
                 frequency=self.frequency,
+                progress=True,
             )
-            title = f"{type(model).__name__} ({Path(self.model).name}) against Pinocchio's {robot.name}"
-            figures = comparison.write_results(result, robot, folder, facts, title)
+            title = f"{Path(self.model).name} against {robot.name}"
+            with notes.status(f"drawing the page into {folder}"):
+                figures = comparison.write_results(result, robot, folder, facts, title)
         _print(console, title, figures)
         for name in comparison.FILES:
             console.print(str(folder / name), soft_wrap=True, highlight=False, markup=False)

@@ -19,6 +19,7 @@ from nbs_pin.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.files import write_whole
 from nbs_pin.model_error import ModelErrors, compare
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
+from nbs_pin.progress import waiting
 from nbs_pin.references import Sinusoid
 from nbs_pin.robot import Robot, load_robot
 from nbs_pin.simulation import simulate
@@ -90,11 +91,12 @@ def compare_models(
             )
         except SimulationDiverged as error:  # of a model so wrong that its law is unstable: that is a result
             missing = f"the closed loop diverged\n{str(error)[:60]} …"
-    errors = compare(model, truth, samples, speed, seed, box, run)
-    if robot.nv < 2:
-        return Comparison(errors, None, missing)
-    pair = telling_joints(model, truth, errors.box) if joints is None else joints
-    return Comparison(errors, error_map(model, truth, errors.box, pair), missing)
+    with waiting("comparing", progress):
+        errors = compare(model, truth, samples, speed, seed, box, run)
+        if robot.nv < 2:
+            return Comparison(errors, None, missing)
+        pair = telling_joints(model, truth, errors.box) if joints is None else joints
+        return Comparison(errors, error_map(model, truth, errors.box, pair), missing)
 
 
 def closed_loop(
@@ -145,8 +147,8 @@ def figures(result: Comparison, robot: Robot) -> dict[str, Any]:
         "eigenvalue_margin_kgm2": e.eigenvalue_margin,
         "mass_ratio": e.mass_ratio,
         "energy_drift": e.energy_drift,
-        "energy_drift_own": float(np.max(e.motion.own)),
-        "energy_drift_floor": float(np.max(e.motion.floor)),
+        "energy_drift_own": None if e.motion is None else float(np.max(e.motion.own)),
+        "energy_drift_floor": None if e.motion is None else float(np.max(e.motion.floor)),
         "scale_factor": e.scale.factor,
         "scale_error": e.scale.error,
         "by_speed": [{"at": at, **x._asdict()} for at, x in zip(*e.by_speed, strict=True)],
