@@ -15,7 +15,7 @@ from nbs_pin.studies import collecting
 from nbs_pin.versions import versions
 from tests.test_plotting import png_size
 
-QUICK = ("--samples", "80", "--duration", "0.4")
+QUICK = ("--samples", "80", "--sampling", "0.01", "--duration", "0.4")
 
 
 def run(folder, *options, robot="two_link"):
@@ -37,7 +37,7 @@ def summary(folder):
 def test_the_files_are_the_data_and_what_they_cover(folder):
     assert sorted(path.name for path in folder.iterdir()) == sorted(collecting.FILES)
     data, said = load_dataset(folder / "data.npz"), summary(folder)
-    expected = collect(nbs.load_robot("two_link"), samples=80, duration=0.4)
+    expected = collect(nbs.load_robot("two_link"), samples=80, sampling=0.01, duration=0.4)
     assert_array_equal(data.tau, expected.tau)
     assert data.about == expected.about
     assert said["versions"] == versions()

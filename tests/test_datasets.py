@@ -158,7 +158,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
 @pytest.mark.parametrize("name", ["three_link", "panda", GANTRY])
 def test_the_data_obey_the_arms_equation(name, recipe):
     robot = nbs.load_robot(name)
-    data = collect(robot, recipe, 60, seed=3, duration=0.6)
+    data = collect(robot, recipe, 60, seed=3, duration=0.3, sampling=0.01 if recipe != "passive" else None)
     assert len(data) == 60
     scale = 1.0 + np.abs(data.tau).max()
     assert torque_error(robot, data).max() < 1e-11 * scale * (1.0 + np.abs(data.a).max())
@@ -172,10 +172,22 @@ def test_the_data_obey_the_arms_equation(name, recipe):
 
 def test_the_same_seed_gives_the_same_data():
     robot = nbs.load_robot("two_link")
-    first, again, other = (collect(robot, samples=40, seed=seed, noise=Noise(torque=0.1)) for seed in (5, 5, 6))
+    first, again, other = (
+        collect(robot, samples=40, seed=seed, sampling=0.01, noise=Noise(torque=0.1)) for seed in (5, 5, 6)
+    )
     for name in ARRAYS:
         assert_array_equal(getattr(first, name), getattr(again, name))
     assert (first.q != other.q).all()
+
+
+def test_few_samples_still_come_from_many_trajectories():
+    robot = nbs.load_robot("two_link")
+    data = collect(robot, samples=200, duration=0.4)
+    assert data.trajectories == 20
+    assert_allclose(np.diff(data.t[data.trajectory == 3]), 0.04, rtol=1e-9)
+    assert data.about["sampling"] == pytest.approx(0.04)
+    assert collect(robot, samples=50, sampling=0.01, duration=0.4).trajectories == 2
+    assert {np.count_nonzero(data.trajectory == k) for k in range(20)} == {10}
 
 
 def test_excited_motions_stay_inside_the_arm_and_reach_through_it():
@@ -232,7 +244,7 @@ def test_an_arm_without_limits_is_given_some():
     robot = nbs.load_robot("double_pendulum")
     assert np.isinf(robot.effort_limit).all()
     limit = torque_limits(robot)
-    data = collect(robot, samples=100)
+    data = collect(robot, samples=100, sampling=0.01)
     assert (np.isfinite(limit) & (limit > 0.0)).all()
     assert (np.abs(data.tau) <= limit).all()
     assert_array_equal(torque_limits(nbs.load_robot("ur5")), nbs.load_robot("ur5").effort_limit)
@@ -241,7 +253,7 @@ def test_an_arm_without_limits_is_given_some():
 def test_friction_stays_in_the_torque():
     robot = nbs.load_robot("ur5")
     friction = JointFriction(np.full(6, 0.8), np.full(6, 0.4), transition=1e-6)
-    data = collect(robot, samples=300, friction=friction)
+    data = collect(robot, samples=300, sampling=0.01, friction=friction)
     sliding = np.abs(data.v) > 0.05
     assert torque_error(robot, data, friction)[sliding].max() < 2e-3
     assert np.median(torque_error(robot, data)[sliding]) > 0.4
@@ -284,7 +296,7 @@ def test_derivatives_are_exact_for_polynomials(degree, seed):
 
 def test_differentiated_data_are_those_of_the_simulator():
     robot = nbs.load_robot("three_link")
-    data = collect(robot, samples=200, acceleration="differentiated")
+    data = collect(robot, samples=200, sampling=0.01, acceleration="differentiated")
     assert np.sqrt((torque_error(robot, data) ** 2).mean()) < 1e-3 * data.tau.std()
     assert len(data) == 200
     assert data.about["acceleration"] == "differentiated"
@@ -292,14 +304,14 @@ def test_differentiated_data_are_those_of_the_simulator():
 
 def test_noise_is_what_it_is_said_to_be():
     robot = nbs.load_robot("ur5")
-    clean = collect(robot, samples=400)
-    noisy = collect(robot, samples=400, noise=Noise(torque=0.5))
+    clean = collect(robot, samples=300, sampling=0.01)
+    noisy = collect(robot, samples=300, sampling=0.01, noise=Noise(torque=0.5))
     assert_array_equal(noisy.q, clean.q)
     assert_allclose((noisy.tau - clean.tau).std(axis=0), 0.5, rtol=0.15)
     step = 2.0 * np.pi * 2.0**-16
-    rounded = collect(robot, samples=400, noise=Noise(encoder=2.0**-16))
+    rounded = collect(robot, samples=300, sampling=0.01, noise=Noise(encoder=2.0**-16))
     assert_allclose(rounded.q / step, np.round(rounded.q / step), atol=1e-6)
-    exact = collect(robot, samples=400, acceleration="differentiated")
+    exact = collect(robot, samples=300, sampling=0.01, acceleration="differentiated")
     assert rounded.about["acceleration"] == "differentiated"
     true = nbs.forward_dynamics(nbs.PinocchioDynamics(robot), rounded.q, rounded.v, rounded.tau)
     error = (rounded.a - true).std()
@@ -335,7 +347,8 @@ def test_excitation_is_inside_the_ranges_and_its_derivatives_are_right():
         ({"samples": 0}, "samples is 0"),
         ({"speed": -1.0}, "speed"),
         ({"sampling": 0.0015}, "whole number"),
-        ({"duration": 0.0051}, "whole number"),
+        ({"duration": 0.005}, "make it longer"),
+        ({"duration": -1.0}, "duration"),
         ({"acceleration": "guessed"}, "acceleration 'guessed' is unknown"),
         ({"acceleration": "simulator", "noise": Noise(encoder=1e-4)}, "rounded encoders"),
         ({"recipe": "uniform", "noise": Noise(encoder=1e-4)}, "nothing to differentiate"),

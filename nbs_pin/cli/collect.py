@@ -32,11 +32,11 @@ class Collect:
     samples: Annotated[int, integer("--samples", least=1, most=10_000_000)] = 10_000
     """How many samples."""
     sampling: Annotated[
-        float | None, number("--sampling", least=0.001, most=10.0, unit="s"), default("0.01, passive 0.001")
+        float | None, number("--sampling", least=0.001, most=10.0, unit="s"), default("0.01 to 0.05, passive 0.001")
     ] = None
     """Time between samples, a whole number of milliseconds [s]."""
     duration: Annotated[float, number("--duration", above=0.0, most=1000.0, unit="s")] = 3.0
-    """Length of a trajectory, a whole number of samplings [s]; passive and uniform have none."""
+    """Length of a trajectory [s]; passive and uniform have none."""
     speed: Annotated[float, number("--speed", above=0.0, most=100.0, unit="rad/s")] = 2.0
     """About how fast the joints move; peaks stay near their velocity limits [rad/s]."""
     friction: bool = False

@@ -32,6 +32,8 @@ Acceleration: TypeAlias = Literal["simulator", "differentiated"]
 """Where v̇ comes from."""
 RECORD_STEP = 1e-3
 """Control period, plant step and distance of the samples that derivatives are taken from [s]."""
+_TIMED = ("excited", "reference")
+_TRAJECTORIES = 20
 
 
 def collect(
@@ -65,7 +67,8 @@ def collect(
     instant, so τ is then their mean.
     friction: True lets the friction of the URDF act, a `JointFriction` another (its transition is not used: MuJoCo's
     joints stick). τ stays what the motors applied.
-    sampling: time between samples [s], a whole number of ms; None is 0.01, and 0.001 for "passive".
+    sampling: time between samples [s], a whole number of ms; None is 0.001 for "passive" and otherwise from 0.01 to
+    0.05, so that few samples still come from 20 trajectories: neighbours in time say the same.
     speed: about how fast an excited joint moves [rad/s]; peaks stay near the velocity limit.
     progress: show a progress bar when it takes longer than 2 s at a terminal.
     Torque limits are the arm's; a joint without one is given what its heaviest posture needs, and 20 rad/s² on top.
@@ -75,10 +78,9 @@ def collect(
     noise = noise or Noise()
     _check(recipe, samples, speed, noise, acceleration)
     acting = JointFriction.of(robot) if friction is True else friction or None
-    usual = 1.0 if recipe == "passive" else 10.0
-    interval = usual * RECORD_STEP if sampling is None else sampling
+    interval = _interval(recipe, samples, sampling, duration)
     stride = whole(interval, RECORD_STEP, "sampling", "step of the record")
-    counts = [samples] if recipe == "passive" else _shares(samples, whole(duration, interval, "duration", "sampling"))
+    counts = [samples] if recipe == "passive" else _shares(samples, int(duration / interval + 1e-9))
     generator, differentiated = np.random.default_rng(seed), acceleration == "differentiated" or noise.encoder > 0.0
     bench = _bench(recipe, robot, acting, speed)
     if recipe == "uniform":
@@ -206,9 +208,20 @@ def _states(bench: _Bench, samples: int, speed: float, generator: np.random.Gene
     return np.zeros(samples), q, v, bench.plant.acceleration(q, v, tau), tau
 
 
+def _interval(recipe: str, samples: int, sampling: float | None, duration: float) -> float:
+    """Time between samples [s]: the one asked for, or the usual one."""
+    positive("duration", duration, "s")
+    if sampling is None:
+        spread = round(_TRAJECTORIES * duration / samples / RECORD_STEP)
+        sampling = RECORD_STEP * (1 if recipe == "passive" else min(max(spread, 10), 50))
+    if duration < sampling and recipe in _TIMED:
+        raise ArgumentError(f"a trajectory of {duration} s has no two samples {sampling:g} s apart; make it longer.")
+    return sampling
+
+
 def _shares(samples: int, longest: int) -> list[int]:
     """How many samples each trajectory gives: nearly equal shares of at most `longest`, two or more if possible."""
-    count = min(max(math.ceil(samples / longest), 2), samples)
+    count = min(max(math.ceil(samples / max(longest, 1)), 2), samples)
     return np.diff(np.linspace(0, samples, count + 1).astype(int)).tolist()
 
 
