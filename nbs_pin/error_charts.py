@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
@@ -26,8 +26,8 @@ LOOKS = {
     "forward": ("acceleration", "#7a4fa3"),
 }
 """Label and colour of every entry of `Errors`, the same in all panels."""
-LEAST = 1e-17
-"""Relative errors below this are drawn as this."""
+LEAST, MOST = 1e-17, 1e12
+"""Errors outside this range are drawn at its ends."""
 _HEAT = LinearSegmentedColormap.from_list(
     "error", ["#eaf2fb", "#a9c9ea", "#f6d365", "#ff8c1a", "#b3261e", "#43090b"], N=256
 )
@@ -86,13 +86,13 @@ def plot_sample_sizes(
         for axes, (title, models) in zip(grid, panels.items(), strict=True):
             for name, curve in models.items():
                 sizes = sorted(curve)
-                values = [np.maximum(np.asarray(curve[size], dtype=float), LEAST) for size in sizes]
+                values = [_seen(curve[size]) for size in sizes]
                 axes.plot(sizes, [np.median(x) for x in values], "o-", color=colours[name], markersize=3.5, label=name)
                 low, high = [x.min() for x in values], [x.max() for x in values]
                 axes.fill_between(sizes, low, high, color=colours[name], alpha=0.12, linewidth=0)
             axes.set_xscale("log")
             _log_errors(axes)
-            _plain_ticks(axes, sorted({size for curve in models.values() for size in curve}))
+            _plain_ticks(axes, sorted({float(size) for curve in models.values() for size in curve}))
             axes.set(xlabel="samples")
             axes.set_title(title, loc="left", color=INK)
         grid[0].set_ylabel(ylabel)
@@ -136,7 +136,7 @@ def _drift(errors: ModelErrors) -> str:
 def _draw_maps(part: SubFigure, heat: ErrorMap, names: Sequence[str]) -> None:
     """Errors of M, C v and G over two joints, one colour scale for the three; the best fiftieth share its end."""
     kinds = ("mass_matrix", "coriolis", "gravity")
-    shown = [np.maximum(getattr(heat.errors, kind), LEAST) for kind in kinds]
+    shown = [_seen(getattr(heat.errors, kind)) for kind in kinds]
     seen = np.concatenate([x[np.isfinite(x)] for x in shown])
     low, high = (np.percentile(seen, 2.0), seen.max()) if seen.size else (LEAST, 1.0)
     scale = LogNorm(min(low, high / 3.0), high)
@@ -176,7 +176,7 @@ def _draw_growth(panels: np.ndarray, errors: ModelErrors, names: Sequence[str]) 
 def _draw_curves(axes: Axes, growth: Growth, shown: Sequence[str]) -> None:
     for name in shown:
         label, colour = LOOKS[name]
-        values = [max(getattr(e, name), LEAST) for e in growth.errors]
+        values = _seen([getattr(e, name) for e in growth.errors])
         axes.plot(growth.at, values, "o-", color=colour, markersize=3.5, label=label, clip_on=False)
     _log_errors(axes)
     axes.legend(frameon=False, ncols=len(shown))
@@ -186,7 +186,7 @@ def _draw_joints(axes: Axes, errors: ModelErrors, names: Sequence[str]) -> None:
     """Torque error of every joint beside the deviation of its torque."""
     rows = np.arange(len(names))
     with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.maximum(np.nan_to_num(errors.torque_rms / errors.torque_deviation, posinf=np.nan), LEAST)
+        shares = _seen(errors.torque_rms / errors.torque_deviation)
     low, high = _limits(np.nanmin(shares), np.nanmax(shares))
     axes.hlines(rows, low, shares, color=LOOKS["inverse"][1], alpha=0.35, linewidth=3.0)
     axes.plot(shares, rows, "o", color=LOOKS["inverse"][1], markersize=5.5, clip_on=False)
@@ -207,10 +207,9 @@ def _draw_samples(axes: Axes, errors: ModelErrors) -> None:
     """Share of the samples whose error is smaller, per quantity, with a dot at the RMS, the relative error."""
     ranks = np.arange(1, errors.samples + 1) / errors.samples
     for name, (label, colour) in LOOKS.items():
-        values = np.maximum(np.sort(np.asarray(getattr(errors.each, name))), LEAST)
+        values, rms = np.sort(_seen(getattr(errors.each, name))), float(_seen(getattr(errors, name)))
         if np.isfinite(values).all():
             axes.plot(values, ranks, color=colour, label=label)
-            rms = max(getattr(errors, name), LEAST)
             axes.plot(rms, np.interp(rms, values, ranks), "o", color=colour, markersize=5)
     axes.set_xscale("log")
     _log_ticks(axes.xaxis, *axes.get_xlim())
@@ -227,7 +226,7 @@ def _draw_energy(axes: Axes, motion: FreeMotion) -> None:
         (motion.own, ACTUAL, "model's energy, model's motion"),
         (motion.floor, LIMIT, "true energy, true motion"),
     ):
-        seen = np.maximum(np.where(np.isfinite(values), values, np.nan), LEAST)[1:]
+        seen = _seen(values)[1:]
         gone = np.isnan(seen).any(axis=1)
         median, worst = (np.where(gone, np.nan, statistic(seen, axis=1)) for statistic in (np.median, np.max))
         axes.plot(motion.t[1:], median, color=colour, linewidth=1.6, label=label)
@@ -244,9 +243,9 @@ def _draw_energy(axes: Axes, motion: FreeMotion) -> None:
 def _draw_mismatch(axes: Axes, mismatch: Mismatch) -> None:
     """‖δ‖ over time, median and worst trajectory, under the bound of the same states."""
     bound = mismatch.bound(mismatch.q_norm, mismatch.v_norm)
-    size = np.maximum(mismatch.size, LEAST)
+    size = _seen(mismatch.size)
     median, worst = np.median(size, axis=1), size.max(axis=1)
-    axes.plot(mismatch.t, np.maximum(bound.max(axis=1), LEAST), color=INK, linewidth=1.6, label="bound, largest")
+    axes.plot(mismatch.t, _seen(bound.max(axis=1)), color=INK, linewidth=1.6, label="bound, largest")
     axes.plot(mismatch.t, worst, color=ERROR, linewidth=1.0, linestyle=_DASHED, label="‖δ‖, worst start")
     axes.plot(mismatch.t, median, color=ERROR, linewidth=1.6, label="‖δ‖, median")
     axes.fill_between(mismatch.t, median, worst, color=ERROR, alpha=0.12, linewidth=0)
@@ -263,6 +262,12 @@ def _draw_mismatch(axes: Axes, mismatch: Mismatch) -> None:
     told = f"‖δ‖ ≤ {number(mismatch.a)} ‖q‖ + {number(mismatch.b)} ‖v‖ + {number(mismatch.c)}"
     note = f"{told}   ({mismatch.trajectories} starts)\n{sure}"
     axes.annotate(note, (0.02, 0.985), xycoords="axes fraction", va="top", fontsize=7.8, color=INK)
+
+
+def _seen(values: Any) -> np.ndarray:
+    """The values within what is drawn, NaN for those that are not finite."""
+    values = np.asarray(values, dtype=float)
+    return np.asarray(np.clip(np.where(np.isfinite(values), values, np.nan), LEAST, MOST))
 
 
 def _leave_out(axes: Axes, why: str) -> None:
@@ -305,6 +310,6 @@ def _log_ticks(ruler: Axis, low: float, high: float) -> None:
     ruler.set_minor_locator(NullLocator())
 
 
-def _plain_ticks(axes: Axes, at: Sequence[float] | Float[np.ndarray, " ticks"]) -> None:
+def _plain_ticks(axes: Axes, at: Sequence[float]) -> None:
     axes.set_xticks(list(at), [f"{value:g}" for value in at])
     axes.xaxis.set_minor_locator(NullLocator())

@@ -3,6 +3,7 @@
 Any two dynamics providers can be compared; what a relative error is stands in `relative_errors.py`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.free_motion import FreeMotion, free_motion
 from nbs_pin.mismatch import Mismatch, accelerations, mismatch
-from nbs_pin.relative_errors import Box, Errors, judge, share
+from nbs_pin.relative_errors import Box, Errors, check_joints, judge, share
 from nbs_pin.state import Run
 
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
@@ -101,7 +102,7 @@ def compare(
     samples: int = 2_000,
     speed: PerJoint = 2.0,
     seed: int = 1,
-    box: tuple[PerJoint, PerJoint] | None = None,
+    box: Sequence[PerJoint] | None = None,
     run: Run | None = None,
     motions: int = 10,
 ) -> ModelErrors:
@@ -114,8 +115,7 @@ def compare(
     Joints that slide are compared in their own units beside those that turn, as M has them.
     Raises ArgumentError for another number of joints, an empty box, or a model that is not finite at some sample.
     """
-    if model.nv != truth.nv:
-        raise ArgumentError(f"the model has {model.nv} joints and the truth {truth.nv}; compare two of one arm.")
+    check_joints(model, truth)
     if samples < 2 or samples != int(samples):
         raise ArgumentError(f"samples is {samples}, expected a whole number of at least 2; 2000 is usual.")
     chosen = box_of(model, truth, box, speed)
@@ -147,15 +147,13 @@ def compare(
     )
 
 
-def box_of(
-    model: DynamicsProvider, truth: DynamicsProvider, box: tuple[PerJoint, PerJoint] | None, speed: PerJoint
-) -> Box:
+def box_of(model: DynamicsProvider, truth: DynamicsProvider, box: Sequence[PerJoint] | None, speed: PerJoint) -> Box:
     """The box that `compare` looks in for these arguments."""
     if box is None:
         return Box.of_robot(truth.robot or model.robot, truth.nv, speed)
     if len(box) != 2:
         raise ArgumentError(f"the box has {len(box)} parts, expected two: (lower, upper).")
-    return Box.of(*box, speed, truth.nv)
+    return Box.of(box[0], box[1], speed, truth.nv)
 
 
 def _eigenvalues(modelled: np.ndarray, true: np.ndarray) -> tuple[float, tuple[float, float]]:

@@ -112,8 +112,7 @@ def judge(
 
     Raises ArgumentError for another number of joints, or a model that is not finite at some state.
     """
-    if model.nv != truth.nv:
-        raise ArgumentError(f"the model has {model.nv} joints and the truth {truth.nv}; compare two of one arm.")
+    check_joints(model, truth)
     true, modelled = (
         [d.mass_matrix(q), matvec(d.coriolis_matrix(q, v), v), d.gravity(q), inverse_dynamics(d, q, v, a)]
         for d in (truth, model)
@@ -126,6 +125,12 @@ def judge(
                 "numbers; fit it again, or take a smaller box."
             )
     return Judged(Errors(*map(_shares, modelled, true)), true[3], modelled[3])
+
+
+def check_joints(model: DynamicsProvider, truth: DynamicsProvider) -> None:
+    """Raises ArgumentError unless both have the same number of joints."""
+    if model.nv != truth.nv:
+        raise ArgumentError(f"the model has {model.nv} joints and the truth {truth.nv}; compare two of one arm.")
 
 
 def share(error: Any, size: Any) -> Any:

@@ -1,7 +1,7 @@
 """A model of an arm held against another: the study behind `nbs-pin compare`."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from nbs_pin.model_error import ModelErrors, compare
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.progress import waiting
 from nbs_pin.references import Sinusoid
+from nbs_pin.relative_errors import check_joints
 from nbs_pin.robot import Robot, load_robot
 from nbs_pin.simulation import simulate
 from nbs_pin.state import Run
@@ -64,7 +65,7 @@ def compare_models(
     samples: int = 2_000,
     speed: PerJoint = 2.0,
     seed: int = 1,
-    box: tuple[PerJoint, PerJoint] | None = None,
+    box: Sequence[PerJoint] | None = None,
     joints: tuple[int, int] | None = None,
     run: Run | None = None,
     trajectories: int = TRAJECTORIES,
@@ -78,6 +79,7 @@ def compare_models(
     Raises ArgumentError for arguments that do not fit, and a run of another arm.
     """
     truth = PinocchioDynamics(robot)
+    check_joints(model, truth)
     missing = "no closed loop was run"
     if run is not None:
         if run.robot_sha256 != robot.sha256:
