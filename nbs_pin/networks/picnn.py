@@ -52,7 +52,7 @@ class PICNN(nn.Module):
     @property
     def widths(self) -> tuple[int, ...]:
         """Sizes of the hidden layers."""
-        return tuple(len(self.get_parameter(f"b{i}")) for i in range(self.depth - 1))
+        return tuple(len(getattr(self, f"b{i}")) for i in range(self.depth - 1))
 
     def forward(self, context: Float[Tensor, "*batch m"], x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """f(x̃, x)."""
@@ -94,12 +94,12 @@ class PICNN(nn.Module):
         return softplus(gate) if self.smooth else torch.relu(gate)
 
     def _weights(self, i: int) -> Tensor:
-        free = self.get_parameter(f"wy{i}")
+        free = getattr(self, f"wy{i}")
         return free.abs() if self.smooth else torch.relu(free)
 
     def _linear(self, name: str, i: int, x: Tensor, bias: str | None = "b") -> Tensor:
-        shift = None if bias is None else self.get_parameter(f"{bias}{i}")
-        return nn.functional.linear(x, self.get_parameter(f"{name}{i}"), shift)
+        shift = None if bias is None else getattr(self, f"{bias}{i}")
+        return nn.functional.linear(x, getattr(self, f"{name}{i}"), shift)
 
     @staticmethod
     def _smooth_start(name: str, start: Tensor) -> Tensor:

@@ -42,11 +42,11 @@ class SoftplusNetwork(nn.Module):
     @property
     def widths(self) -> tuple[int, ...]:
         """Sizes of the hidden layers."""
-        return tuple(len(self.get_parameter(f"b{i}")) for i in range(self.depth - 1))
+        return tuple(len(getattr(self, f"b{i}")) for i in range(self.depth - 1))
 
     def forward(self, x: Float[torch.Tensor, "*batch m"]) -> Float[torch.Tensor, "*batch"]:
         """The value at x."""
         for i in range(self.depth):
-            x = nn.functional.linear(x, self.get_parameter(f"w{i}"), self.get_parameter(f"b{i}"))
+            x = nn.functional.linear(x, getattr(self, f"w{i}"), getattr(self, f"b{i}"))
             x = softplus(x) if i < self.depth - 1 else x
         return x[..., 0]
