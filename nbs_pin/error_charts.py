@@ -1,6 +1,7 @@
 """Pictures of model errors, in the style of `plotting`: a page for one model, and errors against amount of data."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,13 @@ from nbs_pin.mismatch import Mismatch
 from nbs_pin.model_error import Growth, ModelErrors
 from nbs_pin.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
 
-INK, NOTE, PALE = "#1d2733", "#5d6b7a", "#eef3f9"
+INK, NOTE, PALE, VIOLET = "#1d2733", "#5d6b7a", "#eef3f9", "#7a4fa3"
 LOOKS = {
     "mass_matrix": ("M", ACTUAL),
     "coriolis": ("C v", REFERENCE),
     "gravity": ("G", TORQUE),
     "inverse": ("torque", ERROR),
-    "forward": ("acceleration", "#7a4fa3"),
+    "forward": ("acceleration", VIOLET),
 }
 """Label and colour of every entry of `Errors`, the same in all panels."""
 LEAST, MOST = 1e-17, 1e12
@@ -50,7 +51,7 @@ def plot_model_errors(
     samples, energy in free motion, and ‖δ‖ along the closed loop beside its bound. missing: why there is no closed
     loop, where there is none. joints: their names with units.
     """
-    rows = 2 if heat is None else 3
+    joints, rows = [joint.replace("$", r"\$") for joint in joints], 2 if heat is None else 3
     with picture(path, 13.5, 1.4 + 3.3 * rows) as figure:
         heights = (1.4, *([3.3] if heat is not None else []), 6.6)
         parts = np.ravel(np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights)))
@@ -76,29 +77,34 @@ def plot_sample_sizes(
 ) -> Path:
     """Draws errors against number of samples, both axes logarithmic, and writes the picture (PNG); returns its path.
 
-    panels: title -> model -> number of samples -> an error per seed; a line through the medians, a band from least to
-    greatest, a colour per model in all panels.
+    panels: title -> model -> number of samples -> an error per seed. A line through the medians of the finite ones, a
+    band from least to greatest, a colour per model in all panels.
     """
     names = list(dict.fromkeys(name for models in panels.values() for name in models))
-    colours = dict(zip(names, (ACTUAL, REFERENCE, TORQUE, ERROR, "#7a4fa3", LIMIT, SATURATED), strict=False))
+    colours = dict(zip(names, cycle((ACTUAL, REFERENCE, TORQUE, ERROR, VIOLET, LIMIT, SATURATED)), strict=False))
+    seen = np.concatenate([_seen(x) for models in panels.values() for curve in models.values() for x in curve.values()])
     with picture(path, 1.0 + 4.3 * len(panels), 4.2) as figure:
         grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
         for axes, (title, models) in zip(grid, panels.items(), strict=True):
             for name, curve in models.items():
-                sizes = sorted(curve)
-                values = [_seen(curve[size]) for size in sizes]
-                axes.plot(sizes, [np.median(x) for x in values], "o-", color=colours[name], markersize=3.5, label=name)
-                low, high = [x.min() for x in values], [x.max() for x in values]
-                axes.fill_between(sizes, low, high, color=colours[name], alpha=0.12, linewidth=0)
+                _draw_seeds(axes, curve, colours[name], name)
             axes.set_xscale("log")
-            _log_errors(axes)
             _plain_ticks(axes, sorted({float(size) for curve in models.values() for size in curve}))
-            axes.set(xlabel="samples")
+            axes.set(xlabel="samples", yscale="log", ylim=_limits(float(np.nanmin(seen)), float(np.nanmax(seen))))
             axes.set_title(title, loc="left", color=INK)
+            _log_ticks(axes.yaxis, *axes.get_ylim())
         grid[0].set_ylabel(ylabel)
         handles, labels = grid[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), frameon=False)
     return Path(path)
+
+
+def _draw_seeds(axes: Axes, curve: Mapping[int, Sequence[float]], colour: str, name: str) -> None:
+    sizes = sorted(curve)
+    values = [_seen(curve[size]) for size in sizes]
+    low, middle, high = ([float(of(x)) for x in values] for of in (np.nanmin, np.nanmedian, np.nanmax))
+    axes.plot(sizes, middle, "o-", color=colour, markersize=3.5, label=name)
+    axes.fill_between(sizes, low, high, color=colour, alpha=0.12, linewidth=0)
 
 
 def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
@@ -111,7 +117,7 @@ def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
         "best common factor": f"{errors.scale.factor:.5g}",
         "energy drift": _drift(errors),
     }
-    head.text(0.012, 0.86, title, fontsize=14, fontweight="bold", color=INK, va="center")
+    head.text(0.012, 0.86, title.replace("$", r"\$"), fontsize=14, fontweight="bold", color=INK, va="center")
     fast = errors.box.speed
     speed = f"{fast[0]:.3g}" if np.ptp(fast) == 0.0 else f"{fast.min():.3g} to {fast.max():.3g}"
     where = f"{errors.samples} uniform states, |v| ≤ {speed} rad/s, seed {errors.seed}"

@@ -1,6 +1,8 @@
 """`nbs-pin compare`: what it writes and prints, what it refuses, and what it says of models that are no good."""
 
+import contextlib
 import csv
+import io
 import json
 
 import numpy as np
@@ -9,8 +11,10 @@ import pytest
 import nbs_pin as nbs
 from nbs_pin import cli
 from nbs_pin.catalogue import find
+from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.learning.datasets import Dataset
 from nbs_pin.model_error import compare
+from nbs_pin.networks.families import make_network
 from nbs_pin.studies import comparison
 from nbs_pin.versions import versions
 
@@ -27,11 +31,17 @@ def wrong(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def folder(wrong, tmp_path_factory):
-    """Where it was compared."""
-    folder = tmp_path_factory.mktemp("compared") / "three_link"
-    assert run(folder, wrong, "--against", "three_link") == 0
-    return folder
+def compared(wrong, tmp_path_factory):
+    """Where it was compared, and what was printed."""
+    folder, printed = tmp_path_factory.mktemp("compared") / "three_link", io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert run(folder, wrong, "--against", "three_link") == 0
+    return folder, printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def folder(compared):
+    return compared[0]
 
 
 def run(folder, model, *options):
@@ -61,15 +71,15 @@ def test_the_summary_is_what_compare_finds(folder, wrong):
     assert [entry["at"] for entry in figures["by_speed"]] == list(found.by_speed.at)
 
 
-def test_the_table_and_the_csv_are_the_summary(wrong, tmp_path, capsys):
-    assert run(tmp_path / "a", wrong, "--against", "three_link") == 0
-    printed, figures = capsys.readouterr().out, summary(tmp_path / "a")["figures"]
+def test_the_table_and_the_csv_are_the_summary(compared):
+    folder, printed = compared
+    figures = summary(folder)["figures"]
     for name in ("mass_matrix", "coriolis", "gravity", "inverse", "forward"):
         assert f"{figures['relative_error'][name]:.3g}" in printed
         assert f"{figures['along_run'][name]:.3g}" in printed
     assert f"{figures['mismatch']['c_Nm']:.3g} N·m on 4 starts" in printed
-    assert printed.splitlines()[-3:] == [str(tmp_path / "a" / name) for name in comparison.FILES]
-    rows = list(csv.DictReader((tmp_path / "a" / "errors.csv").read_text(encoding="utf-8").splitlines()))
+    assert printed.splitlines()[-3:] == [str(folder / name) for name in comparison.FILES]
+    rows = list(csv.DictReader((folder / "errors.csv").read_text(encoding="utf-8").splitlines()))
     cells = {(row["figure"], row["where"]): row["value"] for row in rows}
     assert len(cells) == len(rows)
     assert float(cells["coriolis_error", "box"]) == figures["relative_error"]["coriolis"]
@@ -88,6 +98,17 @@ def test_the_model_of_a_saved_controller_is_held_against_its_arm(tmp_path, capsy
     assert figures["relative_error"] == expected.errors._asdict()
     assert figures["mismatch"] is None
     assert "no closed loop was run" in capsys.readouterr().out
+
+
+def test_a_learned_model_in_a_file_is_held_against_its_arm(tmp_path):
+    robot = nbs.load_robot("two_link")
+    model = LagrangianDynamics(make_network("cholesky", [False, False], seed=3), robot)
+    nbs.save(model, tmp_path / "model.nbs")
+    assert run(tmp_path / "a", str(tmp_path / "model.nbs"), "--joints", "2,1", "--trajectories", "0") == 0
+    expected = compare(model, nbs.PinocchioDynamics(robot), samples=50, motions=0)
+    found = summary(tmp_path / "a")["figures"]["relative_error"]
+    assert found == pytest.approx(expected.errors._asdict(), rel=1e-9)
+    assert expected.mass_matrix > 0.1
 
 
 def test_the_box_can_be_that_of_data(wrong, tmp_path):

@@ -136,7 +136,7 @@ def test_the_scale_of_the_torque_is_found_and_free_motion_does_not_know_it():
     assert found.energy_drift < 1e-4
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 10_000), size=st.floats(1e-6, 0.3))
 def test_a_best_factor_never_leaves_more_and_the_ratio_bounds_the_inertia(seed, size):
     model = perturbed(size=size, seed=seed)
