@@ -19,6 +19,7 @@ from nbs_pin import __version__
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.compare import Compare
+from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.reproduce import Reproduce
 from nbs_pin.cli.robots import Robots
@@ -31,13 +32,14 @@ Command: TypeAlias = (
     Annotated[Track, tyro.conf.subcommand("track")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Collect, tyro.conf.subcommand("collect")]
+    | Annotated[Learn, tyro.conf.subcommand("learn")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Robots, tyro.conf.subcommand("robots")]
 )
-NAMES = ("track", "train", "collect", "compare", "replay", "reproduce", "bench", "robots")
+NAMES = ("track", "train", "collect", "learn", "compare", "replay", "reproduce", "bench", "robots")
 BAD_INPUT, INTERRUPTED = 2, 130
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` shows the options of a command; "

@@ -28,7 +28,7 @@ class FitReport:
     parameters: int
     """Numbers that were learned."""
     history: tuple[float, ...]
-    """Normalised mean squared residual per iteration."""
+    """Normalised mean squared residual: untrained, and after every iteration."""
     held_out: tuple[float, ...]
     """The same on what was held out; empty where it chose nothing."""
     train_nmse: float

@@ -101,7 +101,7 @@ def fit(
     if robot is not None and robot.nv != data.nv:
         raise ArgumentError(f"the data have {data.nv} joints and {robot.name} {robot.nv}; give the arm they are of.")
     start = time.perf_counter()
-    train, test = _parted(data, held_out, seed)
+    train, test = parted(data, held_out, seed)
     fitted = _FITTERS[model](FitTask(model, train, test, seed, robot, friction, progress, settings))
     bare = fitted.assemble(None)
     report = FitReport(
@@ -122,8 +122,8 @@ def fit(
     return fitted.assemble(report)
 
 
-def _parted(data: Dataset, held_out: Dataset | float | None, seed: int) -> tuple[Dataset, Dataset | None]:
-    """What is learned from and what is held out."""
+def parted(data: Dataset, held_out: Dataset | float | None = None, seed: int = 0) -> tuple[Dataset, Dataset | None]:
+    """What is learned from, and what is held out for `fit` with these arguments; raises as `fit` does."""
     if isinstance(held_out, Dataset):
         if held_out.nv != data.nv:
             raise ArgumentError(f"held_out has {held_out.nv} joints and the data {data.nv}; give data of one arm.")
@@ -183,15 +183,16 @@ def _fit_residual(task: FitTask) -> Fitted:
 
 def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport | None], DynamicsProvider]) -> Fitted:
     names = () if task.robot is None else task.robot.joint_names
+    loss = task.settings.get("loss", "torque")
     return Fitted(
         assemble=assemble,
         friction=found.friction,
-        parameters=len(found.equations.theta),
+        parameters=found.parameters,
         history=tuple(found.history),
         held_out=tuple(found.held_out),
         evaluations=found.evaluations,
         stopped=found.stopped,
-        unexcited=unexcited(found.equations, task.data, names),
+        unexcited=unexcited(found.network, task.data, friction=found.friction, loss=loss, names=names),
     )
 
 

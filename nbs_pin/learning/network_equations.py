@@ -41,6 +41,14 @@ class Equation(nn.Module):
         self.network, self.loss, self.transition = network, loss, transition
         self.roots = None if friction is None else nn.Parameter(friction.sqrt())
 
+    @classmethod
+    def fitted(cls, network: LagrangianNetwork, friction: JointFriction | None, loss: Loss) -> "Equation":
+        """Of a network and a friction that are known."""
+        if friction is None:
+            return cls(network, loss, None, 1.0)
+        coefficients = torch.from_numpy(np.stack([friction.viscous, friction.coulomb]))
+        return cls(network, loss, coefficients, friction.transition)
+
     def forward(
         self, q: torch.Tensor, v: torch.Tensor, a: torch.Tensor, tau: torch.Tensor, *nominal: torch.Tensor
     ) -> torch.Tensor:

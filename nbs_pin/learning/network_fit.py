@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, cast, get_args
 
 import torch
 from jaxtyping import Int
@@ -27,8 +27,8 @@ LARGEST_FOR_LM = 3500
 """Parameters beyond which "lm" is no longer the default: its work per sample grows with their square."""
 _COARSE_EQUATIONS, _COARSE_STEPS, _COARSE_ENOUGH = 5, 25, 3e-3  # residuals per parameter, steps, nMSE
 _STARTS, _STUCK = 3, 0.05  # a start that ends its coarse part above this nMSE leads nowhere
-_PATIENCE, _SLOW = 0.2, 5e-3  # a share of the iterations, and the least gain in one of them
-_BATCH, _RATE, _LBFGS_SHARE = 256, 3e-3, 0.75
+_PATIENCE, _SLOW = 0.2, 0.03  # a share of the iterations, and the least gain in so many of them
+_BATCH, _BATCHES, _RATE, _LBFGS_SHARE = 256, 16, 3e-3, 0.75  # samples of a batch at most, batches at least
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e8
 
 
@@ -38,10 +38,10 @@ class NetworkFit:
 
     network: LagrangianNetwork
     friction: JointFriction | None
-    equations: Equations
-    """Of the samples that were learned from, at the fitted parameters."""
+    parameters: int
+    """Numbers that were learned."""
     history: list[float]
-    """Normalised mean squared residual of the samples learned from, per iteration."""
+    """Normalised mean squared residual of the samples learned from: untrained, and after every iteration."""
     held_out: list[float]
     """The same of the samples held out, empty when there are none; the network is that of the least."""
     evaluations: int
@@ -78,20 +78,19 @@ class _Search:
 
     def label(self) -> str:
         """What the progress bar says."""
-        return f"fitting, nMSE {self.train[-1]:.2e}" if self.train else "fitting"
+        return f"fitting, nMSE {self.train[-1]:.2e}"
 
     def run(self, steps: Iterator[Theta], count: int, progress: bool, enough: float = 0.0) -> str:
         """Take up to `count` steps, until one costs no more than `enough`; returns why it ended."""
-        slow, patience = 0, max(3, round(_PATIENCE * count))
+        patience = max(3, round(_PATIENCE * count))
         try:
             for _ in tracked(range(count), self.label, progress):
                 theta = next(steps, None)
                 if theta is None:
                     return "converged"
-                before = self.train[-1] if self.train else math.inf
                 cost = self.record(theta)
-                slow = slow + 1 if cost > (1.0 - _SLOW) * before else 0
-                if cost <= enough or slow >= patience:
+                before = self.train[-1 - patience] if len(self.train) > patience else math.inf
+                if cost <= enough or cost > (1.0 - _SLOW) * before:
                     return "converged"
                 if self.checked and self.since >= patience:
                     return "held out"
@@ -106,8 +105,8 @@ def fit_network(
     held_out: Dataset | None = None,
     *,
     seed: int = 0,
-    loss: Loss = "torque",
-    optimiser: FitOptimiser | None = None,
+    loss: Loss | str = "torque",
+    optimiser: FitOptimiser | str | None = None,
     iterations: int | None = None,
     friction: bool = False,
     transition: float = 0.01,
@@ -129,10 +128,12 @@ def fit_network(
 
     def begin(start: int) -> _Search:
         begun = first_friction(data) if friction else None
-        equation = Equation(copy.deepcopy(make(start)).requires_grad_(True), loss, begun, transition)
+        equation = Equation(copy.deepcopy(make(start)).requires_grad_(True), cast(Loss, loss), begun, transition)
         equations = Equations.of(equation, data)
         checked = None if held_out is None else Equations.of(equation, held_out, equations.unit)
-        return _Search(equations, checked, equations.theta)
+        search = _Search(equations, checked, equations.theta)
+        search.record(search.best)
+        return search
 
     found = begin(seed)
     name = optimiser or ("lm" if len(found.best) <= LARGEST_FOR_LM else "lbfgs")
@@ -149,8 +150,8 @@ def fit_network(
     found.equations.write(found.best)
     equation = found.equations.equation
     equation.requires_grad_(False)
-    curves, work = (found.train, found.checked), round(found.work)
-    return NetworkFit(equation.network, equation.friction(), found.equations, *curves, work, stopped)
+    count, work = len(found.best), round(found.work)
+    return NetworkFit(equation.network, equation.friction(), count, found.train, found.checked, work, stopped)
 
 
 def _marquardt_starts(
@@ -172,7 +173,7 @@ def _marquardt_starts(
     best = min(tried, key=lambda s: s.least)
     best.work = sum(s.work for s in tried)
     best.since = 0
-    left = max(1, count - len(best.train))
+    left = max(1, count + 1 - len(best.train))
     return best, best.run(_marquardt(best, best.best, torch.arange(samples)), left, progress)
 
 
@@ -201,12 +202,12 @@ def _marquardt(search: _Search, theta: Theta, rows: Int[torch.Tensor, " m"], dam
 def _adam(search: _Search, theta: Theta, epochs: int, seed: int) -> Iterator[Theta]:
     """Passes over the samples in small batches."""
     equations, generator = search.equations, torch.Generator().manual_seed(seed)
-    moving = theta.clone().requires_grad_(True)
+    moving, batch = theta.clone().requires_grad_(True), min(_BATCH, -(-len(equations) // _BATCHES))
     optimiser = torch.optim.Adam([moving], lr=_RATE)
     for epoch in range(epochs):
         for group in optimiser.param_groups:
             group["lr"] = _RATE * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * epoch / epochs)))
-        for rows in torch.split(torch.randperm(len(equations), generator=generator), _BATCH):
+        for rows in torch.split(torch.randperm(len(equations), generator=generator), batch):
             optimiser.zero_grad()
             equations.residual(moving, rows).square().mean().backward()  # type: ignore[no-untyped-call]
             optimiser.step()

@@ -1,0 +1,291 @@
+"""Fitting models to data: the mathematics of the residuals, the optimisers, what is reported and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+import nbs_pin as nbs
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.learning import network_fit
+from nbs_pin.learning.datasets import Dataset, joint_tree
+from nbs_pin.learning.fit_report import torque_errors, torque_nmse
+from nbs_pin.learning.fitting import MODELS, fit, parted
+from nbs_pin.learning.network_equations import Equation, Equations
+from nbs_pin.learning.network_fit import fit_network
+from nbs_pin.learning.unexcited import unexcited
+from nbs_pin.networks.families import NETWORKS, make_network
+
+ROBOT = nbs.load_robot("two_link")
+TRUTH = nbs.PinocchioDynamics(ROBOT)
+FRICTION = JointFriction(np.array([0.7, 0.3]), np.array([0.9, 0.4]), 0.1)
+
+
+def states(samples, seed=0, noise=0.0, friction=None, still=False):
+    """Independent states of the two-link arm and their torque."""
+    rng, n = np.random.default_rng(seed), ROBOT.nv
+    q = rng.uniform(-np.pi, np.pi, (samples, n))
+    v, a = ((0.0 if still else scale) * rng.normal(size=(samples, n)) for scale in (1.5, 4.0))
+    tau = nbs.inverse_dynamics(TRUTH, q, v, a) + noise * rng.normal(size=(samples, n))
+    tau += 0.0 if friction is None else friction.torque(v)
+    order = np.arange(samples)
+    return Dataset(q, v, a, tau, 1.0 * order, order, *joint_tree(ROBOT), ROBOT.name)
+
+
+def relative(model):
+    """Relative errors of M, C v and G over fresh states."""
+    fresh = states(300, seed=99)
+    q, v = fresh.q, fresh.v
+    pairs = [(m.mass_matrix(q), (m.coriolis_matrix(q, v) @ v[..., None]), m.gravity(q)) for m in (model, TRUTH)]
+    return [np.linalg.norm(x - y) / np.linalg.norm(y) for x, y in zip(*pairs, strict=True)]
+
+
+def equations(name, loss="torque", friction=None):
+    """Of a small network with parameters away from their first ones."""
+    if name == "residual":
+        from nbs_pin.dynamics.residual import ResidualNetwork
+
+        network = ResidualNetwork(TRUTH, widths=(4,))
+    else:
+        network = make_network(name, [False, False], 1, widths=(4, 4), epsilon=0.5)
+    given = None if friction is None else torch.tensor(np.stack([friction.viscous, friction.coulomb]))
+    equation = Equation(network, loss, given, 0.1)
+    with torch.no_grad():
+        for p in equation.parameters():
+            p.add_(0.1 * torch.randn(p.shape, dtype=p.dtype, generator=torch.Generator().manual_seed(p.numel())))
+    return Equations.of(equation, states(6))
+
+
+@pytest.mark.parametrize("friction", [None, FRICTION], ids=["frictionless", "friction"])
+@pytest.mark.parametrize(
+    ("name", "loss"),
+    [*((name, "torque") for name in (*NETWORKS, "residual")), ("cholesky", "acceleration"), ("picnn", "acceleration")],
+)
+def test_the_jacobian_is_that_of_finite_differences(name, loss, friction):
+    system = equations(name, loss, friction)
+    theta, rows = system.theta, torch.arange(6)
+    J = system.jacobian(theta, rows)
+    direction = torch.randn(len(theta), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    moved = [system.residual(theta + h * direction, rows).reshape(-1) for h in (1e-6, -1e-6)]
+    assert_allclose(J @ direction, (moved[0] - moved[1]) / 2e-6, rtol=1e-6, atol=1e-6 * float(J.abs().max()))
+
+
+def test_the_normal_equations_are_sums_over_blocks(monkeypatch):
+    system = equations("cholesky", friction=FRICTION)
+    theta, rows = system.theta, torch.tensor([0, 2, 3, 5])
+    monkeypatch.setattr("nbs_pin.learning.network_equations._LARGEST_BLOCK", 3 * 2 * len(theta))
+    matrix, slope = system.normal(theta, rows)
+    J, r = system.jacobian(theta, rows), system.residual(theta, rows).reshape(-1)
+    assert_allclose(matrix, J.T @ J / 8, atol=1e-12)
+    assert_allclose(slope, J.T @ r / 8, atol=1e-12)
+    assert system.cost(theta, rows) == pytest.approx(float(r.square().mean()))
+
+
+def test_writing_parameters_changes_the_network():
+    system = equations("cholesky", friction=FRICTION)
+    theta = system.theta + 0.01
+    system.write(theta)
+    assert_array_equal(system.theta, theta)
+    data, network = states(6), system.equation.network
+    q, v, a = (torch.from_numpy(x) for x in (data.q, data.v, data.a))
+    friction = system.equation.friction()
+    expected = network.torque(q, v, v, a).detach().numpy() + friction.torque(data.v) - data.tau
+    assert_allclose(system.residual(theta).detach() * system.unit, expected, atol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def cholesky():
+    """A network fitted to 800 states."""
+    return fit(states(800), "cholesky", robot=ROBOT, widths=(12, 12))
+
+
+def test_levenberg_marquardt_finds_the_arm(cholesky):
+    mass, coriolis, gravity = relative(cholesky)
+    assert max(mass, gravity) < 0.02
+    assert coriolis < 0.06
+    assert cholesky.report.test_nmse < 1e-3
+
+
+def test_the_report_says_what_was_done(cholesky):
+    report, (train, test) = cholesky.report, parted(states(800))
+    assert (report.model, report.seed, report.samples) == ("cholesky", 0, 640)
+    assert report.parameters == sum(p.numel() for p in cholesky.network.parameters())
+    assert report.train_nmse == pytest.approx(torque_nmse(cholesky, train))
+    assert report.test_nmse == pytest.approx(torque_nmse(cholesky, test))
+    assert len(report.history) == len(report.held_out) <= network_fit.ITERATIONS["lm"] + 1
+    assert report.history[0] > 100.0 * report.history[-1]
+    assert report.seconds > 0.0
+    assert report.evaluations > len(report.history)
+    assert report.unexcited == ()
+    assert cholesky.robot is ROBOT
+    assert cholesky.friction is None
+
+
+def test_the_same_seed_gives_the_same_model_and_another_seed_another():
+    data, q = states(150), states(5, seed=3).q
+    mass = [fit(data, "cholesky", seed, widths=(5,), iterations=3).mass_matrix(q) for seed in (0, 0, 1)]
+    assert_array_equal(mass[0], mass[1])
+    assert np.abs(mass[0] - mass[2]).max() > 1e-3
+
+
+def test_what_is_held_out_chooses_the_iteration():
+    data = states(120, noise=8.0)
+    model = fit(data, "cholesky", widths=(16, 16))
+    report = model.report
+    train, test = parted(data)
+    unit = train.tau.std(axis=0)
+    assert np.mean((torque_errors(model, test) / unit) ** 2) == pytest.approx(min(report.held_out), rel=1e-9)
+    assert int(np.argmin(report.held_out)) < len(report.held_out) - 1
+    assert report.history[-1] < report.history[int(np.argmin(report.held_out))]
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "lbfgs"])
+def test_first_order_optimisers_lower_the_cost(optimiser):
+    report = fit(states(200), "cholesky", widths=(8, 8), optimiser=optimiser, iterations=40).report
+    assert report.history[-1] < 0.5 * report.history[0]
+    assert len(report.history) <= 41
+
+
+def test_every_family_learns():
+    for name in NETWORKS:
+        report = fit(states(150), name, widths=(5, 5), iterations=8).report
+        assert report.history[-1] < 0.5 * report.history[0], name
+
+
+def test_the_acceleration_is_learned_too():
+    report = fit(states(200), "cholesky", widths=(8,), loss="acceleration", iterations=12, epsilon=0.1).report
+    assert report.history[-1] < 0.3 * report.history[0]
+
+
+def test_friction_is_learned_beside_a_nearly_known_arm():
+    data = states(300, noise=1e-3, friction=FRICTION)
+    model = fit(data, "residual", robot=ROBOT, friction=True, widths=(4,), transition=0.1)
+    assert_allclose(model.friction.viscous, FRICTION.viscous, rtol=0.02)
+    assert_allclose(model.friction.coulomb, FRICTION.coulomb, rtol=0.02)
+    assert max(relative(model)) < 1e-3
+    without = fit(data, "residual", robot=ROBOT, widths=(4,))
+    assert without.report.test_nmse > 100.0 * model.report.test_nmse
+
+
+def test_identified_models_come_through_the_same_door():
+    model = fit(states(100, friction=FRICTION), "identified", robot=ROBOT, friction=True, transition=0.1)
+    assert max(relative(model)) < 1e-8
+    assert_allclose(model.friction.viscous, FRICTION.viscous, rtol=1e-6)
+    assert model.report.test_nmse < 1e-16
+    assert len(model.report.details["noise_Nm"]) == 2
+    assert model.report.history == ()
+
+
+def test_ctrl_c_keeps_the_best(monkeypatch):
+    calls, normal = [], Equations.normal
+
+    def interrupted(self, theta, rows):
+        calls.append(theta)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return normal(self, theta, rows)
+
+    monkeypatch.setattr(Equations, "normal", interrupted)
+    data = states(200)
+    found = fit_network(lambda seed: make_network("cholesky", [False] * 2, seed, widths=(6,)), data)
+    assert found.stopped == "interrupted"
+    assert len(found.history) == 4
+    system = Equations.of(Equation.fitted(found.network, None, "torque"), data)
+    assert system.cost(system.theta) == pytest.approx(min(found.history))
+
+
+def test_a_start_that_leads_nowhere_is_replaced(monkeypatch):
+    monkeypatch.setattr(network_fit, "_COARSE_STEPS", 12)
+    begun = []
+
+    def make(seed):
+        begun.append(seed)
+        network = make_network("cholesky", [False] * 2, seed, widths=(6, 6))
+        if len(begun) == 1:
+            with torch.no_grad():
+                for p in network.parameters():
+                    p.zero_()  # a saddle: every neuron is the same for ever
+        return network
+
+    found = fit_network(make, states(200))
+    assert begun[0] == 0
+    assert len(begun) == 2
+    assert found.history[-1] < 0.05
+
+
+def test_data_at_rest_leave_the_inertia_open_and_data_of_few_poses_the_rest():
+    still = states(400, still=True)
+    network = fit(still, "cholesky", widths=(8, 8), iterations=20).network
+    told = unexcited(network, still, names=ROBOT.joint_names)
+    assert {line.split(":")[0] for line in told} == {f"inertia of {joint}" for joint in ROBOT.joint_names}
+    moving = states(400)
+    assert unexcited(network, moving) == ()
+    assert unexcited(network, moving.take(np.cos(moving.q[:, 1]) < -0.9))
+
+
+def test_data_without_torque_leave_the_scale_open():
+    data = states(100)
+    zero = 0.0 * data.q
+    free = replace(data, a=nbs.forward_dynamics(TRUTH, data.q, data.v, zero), tau=zero)
+    model = fit(free, "cholesky", widths=(6,), loss="acceleration", iterations=4, epsilon=0.1)
+    assert model.report.unexcited[0].startswith("the torque's scale")
+    assert np.isnan(model.report.train_nmse)
+    for name, robot in (("cholesky", None), ("identified", ROBOT)):
+        with pytest.raises(ArgumentError, match=r"no torque"):
+            fit(free, name, robot=robot)
+
+
+def test_nmse_is_the_mean_over_joints_whose_torque_varies():
+    data = states(50)
+    errors = torque_errors(TRUTH, replace(data, tau=data.tau + 1.0))
+    assert_allclose(errors, -1.0, atol=1e-9)
+    assert torque_nmse(TRUTH, replace(data, tau=data.tau + 1.0)) == pytest.approx(np.mean(1.0 / data.tau.var(axis=0)))
+    flat = data.tau.copy()
+    flat[:, 1] = 3.0
+    squares = np.square(torque_errors(TRUTH, replace(data, tau=flat))).mean(axis=0)
+    assert torque_nmse(TRUTH, replace(data, tau=flat)) == pytest.approx(squares[0] / flat[:, 0].var(), abs=1e-12)
+
+
+def test_whole_trajectories_are_held_out():
+    data = replace(states(40), trajectory=np.repeat(np.arange(4), 10))
+    train, test = parted(data, 0.25)
+    assert set(train.trajectory).isdisjoint(test.trajectory)
+    assert (len(train), len(test)) == (30, 10)
+    assert parted(data, 0.0) == (data, None)
+    one = data.take(data.trajectory == 0)
+    assert parted(one) == (one, None)
+    assert parted(data, one) == (data, one)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"model": "wavelets"}, r"'wavelets' is unknown; choose one of .*cholesky"),
+        ({"model": "identified"}, r"robot=nbs\.load_robot"),
+        ({"model": "residual"}, r"robot=nbs\.load_robot"),
+        ({"robot": nbs.load_robot("three_link")}, r"2 joints and three_link 3"),
+        ({"held_out": 1.5}, r"share is 1\.5"),
+        ({"width": 3}, r"no setting width = 3; it takes loss, optimiser"),
+        ({"loss": "energy"}, r"loss 'energy' is unknown"),
+        ({"optimiser": "newton"}, r"optimiser 'newton' is unknown"),
+        ({"iterations": 0}, r"iterations is 0"),
+        ({"model": "identified", "robot": ROBOT, "optimiser": "lm"}, r"no setting optimiser = 'lm'"),
+        ({"model": "residual", "robot": ROBOT, "loss": "acceleration"}, r"no setting loss"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(settings, words):
+    with pytest.raises(ArgumentError, match=words):
+        fit(states(20), **({"model": "cholesky"} | settings))
+
+
+def test_held_out_data_are_of_the_same_arm():
+    three = Dataset(*np.zeros((4, 5, 3)), np.arange(5.0), np.arange(5), np.array([0, 1, 2]), np.zeros(3, bool))
+    with pytest.raises(ArgumentError, match="held_out has 3 joints and the data 2"):
+        fit(states(20), "cholesky", held_out=three)
+
+
+def test_every_model_is_in_the_table():
+    assert set(NETWORKS) | {"residual", "identified"} <= set(MODELS)
