@@ -20,7 +20,8 @@ from nbs_pin.networks.lagrangian import LagrangianNetwork
 Loss: TypeAlias = Literal["torque", "acceleration"]
 """τ̂ − τ, cheap and well conditioned; or v̇ that τ produces less v̇ measured, the paper's, which needs M̂⁻¹."""
 Theta: TypeAlias = Float[torch.Tensor, " parameters"]
-_LARGEST_BLOCK = 2**23  # numbers of a Jacobian at a time, 64 MiB
+_LARGEST_BLOCK = 2**22  # numbers of a Jacobian at a time, 32 MiB
+_STRIPS = 6  # of a symmetric matrix, of which only what is right of the diagonal is computed
 _FLAT = 1e-6
 FIRST_FRICTION = 0.1
 """Friction to begin with, as a share of the torque's deviation at a speed of one deviation."""
@@ -139,8 +140,10 @@ class Equations:
             J = self.jacobian(theta, block)
             with torch.no_grad():
                 slope += J.T @ self.residual(theta, block).reshape(-1) / count
-                matrix.addmm_(J.T, J, alpha=1.0 / count)
-        return matrix, slope
+                for rows_of in _blocks(torch.arange(len(theta)), -(-len(theta) // _STRIPS)):
+                    strip = slice(int(rows_of[0]), int(rows_of[-1]) + 1)
+                    matrix[strip, strip.start :].addmm_(J[:, strip].T, J[:, strip.start :], alpha=1.0 / count)
+        return matrix.triu() + matrix.triu(1).T, slope
 
     def _parts(self, theta: Theta) -> dict[str, torch.Tensor]:
         """The vector as named parameters."""

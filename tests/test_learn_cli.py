@@ -1,0 +1,146 @@
+"""`nbs-pin learn`: what it writes, what it prints, and what it refuses."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+import nbs_pin as nbs
+from nbs_pin import cli
+from nbs_pin.learning.datasets import load_dataset
+from nbs_pin.learning.fit_report import torque_errors
+from nbs_pin.learning.fitting import parted
+from nbs_pin.learning.recipes import collect
+from nbs_pin.studies import learning
+from tests.test_plotting import png_size
+
+ROBOT = nbs.load_robot("two_link")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    """Data of two_link."""
+    path = tmp_path_factory.mktemp("data") / "data.npz"
+    collect(ROBOT, samples=300, duration=0.5, seed=2).save(path)
+    return path
+
+
+def run(path, folder, *options):
+    return cli.main(["learn", str(path), "--out", str(folder), *options])
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def network(path, tmp_path_factory):
+    """Where a network learned from them lies."""
+    folder = tmp_path_factory.mktemp("network") / "out"
+    assert run(path, folder, "--model", "cholesky", "--iterations", "4", "--seed", "3") == 0
+    return folder
+
+
+def test_the_files_are_a_model_and_how_it_came_about(path, network):
+    assert sorted(file.name for file in network.iterdir()) == sorted(learning.FILES)
+    said, model = summary(network), nbs.load(network / "model.nbs")
+    assert said["settings"]["model"] == "cholesky"
+    assert said["robot_sha256"] == ROBOT.sha256 == model.robot.sha256
+    figures, (train, test) = said["figures"], parted(load_dataset(path), 0.2, 3)
+    assert figures["samples"] == len(train)
+    assert figures["test_samples"] == len(test)
+    expected = np.sqrt(np.square(torque_errors(model, test)).mean(axis=0))
+    assert figures["rms_test_torque_error_Nm"] == pytest.approx(expected.tolist())
+    assert len(figures["curves"]["history"]) <= 5
+    assert figures["viscous_friction"] is None
+    width, height = png_size(network / "learning.png")
+    assert width > height > 300
+
+
+def test_the_arm_is_the_one_of_the_data_and_inertias_are_found(path, tmp_path, capsys):
+    assert run(path, tmp_path, "--model", "identified", "--friction") == 0
+    model, said = nbs.load(tmp_path / "model.nbs"), capsys.readouterr().out
+    q = np.array([0.3, -1.1])
+    assert np.abs(model.mass_matrix(q) - nbs.PinocchioDynamics(ROBOT).mass_matrix(q)).max() < 1e-8
+    assert summary(tmp_path)["figures"]["viscous_friction"] == pytest.approx([0.0, 0.0], abs=1e-6)
+    for word in ("two_link, identified", "joint2", "held out", "model.nbs", "learning.png"):
+        assert word in said
+    assert "no better" not in said
+
+
+def test_a_log_needs_a_named_arm(path, tmp_path, capsys):
+    data = load_dataset(path)
+    log = tmp_path / "log.npz"
+    np.savez(log, t=data.t, q=data.q, v=data.v, a=data.a, tau=data.tau, trajectory=data.trajectory)
+    assert run(log, tmp_path / "a", "--model", "identified") == 2
+    assert "robot=nbs.load_robot" in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+    assert run(log, tmp_path / "b", "--model", "identified", "--robot", "two_link") == 0
+    assert nbs.load(tmp_path / "b" / "model.nbs").robot.name == "two_link"
+
+
+def test_an_early_end_keeps_the_best(path, tmp_path, monkeypatch, capsys):
+    from nbs_pin.learning.network_equations import Equations
+
+    calls, normal = [], Equations.normal
+
+    def interrupted(self, theta, rows):
+        calls.append(theta)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return normal(self, theta, rows)
+
+    monkeypatch.setattr(Equations, "normal", interrupted)
+    assert run(path, tmp_path, "--model", "cholesky") == 130
+    said = summary(tmp_path)
+    assert said["interrupted"] is True
+    assert said["figures"]["stopped"] == "interrupted"
+    assert nbs.load(tmp_path / "model.nbs").nv == 2
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_another_model_is_not_replaced(path, network, capsys):
+    before = (network / "model.nbs").read_bytes()
+    assert run(path, network, "--model", "cholesky", "--iterations", "2") == 2
+    assert "holds model.nbs of another model" in capsys.readouterr().err
+    assert (network / "model.nbs").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--model", "forest"), "forest"),
+        (("--held-out", "1"), "--held-out is '1'"),
+        (("--iterations", "0"), "--iterations is '0'"),
+        (("--model", "identified", "--loss", "acceleration"), "no setting loss"),
+        (("--robot", "three_link"), "three_link"),
+        (("--robot", "nowhere"), "nowhere"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(path, tmp_path, capsys, options, words):
+    assert run(path, tmp_path / "out", *options) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_data_are_refused(tmp_path, capsys):
+    assert run(tmp_path / "none.npz", tmp_path / "out") == 2
+    assert "none.npz" in capsys.readouterr().err
+
+
+def test_an_arm_whose_description_changed_is_refused(path):
+    data = load_dataset(path)
+    changed = replace(data, about=data.about | {"robot": data.about["robot"] | {"sha256": "0" * 64}})
+    with pytest.raises(nbs.exceptions.ArgumentError, match="has changed since"):
+        learning.arm_of(changed)
+    assert learning.arm_of(data).name == "two_link"
+    assert learning.arm_of(replace(data, about={})) is None
+
+
+def test_the_model_of_the_command_is_that_of_fit(path, network):
+    data = load_dataset(path)
+    found = learning.learn(data, "cholesky", ROBOT, 3, iterations=4)
+    q = data.q[:5]
+    assert_array_equal(found.model.mass_matrix(q), nbs.load(network / "model.nbs").mass_matrix(q))
