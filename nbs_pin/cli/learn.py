@@ -23,13 +23,13 @@ class Learn:
     Ctrl-C ends the fit of a network early and keeps the best. Hold the result against Pinocchio with
     nbs-pin compare out/learn-panda/model.nbs
 
-    Example: nbs-pin learn out/collect-panda/data.npz --model identified --friction
+    Example: nbs-pin learn out/collect-panda/data.npz --model chain --friction
     """
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """Data of nbs-pin collect, or a log: CSV or NPZ with t, q, tau and, if there are any, v and a."""
-    model: Literal["cholesky", "homogenised", "picnn", "unconstrained", "residual", "identified"] = "cholesky"
-    """M = LLᵀ + εI by a network; a convex network made quadratic; the paper's convex network; a Lagrangian without
+    model: Literal["chain", "cholesky", "homogenised", "picnn", "unconstrained", "residual", "identified"] = "chain"
+    """A rigid tree found from the order of the joints alone; M = LLᵀ + εI by a network; a convex network made quadratic; the paper's convex network; a Lagrangian without
     structure; a network that corrects the arm's URDF; or inertias by least squares in the geometry of the URDF."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the one that the data name")] = None
     """The arm by name or a path to a .urdf or .xacro file; a log names none."""
