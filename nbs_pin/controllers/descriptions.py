@@ -29,6 +29,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.networks.activations import SmoothedReLU, Squareplus
+from nbs_pin.networks.chain import Chain
 from nbs_pin.networks.cholesky import CholeskyNetwork
 from nbs_pin.networks.damping import Damping
 from nbs_pin.networks.picnn import HomogenisedPicnn, PaperPicnn
@@ -264,6 +265,7 @@ _KINDS: dict[str, _Kind] = {
         _Kind(LagrangianDynamics, _same("report"), _same("network", "robot", "friction")),
         _Kind(ResidualDynamics, _same("report"), _same("network", "friction")),
         _Kind(ResidualNetwork, _same("share") | _WIDE, _same("nominal"), _residual, sequence=tuple),
+        _Kind(Chain, _same("parents", "prismatic", "epsilon"), sequence=list),
         *(
             _Kind(network, _WIDE, arrays=_network, sequence=tuple)
             for network in (CholeskyNetwork, HomogenisedPicnn, PaperPicnn, UnconstrainedLagrangian)

@@ -17,6 +17,8 @@ from nbs_pin.exceptions import ArgumentError
 from nbs_pin.networks.lagrangian import CompiledTorque, LagrangianNetwork
 from nbs_pin.robot import Robot
 from nbs_pin.runtime.layout import Packed
+from nbs_pin.runtime.tree_layout import tree_workspace
+from nbs_pin.runtime.tree_rows import tree_accelerations
 
 
 class LagrangianDynamics(DynamicsProvider, nn.Module):
@@ -95,12 +97,23 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
     def forward_dynamics(
         self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
     ) -> Float[Array, "*batch n"]:
-        """v̇ [rad/s²] that the torque τ [N·m] produces."""
-        return self._evaluate(self.network.acceleration, q=q, v=v, tau=tau)
+        """v̇ [rad/s²] that the torque τ [N·m] produces, in numpy by machine code where the network is a rigid tree."""
+        vectors = as_vectors(self.nv, q=q, v=v, tau=tau)
+        tree = None if is_torch_array(vectors[0]) else self._tree
+        if tree is None:
+            return self._evaluate(self.network.acceleration, q=q, v=v, tau=tau)
+        rows = [np.ascontiguousarray(x).reshape(-1, self.nv) for x in vectors]
+        a, factor = np.empty(rows[0].shape), np.empty((self.nv, self.nv))
+        tree_accelerations(*rows, *tree, np.empty(tree_workspace(tree)), factor, a)
+        return a.reshape(vectors[0].shape)
 
     def packed_tree(self) -> Packed | None:
         """The network as a rigid tree, where it is one; None for a subclass, which may have changed an equation."""
-        return self.network.packed_tree() if type(self) is LagrangianDynamics else None
+        return self._tree if type(self) is LagrangianDynamics else None
+
+    @cached_property
+    def _tree(self) -> Packed | None:
+        return self.network.packed_tree()
 
     @cached_property
     def _machine_code(self) -> CompiledTorque | None:
@@ -120,4 +133,5 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
 
 def _forget_machine_code(module: nn.Module, keys: Any) -> None:
     """Other weights, another machine code."""
-    vars(module).pop("_machine_code", None)
+    for name in ("_machine_code", "_tree"):
+        vars(module).pop(name, None)

@@ -14,6 +14,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.exceptions import ArgumentError
+from nbs_pin.learning.chain_fit import fit_chain
 from nbs_pin.learning.datasets import Dataset
 from nbs_pin.learning.fit_report import FitReport, torque_nmse
 from nbs_pin.learning.identification import identify
@@ -24,9 +25,9 @@ from nbs_pin.networks.families import make_network
 from nbs_pin.networks.lagrangian import LagrangianNetwork
 from nbs_pin.robot import Robot
 
-ModelName: TypeAlias = Literal["cholesky", "homogenised", "picnn", "unconstrained", "residual", "identified"]
-"""What `fit` knows: networks that need no description of the arm, a network that corrects the arm's nominal model, and
-inertias that are put into its URDF's geometry."""
+ModelName: TypeAlias = Literal["chain", "cholesky", "homogenised", "picnn", "unconstrained", "residual", "identified"]
+"""What `fit` knows: rigid trees and networks, which need no description of the arm, a network that corrects the arm's
+nominal model, and inertias that are put into its URDF's geometry."""
 HELD_OUT = 0.2
 """Share of the trajectories that `fit` holds out by default."""
 _WIDTHS = {"cholesky": (32, 32), "homogenised": (20, 20), "picnn": (16, 16, 16), "unconstrained": (32, 32)}
@@ -153,6 +154,28 @@ def _fit_family(task: FitTask) -> Fitted:
     )
 
 
+def _fit_chain(task: FitTask) -> Fitted:
+    """A rigid tree, of which the data give only the order of the joints."""
+    settings = task.known("transition", "regularisation", "starts", "epsilon")
+    names = None if task.robot is None else task.robot.joint_names
+    found = fit_chain(task.data, task.seed, friction=task.friction, names=names, progress=task.progress, **settings)
+    network, bodies = found.network, found.bodies
+    return Fitted(
+        assemble=lambda report: LagrangianDynamics(network, task.robot, found.friction, report),
+        friction=found.friction,
+        parameters=sum(x.numel() for x in network.parameters()) + (2 * task.data.nv if found.friction else 0),
+        history=tuple(found.history.tolist()),
+        evaluations=found.evaluations,
+        unexcited=bodies.unexcited,
+        details={
+            "starts": len(found.costs),
+            "nmse_of_starts": found.costs.tolist(),
+            "noise_Nm": np.asarray(bodies.noise).tolist(),
+            "condition": float(bodies.condition),
+        },
+    )
+
+
 def _fit_residual(task: FitTask) -> Fitted:
     """What the arm's nominal model lacks."""
     settings = task.known("optimiser", "iterations", "transition", "widths", "share")
@@ -222,6 +245,7 @@ def _needed(task: FitTask) -> Robot:
 
 
 _FITTERS: dict[str, Callable[[FitTask], Fitted]] = {
+    "chain": _fit_chain,
     **dict.fromkeys(_WIDTHS, _fit_family),
     "residual": _fit_residual,
     "identified": _fit_identified,

@@ -6,6 +6,7 @@ it; the others are free, and are chosen such that every body could exist (`consi
 
 import time
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,16 @@ from nbs_pin.dynamics.pseudo_inertia import PARAMETERS_OF_COORDINATES, coordinat
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.learning.consistent_fit import ConsistentFit, consistent_fit, in_factors
 from nbs_pin.learning.datasets import Dataset, joint_tree
-from nbs_pin.learning.regressor import Expected, Scalars, expectation, joint_triangles, torque_size, triangle
+from nbs_pin.learning.regressor import (
+    Expected,
+    Geometry,
+    RobotGeometry,
+    Scalars,
+    expectation,
+    joint_triangles,
+    torque_size,
+    triangle,
+)
 from nbs_pin.robot import Robot
 
 _EXACT = 1e-11
@@ -77,18 +87,45 @@ def identify(
     equations per base parameter, for an arm that neither moves nor carries weight, and for data without torque, which
     inertias of every scale explain.
     """
-    start = time.perf_counter()
     positive("transition", transition, "rad/s")
     positive("regularisation", regularisation, "measurements")
     _check_arm(data, robot)
     scalars = Scalars(friction, rotor_inertia, transition)
-    triangles = joint_triangles(robot, data, scalars)
-    expected = expectation(robot, data, scalars, triangles)
+    bodies = explain(RobotGeometry(robot), data, scalars, regularisation)
+    parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
+    rotors = bodies.scalars[-1] if rotor_inertia else None
+    return IdentifiedDynamics(robot, parameters, bodies.friction(scalars), rotors, bodies.report)
+
+
+class Bodies(NamedTuple):
+    """What moves an arm of known geometry as its data say."""
+
+    factors: Float[np.ndarray, "n 4 4"]
+    """Lower triangular L of the pseudo-inertias LLᵀ ≻ 0."""
+    scalars: Float[np.ndarray, "kinds n"]
+    """The unknowns of `Scalars`, all > 0."""
+    expected: Expected
+    """What was expected of them."""
+    report: IdentificationReport
+
+    def friction(self, scalars: Scalars) -> JointFriction | None:
+        """The friction among the scalars, if there was any to find."""
+        return JointFriction(self.scalars[0], self.scalars[1], scalars.transition) if scalars.friction else None
+
+
+def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation: float) -> Bodies:
+    """The physically consistent bodies, friction and rotors that explain the data best, for that geometry.
+
+    Raises ArgumentError as `identify` does.
+    """
+    start = time.perf_counter()
+    triangles = joint_triangles(geometry, data, scalars)
+    expected = expectation(geometry, data, scalars, triangles)
     equations = expected.in_units(triangles)
-    base = _base_directions(robot, data, scalars, expected)
+    base = _base_directions(geometry, data, scalars, expected)
     noise = _noise(equations, base.shape[1], len(data))
     design, target = _weighted(equations, noise)
-    fit = consistent_fit(design, target, robot.nv, regularisation)
+    fit = consistent_fit(design, target, data.nv, regularisation)
     weak, values = _unexcited(design, base)
     report = IdentificationReport(
         samples=len(data),
@@ -98,10 +135,11 @@ def identify(
         base_parameters=base.shape[1],
         excited=base.shape[1] - len(weak),
         condition=float(values[0] / values[-1]) if values[-1] > 0.0 else np.inf,
-        unexcited=tuple(_direction(x, expected, scalars.names(robot)) for x in weak),
+        unexcited=tuple(_direction(x, expected, scalars.names(geometry.names)) for x in weak),
         steps=fit.steps,
     )
-    return _dynamics(robot, fit, expected, scalars, report)
+    found = (fit.scalars * expected.scalars).reshape(-1, data.nv)
+    return Bodies(expected.bodies @ fit.factors, found, expected, report)
 
 
 def _check_arm(data: Dataset, robot: Robot) -> None:
@@ -118,15 +156,15 @@ def _check_arm(data: Dataset, robot: Robot) -> None:
 
 
 def _base_directions(
-    robot: Robot, data: Dataset, scalars: Scalars, expected: Expected
+    geometry: Geometry, data: Dataset, scalars: Scalars, expected: Expected
 ) -> Float[np.ndarray, "unknowns base"]:
     """An orthonormal basis of the directions that the torque can depend on, from random states as fast as the data."""
-    rng, size = np.random.default_rng(0), (_RANDOM_STATES, robot.nv)
+    rng, size = np.random.default_rng(0), (_RANDOM_STATES, data.nv)
     speed, rate = (max(float(np.abs(x).max()), 1.0) for x in (data.v, data.a))
     v, a, order = speed * rng.normal(size=size), rate * rng.normal(size=size), np.arange(_RANDOM_STATES)
     q = rng.uniform(-np.pi, np.pi, size)
     states = replace(data, q=q, v=v, a=a, tau=0.0 * q, t=order.astype(float), trajectory=order)
-    rows = expected.in_units(joint_triangles(robot, states, scalars))[:, :, :-1]
+    rows = expected.in_units(joint_triangles(geometry, states, scalars))[:, :, :-1]
     rows = rows / np.linalg.norm(rows, axis=(1, 2), keepdims=True)
     _, values, directions = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), full_matrices=False)
     return directions[values > _NEGLIGIBLE * values[0]].T
@@ -189,14 +227,3 @@ def _nmse(equations: np.ndarray, fit: ConsistentFit, data: Dataset) -> float:
     variance = data.tau.var(axis=0)
     varies = variance > 1e-12 * max(variance.max(), np.square(data.tau).max())
     return float((squares[varies] / variance[varies]).mean()) if varies.any() else 0.0
-
-
-def _dynamics(
-    robot: Robot, fit: ConsistentFit, expected: Expected, scalars: Scalars, report: IdentificationReport
-) -> IdentifiedDynamics:
-    """The fit in SI units, as a model."""
-    factors = expected.bodies @ fit.factors
-    parameters = inertial_parameters(factors @ factors.swapaxes(1, 2))
-    found = (fit.scalars * expected.scalars).reshape(-1, robot.nv)
-    friction = JointFriction(found[0], found[1], scalars.transition) if scalars.friction else None
-    return IdentifiedDynamics(robot, parameters, friction, found[-1] if scalars.rotor_inertia else None, report)

@@ -40,7 +40,7 @@ __all__ = ["tree_acceleration", "tree_acceleration_adjoint", "tree_torque", "tre
 
 
 @kernel
-def _place(q: np.ndarray, layout: np.ndarray, weights: np.ndarray, work: np.ndarray) -> None:
+def place(q: np.ndarray, layout: np.ndarray, weights: np.ndarray, work: np.ndarray) -> None:
     """R and p of every joint → work."""
     for i in range(layout[0]):
         body, row = weights[BASE + BODY * i : BASE + BODY * (i + 1)], work[ROW * (i + 1) : ROW * (i + 2)]
@@ -56,7 +56,7 @@ def _place(q: np.ndarray, layout: np.ndarray, weights: np.ndarray, work: np.ndar
 
 
 @kernel
-def _sweep(
+def sweep(
     v: np.ndarray, w: np.ndarray, a: np.ndarray, layout: np.ndarray, weights: np.ndarray, work: np.ndarray
 ) -> None:
     """Motion and force of every body alone, outwards, from R and p in work."""
@@ -72,8 +72,8 @@ def _sweep(
 
 
 @kernel
-def _gather(a: np.ndarray, layout: np.ndarray, weights: np.ndarray, work: np.ndarray, tau: np.ndarray) -> None:
-    """The torque of every joint, inwards, after `_sweep`; tau may be a."""
+def gather(a: np.ndarray, layout: np.ndarray, weights: np.ndarray, work: np.ndarray, tau: np.ndarray) -> None:
+    """The torque of every joint, inwards, after `sweep`; tau may be a."""
     for i in range(layout[0] - 1, -1, -1):
         at = layout[1 + 2 * i] * ROW
         row = work[ROW * (i + 1) : ROW * (i + 2)]
@@ -94,13 +94,13 @@ def tree_torque(
     tau: np.ndarray,
 ) -> None:
     """M(q) a + C(q, v) w + G(q) → tau [N·m], by one polarised Newton–Euler pass; C is the Christoffel one."""
-    _place(q, layout, weights, work)
-    _sweep(v, w, a, layout, weights, work)
-    _gather(a, layout, weights, work, tau)
+    place(q, layout, weights, work)
+    sweep(v, w, a, layout, weights, work)
+    gather(a, layout, weights, work, tau)
 
 
 @kernel
-def _spread(mu: np.ndarray, layout: np.ndarray, work: np.ndarray) -> None:
+def spread(mu: np.ndarray, layout: np.ndarray, work: np.ndarray) -> None:
     """The velocities u and o of every body at the joint velocity μ."""
     for i in range(layout[0]):
         at, slide = layout[1 + 2 * i] * ROW, float(layout[2 + 2 * i])
@@ -131,9 +131,9 @@ def tree_torque_adjoint(
     a_bar: np.ndarray,
 ) -> None:
     """Add the derivatives of μᵀτ, τ of `tree_torque`, with respect to q, v, w and a to the arrays named last."""
-    _place(q, layout, weights, work)
-    _sweep(v, w, a, layout, weights, work)
-    _spread(mu, layout, work)
+    place(q, layout, weights, work)
+    sweep(v, w, a, layout, weights, work)
+    spread(mu, layout, work)
     for i in range(layout[0] - 1, -1, -1):
         at, slide = layout[1 + 2 * i] * ROW, layout[2 + 2 * i]
         body = weights[BASE + BODY * i : BASE + BODY * (i + 1)]
@@ -224,10 +224,10 @@ def tree_acceleration(
     a: np.ndarray,
 ) -> None:
     """M(q)⁻¹(τ − C(q, v) v − G(q)) → a, and the Cholesky factor L of M = LLᵀ, zero above, → factor (n, n)."""
-    _place(q, layout, weights, work)
+    place(q, layout, weights, work)
     a[:] = 0.0
-    _sweep(v, v, a, layout, weights, work)
-    _gather(a, layout, weights, work, a)
+    sweep(v, v, a, layout, weights, work)
+    gather(a, layout, weights, work, a)
     for i in range(layout[0]):
         a[i] = tau[i] - a[i]
     _mass(layout, weights, work, factor)

@@ -1,0 +1,208 @@
+"""The chain network from data: geometry by many descents from random trees, then the bodies by convex least squares.
+
+1. From a random tree, Levenberg–Marquardt over placements, bodies and friction on a few hundred samples, bodies being
+   any symmetric matrices, in which torque is linear. Of all descents the lowest counts.
+2. The same once more on all samples, each joint weighted by the residual it was left with.
+3. For that geometry, the bodies that can exist and explain the data best, as for an arm whose geometry is known
+   (`identification.explain`).
+"""
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from threadpoolctl import threadpool_limits
+
+from nbs_pin.checks import positive
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.learning.datasets import Dataset
+from nbs_pin.learning.identification import Bodies, IdentificationReport, explain
+from nbs_pin.learning.levenberg_marquardt import Descent, levenberg_marquardt
+from nbs_pin.learning.physical_tree import PhysicalTree
+from nbs_pin.learning.regressor import Scalars
+from nbs_pin.learning.tree_guess import Measured, TreeGuess
+from nbs_pin.networks.chain import Chain, random_tree
+from nbs_pin.progress import tracked
+
+_FEW = 400
+"""Samples that the search looks at."""
+_EXACT = 1e-16
+"""Weighted residual below which a descent has found the arm."""
+_WAVE = 8
+"""Descents between two looks at the results."""
+_SAME, _FAR = 0.02, 0.1
+"""Descents whose costs differ by less than this share met in one minimum; one this far below the usual is no chance."""
+_LEAST = 1e-9
+"""Least residual that a joint is credited with, as a share of its torque."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChainFit:
+    """A chain network, and how it was found."""
+
+    network: Chain
+    friction: JointFriction | None
+    """Viscous and Coulomb friction, if they were to be learned."""
+    history: Float[np.ndarray, " steps"]
+    """Torque nMSE after every step of the descent that won."""
+    evaluations: int
+    """Steps of all descents."""
+    costs: Float[np.ndarray, " starts"]
+    """Torque nMSE where each descent of the search ended."""
+    bodies: IdentificationReport
+    """How the bodies were found, and what the data do not excite."""
+    seconds: float
+    """What it took [s]."""
+
+
+def fit_chain(
+    data: Dataset,
+    seed: int = 0,
+    *,
+    friction: bool = False,
+    transition: float = 0.01,
+    regularisation: float = 0.3,
+    starts: int = 64,
+    epsilon: float = 1e-12,
+    names: Sequence[str] | None = None,
+    progress: bool = False,
+) -> ChainFit:
+    """The rigid tree that moves as the data do; of the arm only the order and the kinds of its joints are given.
+
+    friction: also find viscous and Coulomb coefficients ≥ 0, for the speed `transition` [rad/s] at which they turn.
+    regularisation: see `identify`. starts: most random trees to descend from; a search ends as soon as one explains the
+    data to rounding, or the best minimum has been met often enough. epsilon: ε of the network [kg·m²]. names: what to
+    call the joints. progress: show a bar at a terminal.
+    Raises ArgumentError for data without torque, which arms of every scale explain, and as `identify` does.
+    """
+    began = time.perf_counter()
+    positive("transition", transition, "rad/s")
+    positive("regularisation", regularisation, "measurements")
+    if starts < 1:
+        raise ArgumentError(f"starts is {starts}, expected 1 or more random trees to descend from; 64 is usual.")
+    if not data.tau.any():
+        raise ArgumentError(f"{data!r} has no torque: arms of every scale move so; record one with motors on.")
+    scalars = Scalars(friction, rotor_inertia=False, transition=transition)
+    measured = _measured(data, scalars)
+    rng = np.random.default_rng(seed)
+    with threadpool_limits(1, "blas"):  # threads below the threads of the search would only wait for each other
+        descents = _search(measured, _layout(data.parents, data.prismatic), starts, rng, progress)
+        best = min(descents, key=_cost)
+        polished = _polished(best.at, measured)
+        called = [f"joint {i}" for i in range(data.nv)] if names is None else names
+        bodies = explain(TreeGeometry(polished.at, data.parents, called), data, scalars, regularisation)
+        physical = _physical(polished.at, bodies, measured, regularisation)
+    network = Chain(data.parents.tolist(), data.prismatic.tolist(), epsilon)
+    with torch.no_grad():
+        for name, value in physical.guess.tree(np.linalg.cholesky(physical.whole().bodies))._asdict().items():
+            getattr(network, name).copy_(torch.from_numpy(value))
+    return ChainFit(
+        network=network,
+        friction=JointFriction(physical.drag[0], physical.drag[1], transition) if friction else None,
+        history=np.array(best.history),
+        evaluations=sum(len(descent.history) for descent in descents),
+        costs=np.array([_cost(descent) for descent in descents]),
+        bodies=bodies.report,
+        seconds=time.perf_counter() - began,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TreeGeometry:
+    """The placements of a guess, as `identification` asks for them."""
+
+    guess: TreeGuess
+    parents: Int[np.ndarray, " n"]
+    names: Sequence[str]
+
+    @property
+    def places(self) -> tuple[list[int], Float[np.ndarray, "n 3"]]:
+        """Parents and positions [m]."""
+        return self.parents.tolist(), self.guess.positions
+
+    def regressor(
+        self, q: Float[np.ndarray, "rows n"], v: Float[np.ndarray, "rows n"], a: Float[np.ndarray, "rows n"]
+    ) -> Float[np.ndarray, "rows n unknowns"]:
+        """Derivatives of the torque with respect to the bodies."""
+        return self.guess.regressor(q, v, a)
+
+
+def _measured(data: Dataset, scalars: Scalars) -> Measured:
+    """The data with every joint weighted by the spread of its torque, or of the largest where it hardly has one."""
+    spread = data.tau.std(axis=0)
+    scale = np.maximum(spread, 1e-3 * spread.max())
+    kinds = scalars.factors(data.v, data.a)
+    q, v, a, tau = (np.ascontiguousarray(x) for x in (data.q, data.v, data.a, data.tau))
+    return Measured(q, v, a, tau, scale, kinds)
+
+
+def _layout(parents: Int[np.ndarray, " n"], prismatic: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " layout"]:
+    """The tree layout of the kernels."""
+    return np.concatenate([[len(parents)], np.column_stack([parents, prismatic]).ravel()]).astype(np.int64)
+
+
+def _cost(descent: Descent[TreeGuess]) -> float:
+    return descent.cost if np.isfinite(descent.cost) else np.inf
+
+
+def _search(
+    data: Measured, layout: np.ndarray, starts: int, rng: np.random.Generator, progress: bool
+) -> list[Descent[TreeGuess]]:
+    """Descents from random trees on a few samples, until one is good enough or the best has been met often enough."""
+    few = data.some(np.sort(rng.permutation(len(data.q))[:_FEW]))
+    descents: list[Descent[TreeGuess]] = []
+
+    def descend(child: np.random.Generator) -> Descent[TreeGuess]:
+        start = TreeGuess.of(random_tree(len(layout) // 2, child), layout, len(data.kinds))
+        return levenberg_marquardt(
+            start, lambda x: x.normal(few), lambda x: x.cost(few), TreeGuess.moved, iterations=150, patience=12
+        )
+
+    def label() -> str:
+        return f"searching, nMSE {min((_cost(x) for x in descents), default=np.inf):.1e}"
+
+    with ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS) as pool:  # type: ignore[attr-defined]
+        for _ in tracked(range(-(-starts // _WAVE)), label, progress):
+            descents.extend(pool.map(descend, rng.spawn(min(_WAVE, starts - len(descents)))))
+            if _settled(np.array([_cost(x) for x in descents])):
+                break
+    return descents
+
+
+def _settled(costs: np.ndarray) -> bool:
+    """Whether more descents are worth their time.
+
+    Enough is one that explains the data to rounding; or the best minimum met twice where it lies far below the usual
+    one; or, after two waves, met by a quarter of all.
+    """
+    best = costs.min()
+    met = int((costs <= (1.0 + _SAME) * best).sum())
+    return bool(
+        best < _EXACT
+        or (met >= 2 and best < _FAR * np.median(costs))
+        or (len(costs) >= 2 * _WAVE and met >= 0.25 * len(costs))
+    )
+
+
+def _polished(guess: TreeGuess, data: Measured) -> Descent[TreeGuess]:
+    """The descent on all samples, then again with every joint weighted by what it was left with."""
+    even = levenberg_marquardt(guess, lambda x: x.normal(data), lambda x: x.cost(data), TreeGuess.moved)
+    left = np.sqrt(np.mean(np.square(even.at.residual(data)), axis=0))
+    fair = replace(data, scale=np.maximum(left, _LEAST * data.scale))
+    return levenberg_marquardt(even.at, lambda x: x.normal(fair), lambda x: x.cost(fair), TreeGuess.moved)
+
+
+def _physical(guess: TreeGuess, bodies: Bodies, data: Measured, strength: float) -> PhysicalTree:
+    """The descent over placements and physical bodies together."""
+    fair = replace(data, scale=bodies.report.noise)
+    start = PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.expected, strength)
+    descent = levenberg_marquardt(
+        start, lambda x: x.normal(fair), lambda x: x.cost(fair), PhysicalTree.moved, iterations=300, stall=1e-4
+    )
+    return descent.at

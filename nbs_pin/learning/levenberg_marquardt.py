@@ -1,0 +1,72 @@
+"""Least squares by Levenberg–Marquardt, on parameters that move by steps rather than add up."""
+
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+T = TypeVar("T")
+_FLOOR = 0.1
+_WEAKEST, _STRONGEST = 1e-14, 1e8
+
+
+class Normal(NamedTuple):
+    """A mean of squared residuals f at one point, and its normal equations: f(δ) ≈ f − 2 gᵀδ + δᵀHδ."""
+
+    cost: float
+    gradient: Float[np.ndarray, " parameters"]
+    hessian: Float[np.ndarray, "parameters parameters"]
+
+
+class Descent(NamedTuple, Generic[T]):
+    """Where a descent ended."""
+
+    at: T
+    cost: float
+    history: list[float]
+    """Cost at the start and after every step."""
+
+
+def levenberg_marquardt(
+    start: T,
+    normal: Callable[[T], Normal],
+    cost: Callable[[T], float],
+    moved: Callable[[T, np.ndarray], T],
+    *,
+    iterations: int = 100,
+    tolerance: float = 1e-28,
+    patience: int = 10,
+    stall: float = 0.01,
+    floor: float = 0.1,
+    progress: Callable[[float], None] = lambda cost: None,
+) -> Descent[T]:
+    """Descend from `start`, where a point x may be anything that `moved(x, δ)` takes a step on.
+
+    (H + λD) δ = g with D = diag H + 0.1 max(diag H): Marquardt's scaling, kept from zero so that a direction that the
+    data hardly see does not move. Pure scaling lets such directions run to where two of them are invisible together,
+    and convergence stops there. λ follows the ratio of actual to predicted gain (Nielsen 1999).
+
+    Ends at a cost of `tolerance`, after `iterations` steps, when `patience` steps gained less than the share `stall`,
+    or when no step gains anything.
+    """
+    x, at, damping, growth = start, normal(start), 1e-2, 2.0
+    history = [at.cost]
+    while at.cost > tolerance and len(history) <= iterations:
+        scale = np.diag(at.hessian) + floor * np.diag(at.hessian).max()
+        step = np.linalg.solve(at.hessian + damping * np.diag(scale), at.gradient)
+        there = moved(x, step)
+        gain = at.cost - cost(there)
+        predicted = step @ (2.0 * at.gradient - at.hessian @ step)
+        if not gain > 0.0 < predicted:  # not a number counts as no gain
+            damping, growth = damping * growth, 2.0 * growth
+            if damping > _STRONGEST:
+                break
+            continue
+        damping = max(damping * max(0.2, 1.0 - (2.0 * gain / predicted - 1.0) ** 3), _WEAKEST)
+        x, at, growth = there, normal(there), 2.0
+        history.append(at.cost)
+        progress(at.cost)
+        if len(history) > patience and history[-1] > (1.0 - stall) * history[-1 - patience]:
+            break
+    return Descent(x, at.cost, history)
