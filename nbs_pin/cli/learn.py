@@ -29,15 +29,16 @@ class Learn:
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """Data of nbs-pin collect, or a log: CSV or NPZ with t, q, tau and, if there are any, v and a."""
     model: Literal["chain", "cholesky", "homogenised", "picnn", "unconstrained", "residual", "identified"] = "chain"
-    """A rigid tree found from the order of the joints alone; M = LLᵀ + εI by a network; a convex network made quadratic; the paper's convex network; a Lagrangian without
-    structure; a network that corrects the arm's URDF; or inertias by least squares in the geometry of the URDF."""
+    """A rigid tree found from the order of the joints alone; M = LLᵀ + εI by a network; a convex network made
+    quadratic; the paper's convex network; a Lagrangian without structure; a network that corrects the arm's URDF; or
+    inertias by least squares in the geometry of the URDF."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the one that the data name")] = None
     """The arm by name or a path to a .urdf or .xacro file; a log names none."""
     friction: bool = False
     """Learn viscous and Coulomb friction of every joint too."""
     held_out: Annotated[float, number("--held-out", least=0.0, most=0.9, unit="")] = 0.2
     """Share of the trajectories that are not learned from, and choose the iteration of a network."""
-    loss: Annotated[Literal["torque", "acceleration"] | None, default("torque")] = None
+    loss: Literal["torque", "acceleration"] = "torque"
     """What a network is to explain."""
     optimiser: Annotated[Literal["lm", "adam", "lbfgs"] | None, default("lm, lbfgs for more than 3500 parameters")] = (
         None
@@ -66,7 +67,8 @@ class Learn:
         sha = None if robot is None else robot.sha256
         facts = {"settings": self._settings(), "versions": versions(), "robot_sha256": sha}
         check_folder(folder, learning.FILES, facts | {"interrupted": False}, self.force, whose="another model")
-        given = {name: getattr(self, name) for name in ("loss", "optimiser", "iterations")}
+        given = {name: getattr(self, name) for name in ("optimiser", "iterations")}
+        given["loss"] = None if self.loss == "torque" else self.loss  # which every model minimises
         with made(folder):
             result = learning.learn(
                 data,
