@@ -1,6 +1,7 @@
 """Least squares by Levenberg–Marquardt, on parameters that move by steps rather than add up."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -19,7 +20,8 @@ class Normal(NamedTuple):
     hessian: Float[np.ndarray, "parameters parameters"]
 
 
-class Descent(NamedTuple, Generic[T]):
+@dataclass(frozen=True, eq=False)
+class Descent(Generic[T]):
     """Where a descent ended."""
 
     at: T
