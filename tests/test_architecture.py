@@ -20,21 +20,29 @@ FLOORS = [
     {"urdf_source", "urdf_checks", "urdf", "catalogue", "robot", "networks"},
     {"dynamics", "references", "reference_files", "disturbances", "metrics", "meshes", "visuals"},
     {"controllers", "plants"},
-    {"loop", "checkpoints"},
+    {"loop", "checkpoints", "relative_errors", "error_maps", "free_motion", "mismatch", "model_error"},
     {"simulation"},
     {"learning"},
-    {"plotting", "charts", "replay_page"},
+    {"plotting", "charts", "error_charts", "replay_page"},
     {"studies"},
     {"cli"},
 ]
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
 HOMES = {
     "mujoco": {"plants.mujoco_plant"},
-    "matplotlib": {"plotting", "charts"},
+    "matplotlib": {"plotting", "charts", "error_charts"},
     "meshcat": {"replay_page"},
     "yourdfpy": {"visuals"},
     "trimesh": {"meshes", "visuals", "replay_page"},
-    "scipy": {"reference_files", "visuals"},
+    "scipy": {
+        "reference_files",
+        "visuals",
+        "mismatch",
+        "learning.measuring",
+        "learning.tree_guess",
+        "learning.physical_tree",
+    },
+    "threadpoolctl": {"learning.chain_fit"},
     "xacrodoc": {"urdf_source"},
     "numba": {"studies.bench", "runtime.jit", "runtime.laws", "runtime.tree_laws", "runtime.threads"},
 }

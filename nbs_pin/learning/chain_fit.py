@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -29,6 +28,7 @@ from nbs_pin.learning.regressor import Scalars
 from nbs_pin.learning.tree_guess import Measured, TreeGuess
 from nbs_pin.networks.chain import Chain, random_tree
 from nbs_pin.progress import tracked
+from nbs_pin.runtime.threads import cores
 
 _FEW = 400
 """Samples that the search looks at."""
@@ -167,7 +167,7 @@ def _search(
     def label() -> str:
         return f"searching, nMSE {min((_cost(x) for x in descents), default=np.inf):.1e}"
 
-    with ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS) as pool:  # type: ignore[attr-defined]
+    with ThreadPoolExecutor(cores()) as pool:
         for _ in tracked(range(-(-starts // _WAVE)), label, progress):
             descents.extend(pool.map(descend, rng.spawn(min(_WAVE, starts - len(descents)))))
             if _settled(np.array([_cost(x) for x in descents])):

@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
@@ -14,6 +13,7 @@ from nbs_pin.dynamics.pseudo_inertia import BASIS, symmetric
 from nbs_pin.learning.levenberg_marquardt import Normal
 from nbs_pin.networks.chain import Tree
 from nbs_pin.runtime.layout import Packed
+from nbs_pin.runtime.threads import cores
 from nbs_pin.runtime.tree_layout import tree_workspace
 from nbs_pin.runtime.tree_parameters import COLUMNS, INERTIA, ROTOR, tree_derivatives
 from nbs_pin.runtime.tree_rows import tree_torques
@@ -175,5 +175,5 @@ def _by_chunks(function: Callable[[slice], R], rows: int) -> list[R]:
     slices = [slice(k, min(k + _CHUNK, rows)) for k in range(0, rows, _CHUNK)]
     if len(slices) == 1:
         return [function(slices[0])]
-    with ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS) as pool:  # type: ignore[attr-defined]
+    with ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(function, slices))

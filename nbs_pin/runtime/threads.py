@@ -11,12 +11,14 @@ FEWEST_ROWS = 64
 """Fewer rows than this are not worth a thread."""
 
 
+def cores() -> int:
+    """How many threads are worth starting; the environment variable NUMBA_NUM_THREADS says otherwise."""
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+
+
 def over_cores(function: Callable[[slice], None], rows: int, fewest: int = FEWEST_ROWS) -> None:
-    """`function` of slices of at least `fewest` rows, which make up all, at once; at most NUMBA_NUM_THREADS of them."""
-    parts = min(
-        numba.config.NUMBA_NUM_THREADS,  # type: ignore[attr-defined]  # read from the environment
-        rows // fewest,
-    )
+    """`function` of slices of at least `fewest` rows, which make up all, at once; at most one for each of the `cores`."""
+    parts = min(cores(), rows // fewest)
     if parts < 2:
         function(slice(0, rows))
         return
