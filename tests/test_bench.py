@@ -30,7 +30,9 @@ def test_rows_carry_their_percentiles_in_order(monkeypatch):
         figures = row.figures
         assert 0.0 < figures["p50_us"] <= figures["p99_us"] <= figures["p99.9_us"] <= figures["max_us"]
         assert figures["over_two_rnea"] == pytest.approx(figures["p50_us"] / figures["two_rnea_us"])
-    assert {row.what for row in rows} == {"control step", "plant step", "simulate", "joints", "training epoch"}
+    kinds = {"control step", "plant step", "simulate", "model torque", "joints", "training epoch"}
+    assert {row.what for row in rows} == kinds
+    assert {row.how for row in rows if row.what == "model torque"} == {"pinocchio", "chain", "cholesky"}
     assert len({row.key for row in rows}) == len(rows)
     json.dumps(bench.summary(rows), allow_nan=False)
 

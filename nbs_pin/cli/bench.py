@@ -24,6 +24,7 @@ _COLUMNS = {
     },
     "plant step": {"p50\n[µs]": "p50_us"},
     "simulate": {"steps\nper s": "steps_per_s", "recorded\n[MB]": "recorded_MB"},
+    "model torque": {"p50\n[µs]": "p50_us", "÷ pinocchio": "over_pinocchio"},
     "joints": {"joints": "joints", "p50\n[µs]": "p50_us", "÷ two\nRNEA": "over_two_rnea"},
     "training epoch": {"p50\n[ms]": "p50_ms", "torch\n÷ it": "torch_over_kernels"},
     "endurance": {
@@ -92,7 +93,7 @@ def _read(path: Path) -> Any:
 
 def _table(what: str, columns: dict[str, str], rows: list[Any]) -> Table:
     table = Table(title=Text(what), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    for heading in ("arm", "law or plant"):
+    for heading in ("arm", "what"):
         table.add_column(heading, no_wrap=True)
     for heading in columns:
         table.add_column(Text(heading), justify="right", no_wrap=True)

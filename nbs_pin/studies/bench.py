@@ -17,8 +17,12 @@ import torch
 from nbs_pin import metrics
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.disturbances import SquareWave, TorqueNoise
+from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError
+from nbs_pin.learning.datasets import joint_tree
+from nbs_pin.networks.chain import Chain
+from nbs_pin.networks.cholesky import CholeskyNetwork
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.plants.mujoco_plant import MujocoPlant
 from nbs_pin.references import Sinusoid
@@ -31,6 +35,8 @@ from nbs_pin.studies.tracking import ControllerName, build_controller
 from nbs_pin.versions import versions
 
 LAWS: tuple[ControllerName, ...] = ("nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid")
+MODELS = ("three_link", "panda")
+"""Arms whose models are timed, learned ones beside Pinocchio."""
 CHAINS = (1, 2, 3, 5, 7, 10, 15, 20, 25, 30)
 PERIOD = 0.001
 _CPU_INFO = Path("/proc/cpuinfo")
@@ -58,7 +64,7 @@ def bench(
     chains: tuple[int, ...] = CHAINS,
     long: bool = False,
 ) -> Iterator[Row]:
-    """Rows as they are measured: control steps, plant steps, simulation, cost against joints, and training epochs.
+    """Rows as they are measured: laws, plants, simulation, models, cost against joints, and training epochs.
 
     calls: how often a control step is timed. A step is timed alone, with the garbage collector off, on one core.
     chains: numbers of joints of the generated arms. long: also an hour of motion and a thousand starts, a few minutes.
@@ -72,6 +78,8 @@ def bench(
             yield control_row(robot, law, calls, against_torch=law == "nbs")
         yield from plant_rows(robot)
         yield simulation_row(robot)
+    for arm in MODELS:
+        yield from model_rows(load_robot(arm))
     for joints in chains:
         yield control_row(serial_chain(joints), "nbs", max(1000, calls // 4), what="joints")
     for (arm, size), figures in training_epochs().items():
@@ -132,6 +140,23 @@ def plant_rows(robot: Robot) -> Iterator[Row]:
     for name, plant in plants.items():
         times = _times(lambda *_, plant=plant: plant.step(q, 0.1 * v, 0.0 * v, PERIOD), [()], 2000)
         yield Row("plant step", robot.name, name, {"p50_us": float(np.median(times))})
+
+
+def model_rows(robot: Robot, calls: int = 5000) -> Iterator[Row]:
+    """The cost of M a_r + C(q, v) v_r + G at one state [µs] for each kind of model; weights do not matter to it."""
+    parents, prismatic = joint_tree(robot)
+    exact = PinocchioDynamics(robot)
+    models = {
+        "pinocchio": exact,
+        "chain": LagrangianDynamics(Chain(parents, prismatic)),
+        "cholesky": LagrangianDynamics(CholeskyNetwork(prismatic.tolist())),
+    }
+    states = [(q, v, v_ref, a_ref) for q, v, _, v_ref, a_ref in _states(robot)]
+    own = np.median(_times(exact.reference_torque, states, calls))
+    for name, model in models.items():
+        times = _times(model.reference_torque, states, calls)
+        figures = {"p50_us": float(np.median(times)), "over_pinocchio": float(np.median(times) / own)}
+        yield Row("model torque", robot.name, name, figures)
 
 
 def simulation_row(robot: Robot, duration: float = 5.0) -> Row:
