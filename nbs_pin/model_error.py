@@ -134,7 +134,7 @@ def compare(
         eigenvalue_margin=margin,
         mass_ratio=ratio,
         energy_drift=np.nan if motion is None else motion.worst,
-        scale=_scale(judged.true, judged.modelled),
+        scale=best_scale(judged.true, judged.modelled),
         by_speed=by_speed,
         by_distance=by_distance,
         each=judged.each,
@@ -164,7 +164,8 @@ def _eigenvalues(modelled: np.ndarray, true: np.ndarray) -> tuple[float, tuple[f
     return float(np.linalg.eigvalsh(modelled).min()), (float(ratios.min()), float(ratios.max()))
 
 
-def _scale(true: np.ndarray, modelled: np.ndarray) -> Scale:
+def best_scale(true: Float[np.ndarray, "samples n"], modelled: Float[np.ndarray, "samples n"]) -> Scale:
+    """The one factor that brings the modelled torques nearest to the true ones [N·m]."""
     factor = float(share(np.vdot(true, modelled), np.vdot(modelled, modelled)))
     return Scale(factor, float(share(np.linalg.norm(true - factor * modelled), np.linalg.norm(true))))
 

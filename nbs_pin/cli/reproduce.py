@@ -25,8 +25,9 @@ class Reproduce:
     Example: nbs-pin reproduce --out out/reproduce
     """
 
-    part: Literal["paper", "fair", "all"] = "paper"
-    """paper: its Table I, its figures and its sweep over α. fair: every law tuned alike and judged on fresh starts."""
+    part: Literal["paper", "fair", "lnn", "all"] = "paper"
+    """paper: its Table I, its figures and its sweep over α. fair: every law tuned alike and judged on fresh starts.
+    lnn: its Figure 5, control on learned models, and what data without torque leave open."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
     """First of the ten seeds of the networks."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/reproduce")
@@ -39,11 +40,16 @@ class Reproduce:
         with notes.status("loading"):
             from nbs_pin.files import write_whole
             from nbs_pin.studies.fair import fair_part
+            from nbs_pin.studies.learned_loop import reproduce_learned
             from nbs_pin.studies.pages import page
             from nbs_pin.studies.paper import reproduce_paper
             from nbs_pin.versions import versions
 
-            parts: dict[str, Callable[[Path, int, bool], Sequence[Any]]] = {"paper": reproduce_paper, "fair": fair_part}
+            parts: dict[str, Callable[[Path, int, bool], Sequence[Any]]] = {
+                "paper": reproduce_paper,
+                "fair": fair_part,
+                "lnn": reproduce_learned,
+            }
         facts: dict[str, Any] = {"settings": self._settings(), "versions": versions()}
         check_folder(self.out, FILES, facts, self.force)
         chosen = list(parts) if self.part == "all" else [self.part]
