@@ -34,10 +34,14 @@ _FEW = 400
 """Samples that the search looks at."""
 _EXACT = 1e-16
 """Weighted residual below which a descent has found the arm."""
+_USUAL = 8
+"""Random trees that show which torques are usual."""
 _WAVE = 8
 """Descents between two looks at the results."""
 _SAME, _FAR = 0.02, 0.1
 """Descents whose costs differ by less than this share met in one minimum; one this far below the usual is no chance."""
+_UNLIKELY, _LIKELY = 9.0, 3.0
+"""Squared residuals, in units of the noise, that right angles may cost: once, and for each."""
 _LEAST = 1e-9
 """Least residual that a joint is credited with, as a share of its torque."""
 
@@ -71,14 +75,16 @@ def fit_chain(
     starts: int = 64,
     epsilon: float = 1e-12,
     names: Sequence[str] | None = None,
+    right_angles: bool = True,
     progress: bool = False,
 ) -> ChainFit:
     """The rigid tree that moves as the data do; of the arm only the order and the kinds of its joints are given.
 
     friction: also find viscous and Coulomb coefficients ≥ 0, for the speed `transition` [rad/s] at which they turn.
     regularisation: see `identify`. starts: most random trees to descend from; a search ends as soon as one explains the
-    data to rounding, or the best minimum has been met often enough. epsilon: ε of the network [kg·m²]. names: what to
-    call the joints. progress: show a bar at a terminal.
+    data to rounding, or the best minimum has been met often enough. epsilon: ε of the network [kg·m²]. right_angles:
+    axes of neighbouring joints that the data do not tell from parallel or perpendicular become so, as most arms are
+    built, which spares part of what unknown geometry costs under noise. names: what to call the joints. progress: show a bar at a terminal.
     Raises ArgumentError for data without torque, which arms of every scale explain, and as `identify` does.
     """
     began = time.perf_counter()
@@ -89,15 +95,15 @@ def fit_chain(
     if not data.tau.any():
         raise ArgumentError(f"{data!r} has no torque: arms of every scale move so; record one with motors on.")
     scalars = Scalars(friction, rotor_inertia=False, transition=transition)
-    measured = _measured(data, scalars)
-    rng = np.random.default_rng(seed)
+    measured, layout = _measured(data, scalars), _layout(data.parents, data.prismatic)
+    handy, rng = _in_handy_units(measured, layout), np.random.default_rng(seed)
     with threadpool_limits(1, "blas"):  # threads below the threads of the search would only wait for each other
-        descents = _search(measured, _layout(data.parents, data.prismatic), starts, rng, progress)
+        descents = _search(handy, layout, starts, rng, progress)
         best = min(descents, key=_cost)
-        polished = _polished(best.at, measured)
+        polished = _polished(best.at, handy)
         called = [f"joint {i}" for i in range(data.nv)] if names is None else names
         bodies = explain(TreeGeometry(polished.at, data.parents, called), data, scalars, regularisation)
-        physical = _physical(polished.at, bodies, measured, regularisation)
+        physical = _physical(polished.at, bodies, measured, regularisation, right_angles)
     network = Chain(data.parents.tolist(), data.prismatic.tolist(), epsilon)
     with torch.no_grad():
         for name, value in physical.guess.tree(np.linalg.cholesky(physical.whole().bodies))._asdict().items():
@@ -134,12 +140,28 @@ class TreeGeometry:
 
 
 def _measured(data: Dataset, scalars: Scalars) -> Measured:
-    """The data with every joint weighted by the spread of its torque, or of the largest where it hardly has one."""
+    """The data with every joint weighted by the spread of its torque, or of the largest where it hardly has one.
+
+    Torques that never change have none: rounding is then all that is weighed.
+    """
     spread = data.tau.std(axis=0)
-    scale = np.maximum(spread, 1e-3 * spread.max())
+    scale = np.maximum(spread, max(1e-3 * spread.max(), _LEAST * np.abs(data.tau).max()))
     kinds = scalars.factors(data.v, data.a)
     q, v, a, tau = (np.ascontiguousarray(x) for x in (data.q, data.v, data.a, data.tau))
     return Measured(q, v, a, tau, scale, kinds)
+
+
+def _in_handy_units(data: Measured, layout: np.ndarray) -> Measured:
+    """The torques in the unit in which random trees of 1 kg make such torques.
+
+    Descents scale placements and bodies alike, so both should be about one. The bodies that are found in this unit are
+    not looked at: only their geometry is.
+    """
+    rng, still = np.random.default_rng(0), replace(data, tau=np.zeros_like(data.tau))
+    trees = [TreeGuess.of(random_tree(len(layout) // 2, rng), layout, len(data.kinds)) for _ in range(_USUAL)]
+    usual = np.mean([np.square(tree.residual(still)).mean() for tree in trees])
+    unit = np.sqrt(np.square(data.tau).mean() / usual)
+    return replace(data, tau=data.tau / unit, scale=data.scale / unit)
 
 
 def _layout(parents: Int[np.ndarray, " n"], prismatic: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " layout"]:
@@ -198,11 +220,18 @@ def _polished(guess: TreeGuess, data: Measured) -> Descent[TreeGuess]:
     return levenberg_marquardt(even.at, lambda x: x.normal(fair), lambda x: x.cost(fair), TreeGuess.moved)
 
 
-def _physical(guess: TreeGuess, bodies: Bodies, data: Measured, strength: float) -> PhysicalTree:
-    """The descent over placements and physical bodies together."""
+def _physical(guess: TreeGuess, bodies: Bodies, data: Measured, strength: float, right_angles: bool) -> PhysicalTree:
+    """The descent over placements and physical bodies together, then again with the angles that it leaves likely."""
     fair = replace(data, scale=bodies.report.noise)
-    start = PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.expected, strength)
-    descent = levenberg_marquardt(
-        start, lambda x: x.normal(fair), lambda x: x.cost(fair), PhysicalTree.moved, iterations=300, stall=1e-4
-    )
-    return descent.at
+
+    def descend(start: PhysicalTree) -> Descent[PhysicalTree]:
+        return levenberg_marquardt(
+            start, lambda x: x.normal(fair), lambda x: x.cost(fair), PhysicalTree.moved, iterations=300, stall=1e-4
+        )
+
+    free = descend(PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.expected, strength))
+    if not right_angles:
+        return free.at
+    held = descend(free.at.at_right_angles(fair))
+    worse = (held.cost - free.cost) * data.q.size
+    return held.at if worse < _UNLIKELY + _LIKELY * np.count_nonzero(held.at.angles) else free.at

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 T = TypeVar("T")
-_FLOOR = 0.1
 _WEAKEST, _STRONGEST = 1e-14, 1e8
 
 
@@ -45,8 +44,8 @@ def levenberg_marquardt(
 ) -> Descent[T]:
     """Descend from `start`, where a point x may be anything that `moved(x, δ)` takes a step on.
 
-    (H + λD) δ = g with D = diag H + 0.1 max(diag H): Marquardt's scaling, kept from zero so that a direction that the
-    data hardly see does not move. Pure scaling lets such directions run to where two of them are invisible together,
+    (H + λD) δ = g with D = diag H + `floor` · max(diag H): Marquardt's scaling, kept from zero so that a direction that
+    the data hardly see does not move. Pure scaling lets such directions run to where two of them are invisible together,
     and convergence stops there. λ follows the ratio of actual to predicted gain (Nielsen 1999).
 
     Ends at a cost of `tolerance`, after `iterations` steps, when `patience` steps gained less than the share `stall`,
@@ -54,7 +53,7 @@ def levenberg_marquardt(
     """
     x, at, damping, growth = start, normal(start), 1e-2, 2.0
     history = [at.cost]
-    while at.cost > tolerance and len(history) <= iterations:
+    while at.cost > tolerance and len(history) <= iterations and at.gradient.any():
         scale = np.diag(at.hessian) + floor * np.diag(at.hessian).max()
         step = np.linalg.solve(at.hessian + damping * np.diag(scale), at.gradient)
         there = moved(x, step)
