@@ -84,7 +84,8 @@ def fit_chain(
     regularisation: see `identify`. starts: most random trees to descend from; a search ends as soon as one explains the
     data to rounding, or the best minimum has been met often enough. epsilon: ε of the network [kg·m²]. right_angles:
     axes of neighbouring joints that the data do not tell from parallel or perpendicular become so, as most arms are
-    built, which spares part of what unknown geometry costs under noise. names: what to call the joints. progress: show a bar at a terminal.
+    built, which spares part of what unknown geometry costs under noise. names: what to call the joints.
+    progress: show a bar at a terminal.
     Raises ArgumentError for data without torque, which arms of every scale explain, and as `identify` does.
     """
     began = time.perf_counter()
@@ -140,12 +141,9 @@ class TreeGeometry:
 
 
 def _measured(data: Dataset, scalars: Scalars) -> Measured:
-    """The data with every joint weighted by the spread of its torque, or of the largest where it hardly has one.
-
-    Torques that never change have none: rounding is then all that is weighed.
-    """
-    spread = data.tau.std(axis=0)
-    scale = np.maximum(spread, max(1e-3 * spread.max(), _LEAST * np.abs(data.tau).max()))
+    """The data with every joint weighted by the spread of its torque, at least a thousandth of the largest."""
+    least = 1e-3 * np.sqrt(np.square(data.tau).mean(axis=0).max())
+    scale = np.maximum(data.tau.std(axis=0), least)
     kinds = scalars.factors(data.v, data.a)
     q, v, a, tau = (np.ascontiguousarray(x) for x in (data.q, data.v, data.a, data.tau))
     return Measured(q, v, a, tau, scale, kinds)

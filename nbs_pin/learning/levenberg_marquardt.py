@@ -45,8 +45,8 @@ def levenberg_marquardt(
     """Descend from `start`, where a point x may be anything that `moved(x, δ)` takes a step on.
 
     (H + λD) δ = g with D = diag H + `floor` · max(diag H): Marquardt's scaling, kept from zero so that a direction that
-    the data hardly see does not move. Pure scaling lets such directions run to where two of them are invisible together,
-    and convergence stops there. λ follows the ratio of actual to predicted gain (Nielsen 1999).
+    the data hardly see does not move. Pure scaling lets such directions run to where two of them are invisible
+    together, and convergence stops there. λ follows the ratio of actual to predicted gain (Nielsen 1999).
 
     Ends at a cost of `tolerance`, after `iterations` steps, when `patience` steps gained less than the share `stall`,
     or when no step gains anything.
