@@ -15,11 +15,12 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.exceptions import ArgumentError
+from nbs_pin.networks.chain import Chain
 from nbs_pin.networks.families import make_network
 from nbs_pin.robot import load_robot
 
 GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # prismatic, revolute and continuous
-LEARNED = ["cholesky", "homogenised", "residual"]
+LEARNED = ["chain", "cholesky", "homogenised", "residual"]
 PROVIDERS = [*ROBOT_NAMES, GANTRY, "analytic", "analytic_uneven", *LEARNED]
 ROWS = 8
 
@@ -43,6 +44,8 @@ def learned(name: str) -> LagrangianDynamics:
     """A network far from its start, on joints that turn and slide."""
     if name == "residual":
         network = ResidualNetwork(PinocchioDynamics(load_robot(GANTRY)), seed=1)
+    elif name == "chain":
+        network = Chain((0, 1, 1), (False, True, False), seed=1)
     else:
         network = make_network(name, (False, True, False), 1, inertia=(2.0, 0.3, 5.0), energy=7.0, epsilon=0.1)
     generator = torch.Generator().manual_seed(2)

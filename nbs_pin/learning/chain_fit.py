@@ -42,6 +42,9 @@ _SAME, _FAR = 0.02, 0.1
 """Descents whose costs differ by less than this share met in one minimum; one this far below the usual is no chance."""
 _UNLIKELY, _LIKELY = 9.0, 3.0
 """Squared residuals, in units of the noise, that right angles may cost: once, and for each."""
+_ERRORS = 6.0, 3.0
+"""Standard errors within which an angle may be right, first the first. Where the torque is even in a tilt t, as in
+a plane, noise makes t² and not t: t² of three standard errors is t of six, as its own error is that of t² over 2t."""
 _LEAST = 1e-9
 """Least residual that a joint is credited with, as a share of its torque."""
 
@@ -230,6 +233,9 @@ def _physical(guess: TreeGuess, bodies: Bodies, data: Measured, strength: float,
     free = descend(PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.expected, strength))
     if not right_angles:
         return free.at
-    held = descend(free.at.at_right_angles(fair))
-    worse = (held.cost - free.cost) * data.q.size
-    return held.at if worse < _UNLIKELY + _LIKELY * np.count_nonzero(held.at.angles) else free.at
+    for errors in _ERRORS:
+        held = descend(free.at.at_right_angles(fair, errors))
+        worse = (held.cost - free.cost) * data.q.size
+        if worse < _UNLIKELY + _LIKELY * np.count_nonzero(held.at.angles):
+            return held.at
+    return free.at

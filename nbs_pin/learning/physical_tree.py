@@ -19,8 +19,6 @@ from nbs_pin.learning.regressor import Expected
 from nbs_pin.learning.tree_guess import JOINT, PLACE, Measured, TreeGuess
 
 FREE, PARALLEL, RIGHT = 0, 1, 2
-_LIKELY = 9.0
-"""A deviation of three standard errors, squared: what noise alone rarely makes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +72,10 @@ class PhysicalTree:
             drag=self.drag * np.exp(whole[inner:].reshape(self.drag.shape)),
         )
 
-    def at_right_angles(self, data: Measured) -> "PhysicalTree":
-        """The tree with every axis parallel or perpendicular to its parent's that the data do not tell from it.
+    def at_right_angles(self, data: Measured, errors: float) -> "PhysicalTree":
+        """The tree with every axis parallel or perpendicular to its parent's that is so within as many standard errors.
 
-        Joints are told apart by three standard errors, from the curvature at this tree, which should be a minimum.
+        They are from the curvature at this tree, which should be a minimum.
         """
         tree = replace(self, angles=())
         information = data.q.size * tree.normal(data).hessian
@@ -90,7 +88,7 @@ class PhysicalTree:
             slope = np.column_stack([-rotation[rows, 1], rotation[rows, 0]])  # of column z with a turn about x and y
             spread = slope @ covariance[at : at + 2, at : at + 2] @ slope.T
             off = rotation[rows, 2]
-            near = off @ np.linalg.solve(spread, off) < _LIKELY
+            near = off @ np.linalg.solve(spread, off) < errors**2
             angles.append((PARALLEL if parallel else RIGHT) if near else FREE)
         rotations = _held(self.guess.rotations, tuple(angles))
         return replace(self, guess=replace(self.guess, rotations=rotations), angles=tuple(angles))

@@ -1,0 +1,685 @@
+"""The chain: every rigid tree and nothing else, exact derivatives, and trees found again from their motions."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import nbs_pin as nbs
+from nbs_pin.arrays import matvec
+from nbs_pin.controllers.pd import PD
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.lagrangian import LagrangianDynamics
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.pseudo_inertia import coordinates
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.learning.chain_fit import TreeGeometry, fit_chain
+from nbs_pin.learning.datasets import Dataset, joint_tree
+from nbs_pin.learning.fitting import fit
+from nbs_pin.learning.identification import explain, identify
+from nbs_pin.learning.levenberg_marquardt import Normal, levenberg_marquardt
+from nbs_pin.learning.measuring import Noise
+from nbs_pin.learning.physical_tree import FREE, PARALLEL, RIGHT, PhysicalTree
+from nbs_pin.learning.recipes import collect
+from nbs_pin.learning.regressor import RobotGeometry, Scalars
+from nbs_pin.learning.tree_guess import Measured, TreeGuess
+from nbs_pin.networks.chain import Chain, Tree, random_tree
+from nbs_pin.robot import load_robot
+from nbs_pin.runtime.layout import Packed
+from nbs_pin.runtime.tree_layout import BODY, tree_workspace
+from nbs_pin.runtime.tree_parameters import COLUMNS, tree_derivatives
+from tests.test_dynamics import GANTRY, relative
+
+TREES = [
+    ((0,), (False,)),
+    ((0,), (True,)),
+    ((0, 1, 2), (False, False, False)),
+    ((0, 1, 2), (True, True, False)),
+    ((0, 1, 1, 3), (False, True, False, False)),
+    ((0, 0, 1, 2, 0), (False, True, True, False, False)),
+    ((0, 1, 2, 3, 3, 2), (False, False, True, False, True, False)),
+]
+BRANCHED = TREES[4]
+BOXES = st.integers(0, 10_000), st.floats(0.0, 30.0)
+
+
+def scrambled(parents, prismatic, seed=0, spread=0.05, epsilon=1e-12) -> Chain:
+    """A random tree with bodies of any shape."""
+    network, rng = Chain(parents, prismatic, epsilon, seed), np.random.default_rng(seed)
+    for parameter in network.parameters():
+        parameter.data += spread * torch.from_numpy(rng.normal(size=parameter.shape))
+    return network
+
+
+def states(network: Chain, rows=6, seed=1) -> tuple[np.ndarray, ...]:
+    """q, v, w, a."""
+    rng, shape = np.random.default_rng(seed), (rows, network.nv)
+    q = rng.uniform(-np.pi, np.pi, shape) * np.where(network.prismatic, 0.25, 1.0)
+    return q, rng.uniform(-2.0, 2.0, shape), rng.uniform(-2.0, 2.0, shape), 5.0 * rng.normal(size=shape)
+
+
+def dataset(network: Chain, samples=400, seed=0, noise=0.0, friction: JointFriction | None = None) -> Dataset:
+    q, v, _, a = states(network, samples, seed)
+    tau = network.compiled()(q, v, v, a) + noise * np.random.default_rng(seed).normal(size=q.shape)
+    tau = tau if friction is None else tau + friction.torque(v)
+    order = np.arange(samples)
+    return Dataset(q, v, a, tau, 0.0 * order, order, np.array(network.parents), np.array(network.prismatic), "tree")
+
+
+def errors(model: DynamicsProvider, truth: DynamicsProvider, prismatic=False) -> np.ndarray:
+    """Relative Frobenius errors of M, C v and G over uniform states; of C v, of M a + C v where there is no C v."""
+    rng = np.random.default_rng(99)
+    q = rng.uniform(-np.pi, np.pi, (200, truth.nv)) * np.where(prismatic, 0.25, 1.0)
+    v, a = rng.uniform(-2.0, 2.0, (2, *q.shape))
+
+    def quantities(d: DynamicsProvider) -> tuple[np.ndarray, ...]:
+        mass, force = d.mass_matrix(q), matvec(d.coriolis_matrix(q, v), v)
+        return mass, force if np.abs(force).max() > 1e-3 else force + matvec(mass, a), d.gravity(q)
+
+    return np.array(
+        [np.linalg.norm(x - y) / np.linalg.norm(y) for x, y in zip(quantities(model), quantities(truth), strict=True)]
+    )
+
+
+def slope(function, size: int, h: float = 1e-3) -> np.ndarray:
+    """Derivatives of `function` at 0 by sixth-order central differences, the last axis being that of its argument."""
+    columns = []
+    for e in h * np.eye(size):
+        parts = [s * (function(k * e) - function(-k * e)) for k, s in ((1, 45.0), (2, -9.0), (3, 1.0))]
+        columns.append(sum(parts) / (60.0 * h))
+    return np.stack(columns, axis=-1)
+
+
+# The definition.
+
+
+def placed_bodies(network: Chain, q: np.ndarray) -> np.ndarray:
+    """T_j L_j (n, 4, 4) at one q, by SciPy."""
+    bodies, frames = [], [np.eye(4)]
+    for j in range(network.nv):
+        joint, place = np.eye(4), np.eye(4)
+        if network.prismatic[j]:
+            joint[2, 3] = q[j]
+        else:
+            joint[:3, :3] = Rotation.from_rotvec([0.0, 0.0, q[j]]).as_matrix()
+        place[:3, :3] = Rotation.from_rotvec(network.turns[j].detach().numpy()).as_matrix()
+        place[:3, 3] = network.positions[j].detach().numpy()
+        frames.append(frames[network.parents[j]] @ place @ joint)
+        bodies.append(frames[-1] @ np.tril(network.factors[j].detach().numpy()))
+    return np.array(bodies)
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_energies_are_those_of_the_bodies(tree):
+    """T̂ = ½ Σ ‖Ṫ_j L_j‖² + ½ε‖v‖² and V̂ = −Σ g·T_j L_j(L_jᵀ)₄, T_j by another hand and Ṫ_j by differences."""
+    network = scrambled(*tree, epsilon=0.3)
+    q, v, _, _ = states(network, 1)
+    rate = slope(lambda t: placed_bodies(network, q[0] + t * v[0]), 1)
+    kinetic = 0.5 * np.square(rate).sum() + 0.15 * np.square(v).sum()
+    np.testing.assert_allclose(network.kinetic(*map(torch.from_numpy, (q, v)))[0].item(), kinetic, rtol=1e-9)
+    factors = network.factors.detach().tril().numpy()
+    moments = np.einsum("jik,jk->ji", placed_bodies(network, q[0]), factors[:, 3])[:, :3].sum(0)
+    potential = -moments @ network.field.detach().numpy()
+    np.testing.assert_allclose(network.potential(torch.from_numpy(q))[0].item(), potential, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_kinetic_energy_is_quadratic_in_the_velocity(tree):
+    network = scrambled(*tree)
+    q, v, w, _ = map(torch.from_numpy, states(network))
+    left = network.kinetic(q, v + w) + network.kinetic(q, v - w)  # the parallelogram law
+    torch.testing.assert_close(left, 2.0 * (network.kinetic(q, v) + network.kinetic(q, w)), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(network.kinetic(q, -3.0 * v), 9.0 * network.kinetic(q, v), rtol=1e-13, atol=0.0)
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_the_definition_and_the_kernels_are_one(tree):
+    for seed in range(3):
+        network = scrambled(*tree, seed, epsilon=0.01)
+        arguments = states(network, seed=seed)
+        expected = network.torque(*map(torch.from_numpy, arguments)).detach().numpy()
+        assert relative(network.compiled()(*arguments) - expected, expected) < 1e-12
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_gravity_is_the_gradient_of_the_potential(tree):
+    network = scrambled(*tree)
+    q = torch.from_numpy(states(network)[0]).requires_grad_()
+    (gradient,) = torch.autograd.grad(network.potential(q).sum(), q)
+    torch.testing.assert_close(network.gravity(q), gradient, rtol=1e-12, atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(*BOXES)
+def test_inertia_has_its_floor_for_absurd_parameters(seed, spread):
+    network = scrambled(*TREES[seed % len(TREES)], seed, spread, epsilon=0.1)
+    mass = network.mass_matrix(torch.from_numpy(states(network, 3, seed)[0])).detach().numpy()
+    least = np.linalg.eigvalsh(mass)[:, 0]
+    assert (least >= 0.1 - 1e-14 * np.abs(mass).max((1, 2)) * network.nv).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(*BOXES)
+def test_a_massless_tree_is_its_floor(seed, spread):
+    network = scrambled(*TREES[seed % len(TREES)], seed, spread, epsilon=0.1)
+    network.factors.data.zero_()
+    q = torch.from_numpy(states(network, 3, seed)[0])
+    torch.testing.assert_close(network.mass_matrix(q), (0.1 * torch.eye(network.nv)).double().expand(3, -1, -1))
+    assert not network.gravity(q).any()
+
+
+@pytest.mark.parametrize("name", ["ur5", GANTRY])
+def test_with_the_parameters_of_an_arm_the_chain_is_the_arm(name):
+    """Every arm is in the class: its placements and bodies put in by hand."""
+    robot = load_robot(name)
+    truth, (parents, prismatic) = PinocchioDynamics(robot), joint_tree(robot)
+    weights = truth.packed_tree().weights
+    joints = weights[3:].reshape(robot.nv, BODY)
+    network = Chain(parents, prismatic, epsilon=1e-12)
+    with torch.no_grad():
+        network.field.copy_(torch.from_numpy(-weights[:3]))
+        for j, row in enumerate(joints):
+            network.turns[j] = torch.from_numpy(Rotation.from_matrix(row[:9].reshape(3, 3)).as_rotvec())
+            network.positions[j] = torch.from_numpy(row[9:12])
+            body = np.empty((4, 4))
+            body[np.triu_indices(3)] = row[16:22]
+            body[:3, 3], body[3, 3] = row[13:16], row[12]
+            body = np.triu(body) + np.triu(body, 1).T
+            network.factors[j] = torch.from_numpy(np.linalg.cholesky(body + 1e-13 * np.eye(4)))
+    model = LagrangianDynamics(network)
+    assert errors(model, truth, prismatic).max() < 1e-9
+    q = states(network)[0]
+    assert np.ptp(model.potential_energy(q) - truth.potential_energy(q)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (((0, 2), (False, False)), r"parents \[0, 2\] .* make no tree"),
+        (((-1,), (False,)), "make no tree"),
+        (((0, 1), (False,)), "make no tree"),
+        (((0,), (False,), 0.0), "epsilon is 0.0"),
+        (((0,), (False,), float("nan")), "epsilon is nan"),
+    ],
+)
+def test_what_makes_no_tree_is_refused(arguments, words):
+    with pytest.raises(ArgumentError, match=words):
+        Chain(*arguments)
+
+
+# Derivatives of the torque with respect to the tree.
+
+
+def shifted(tree: Packed, step: np.ndarray) -> Packed:
+    """The tree a step away, in the columns of `tree_derivatives`."""
+    weights = tree.weights.copy()
+    weights[:3] += step[:3]
+    for row, moved in zip(weights[3:].reshape(-1, BODY), step[3:].reshape(-1, COLUMNS), strict=True):
+        row[:9] = (row[:9].reshape(3, 3) @ Rotation.from_rotvec(moved[:3]).as_matrix()).ravel()
+        row[9:] += moved[3:]
+    return Packed(tree.layout, weights)
+
+
+def derivatives(tree: Packed, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Torques (rows, n) and their table (rows, n, parameters)."""
+    size = 3 + COLUMNS * int(tree.layout[0])
+    tau, table = np.full(q.shape, np.nan), np.full((*q.shape, size), np.nan)
+    tree_derivatives(q, v, a, *tree, np.full(tree_workspace(tree), np.nan), tau, table)
+    return tau, table
+
+
+@st.composite
+def any_tree(draw) -> tuple[tuple[int, ...], tuple[bool, ...]]:
+    """One to five joints, serial or branched anywhere."""
+    n = draw(st.integers(1, 5))
+    parents = tuple(draw(st.integers(0, i)) for i in range(n))
+    return parents, tuple(draw(st.lists(st.booleans(), min_size=n, max_size=n)))
+
+
+@settings(max_examples=25, deadline=None)
+@given(any_tree(), st.integers(0, 10_000))
+def test_derivatives_with_respect_to_the_tree_are_slopes(tree, seed):
+    network = scrambled(*tree, seed, 0.3, epsilon=0.2)
+    packed, torque = network.packed_tree(), network.compiled()
+    q, v, _, a = states(network, 2, seed)
+    tau, table = derivatives(packed, q, v, a)
+    np.testing.assert_allclose(tau, torque(q, v, v, a), rtol=1e-12, atol=1e-12)
+
+    def moved(step: np.ndarray) -> np.ndarray:
+        return replace(torque, weights=shifted(packed, step).weights)(q, v, v, a)
+
+    expected = slope(moved, table.shape[-1])
+    assert relative(table - expected, expected) < 1e-9
+
+
+# Guesses.
+
+
+def guess_and_data(tree=BRANCHED, kinds=2) -> tuple[TreeGuess, Measured]:
+    """A guess away from the tree that moved, and what was measured of that."""
+    network = scrambled(*tree)
+    data, rng = dataset(network, 40), np.random.default_rng(5)
+    scale = rng.uniform(0.5, 2.0, network.nv)
+    factors = Scalars(kinds > 0, False, 0.3).factors(data.v, data.a)
+    measured = Measured(data.q, data.v, data.a, data.tau, scale, factors)
+    guess = TreeGuess.of(random_tree(network.nv, rng), network.packed_tree().layout, kinds)
+    return replace(guess, drag=rng.uniform(0.5, 2.0, guess.drag.shape)), measured
+
+
+def parameters(guess: TreeGuess) -> int:
+    return 3 + 16 * len(guess.bodies) - 6 + guess.drag.size
+
+
+@pytest.mark.parametrize("tree", TREES)
+@pytest.mark.parametrize("kinds", [0, 2])
+def test_normal_equations_of_a_guess_are_those_of_its_residuals(tree, kinds):
+    guess, data = guess_and_data(tree, kinds)
+    residual = guess.residual(data) / data.scale
+    rows = -slope(lambda step: guess.moved(step).residual(data) / data.scale, parameters(guess))
+    found = guess.normal(data)
+    np.testing.assert_allclose(found.cost, np.square(residual).mean(), rtol=1e-12)
+    np.testing.assert_allclose(guess.cost(data), found.cost, rtol=1e-12)
+    gradient = np.einsum("rjp,rj->p", rows, residual) / residual.size
+    assert relative(found.gradient - gradient, gradient) < 1e-9
+    hessian = np.einsum("rjp,rjk->pk", rows, rows) / residual.size
+    assert relative(found.hessian - hessian, hessian) < 1e-9
+
+
+def test_normal_equations_are_sums_over_chunks():
+    guess, few = guess_and_data()
+    repeats = np.tile(np.arange(40), 30)
+    many = guess.normal(few.some(repeats))
+    for ours, theirs in zip(many, guess.normal(few), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_the_frame_of_the_base_does_not_matter(tree):
+    """A guess has joint 0 in the base frame, and gives the torque of the tree that it was made of."""
+    network = scrambled(*tree, epsilon=1e-15)
+    arrays = Tree(*(getattr(network, name).detach().numpy() for name in Tree._fields))
+    arrays = arrays._replace(factors=np.tril(arrays.factors))
+    guess = TreeGuess.of(arrays, network.packed_tree().layout, 0)
+    np.testing.assert_array_equal(guess.positions[0], 0.0)
+    np.testing.assert_allclose(guess.rotations[0], np.eye(3), atol=1e-15)
+    data = dataset(network, 20)
+    unit = Measured(data.q, data.v, data.a, data.tau, np.ones(network.nv), np.zeros((0, *data.q.shape)))
+    assert relative(guess.residual(unit), data.tau) < 1e-12
+    again = Chain(network.parents, network.prismatic, 1e-15)
+    with torch.no_grad():
+        for name, value in guess.tree(np.linalg.cholesky(guess.bodies))._asdict().items():
+            getattr(again, name).copy_(torch.from_numpy(value))
+    assert relative(again.compiled()(data.q, data.v, data.v, data.a) - data.tau, data.tau) < 1e-12
+
+
+@pytest.mark.parametrize("kinds", [0, 2])
+def test_the_regressor_of_a_guess_gives_its_torque(kinds):
+    guess, data = guess_and_data(kinds=kinds)
+    rows = guess.regressor(data.q, data.v, data.a)
+    frictionless = replace(guess, drag=0.0 * guess.drag)
+    expected = data.tau - frictionless.residual(data)
+    assert relative(rows @ coordinates(guess.bodies).ravel() - expected, expected) < 1e-12
+
+
+def test_the_regressor_of_an_arms_own_geometry_spans_pinocchios():
+    """Joint frames differ in the direction of their axes' x alone: the same torques are linear in both."""
+    robot = load_robot("panda")
+    parents, prismatic = joint_tree(robot)
+    packed = PinocchioDynamics(robot).packed_tree()
+    joints = packed.weights[3:].reshape(robot.nv, BODY)
+    guess = TreeGuess(
+        packed.layout,
+        packed.weights[:3],
+        joints[:, :9].reshape(-1, 3, 3),
+        joints[:, 9:12],
+        np.tile(np.eye(4), (robot.nv, 1, 1)),
+        np.zeros((0, robot.nv)),
+    )
+    q, v, _, a = states(Chain(parents, prismatic), 40)
+    ours, theirs = (x.regressor(q, v, a).reshape(-1, 10 * robot.nv) for x in (guess, RobotGeometry(robot)))
+    left = theirs - ours @ np.linalg.lstsq(ours, theirs, rcond=1e-12)[0]
+    assert relative(left, theirs) < 1e-9
+    assert np.linalg.matrix_rank(ours, tol=1e-9 * np.linalg.norm(ours)) == 43
+
+
+@functools.cache
+def physical_and_data() -> tuple[PhysicalTree, Measured]:
+    """Bodies as `explain` finds them for the geometry of a guess."""
+    network = scrambled(*BRANCHED)
+    data = dataset(network, 60, noise=1.0, friction=JointFriction(np.full(4, 0.5), np.full(4, 0.5), 0.3))
+    scalars = Scalars(True, False, 0.3)
+    guess, _ = guess_and_data()
+    bodies = explain(TreeGeometry(guess, data.parents, list("abcd")), data, scalars, 0.3)
+    factors = scalars.factors(data.v, data.a)
+    measured = Measured(data.q, data.v, data.a, data.tau, bodies.report.noise, factors)
+    return PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.expected, 0.3), measured
+
+
+def test_the_slope_of_a_physical_tree_is_that_of_its_cost():
+    start, data = physical_and_data()
+    size, rng = parameters(start.guess), np.random.default_rng(0)
+    tree = start.moved(0.1 * rng.normal(size=size))
+    expected = slope(lambda step: np.array(tree.moved(step).cost(data)), size)
+    found = tree.normal(data)
+    assert relative(-2.0 * found.gradient - expected, expected) < 1e-8
+    np.testing.assert_allclose(found.cost, tree.cost(data), rtol=1e-14)
+    np.testing.assert_allclose(tree.moved(np.zeros(size)).cost(data), tree.cost(data), rtol=1e-12)
+
+
+def test_bodies_that_explain_the_data_are_where_a_physical_tree_rests():
+    """One objective, written twice: bodies and friction that minimise the convex one are stationary here."""
+    tree, data = physical_and_data()
+    own = np.ones(parameters(tree.guess), dtype=bool)
+    own[:3] = False
+    for joint in range(1, 4):
+        own[3 + 16 * joint - 6 : 3 + 16 * joint] = False  # placements
+
+    def decrement(tree: PhysicalTree) -> float:
+        normal = tree.normal(data)
+        gradient, hessian = normal.gradient[own], normal.hessian[np.ix_(own, own)]
+        return float(np.sqrt(gradient @ np.linalg.solve(hessian, gradient) * data.q.size / tree.strength))
+
+    assert decrement(tree) < 0.1
+    assert decrement(replace(tree, drag=1.5 * tree.drag)) > 1.0
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.0, 3.0))
+def test_a_physical_tree_stays_physical(seed, size):
+    tree, _ = physical_and_data()
+    step = size * np.random.default_rng(seed).normal(size=parameters(tree.guess))
+    moved = tree.moved(step)
+    assert (np.linalg.det(moved.factors) != 0.0).all()
+    assert (moved.drag > 0.0).all()
+    np.testing.assert_allclose(
+        moved.guess.rotations @ moved.guess.rotations.swapaxes(1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-12
+    )
+
+
+def test_held_angles_stay_and_the_slope_knows_them():
+    tree, data = physical_and_data()
+    rotations = tree.guess.rotations.copy()
+    rotations[1] = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
+    rotations[2] = Rotation.from_euler("zx", [0.7, 0.5 * np.pi]).as_matrix()
+    tree = replace(tree, guess=replace(tree.guess, rotations=rotations), angles=(FREE, PARALLEL, RIGHT, FREE))
+    size = parameters(tree.guess) - 3
+    expected = slope(lambda step: np.array(tree.moved(step).cost(data)), size)
+    found = tree.normal(data)
+    assert relative(-2.0 * found.gradient - expected, expected) < 1e-8
+    moved = tree.moved(0.5 * np.random.default_rng(0).normal(size=size)).guess.rotations
+    np.testing.assert_allclose(moved[1, :, 2], [0.0, 0.0, 1.0], atol=1e-14)
+    np.testing.assert_allclose(moved[2, 2, 2], 0.0, atol=1e-14)
+    assert np.abs(moved[3] - rotations[3]).max() > 0.01
+
+
+# Levenberg–Marquardt.
+
+
+def descend(residual, start, **options):
+    """Least squares of a function of numbers, derivatives by differences."""
+
+    def normal(x: np.ndarray) -> Normal:
+        left, rows = residual(x), slope(lambda step: residual(x + step), len(x), 1e-3)
+        return Normal(left @ left / left.size, -rows.T @ left / left.size, rows.T @ rows / left.size)
+
+    def cost(x: np.ndarray) -> float:
+        return float(np.mean(np.square(residual(x))))
+
+    return levenberg_marquardt(np.array(start), normal, cost, np.add, **options)
+
+
+def test_rosenbrocks_valley_is_followed_to_its_end():
+    end = descend(lambda x: np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]]), [-1.2, 1.0])
+    np.testing.assert_allclose(end.at, 1.0, atol=1e-12)
+    assert end.cost < 1e-24
+    assert (np.diff(end.history) < 0.0).all()
+    assert end.history[-1] == end.cost
+
+
+def test_a_linear_problem_is_solved_as_such():
+    rng = np.random.default_rng(0)
+    design, target = rng.normal(size=(12, 4)), rng.normal(size=12)
+    end = descend(lambda x: design @ x - target, np.zeros(4), stall=1e-12)
+    np.testing.assert_allclose(end.at, np.linalg.lstsq(design, target, rcond=None)[0], atol=1e-7)
+
+
+def test_what_the_data_do_not_see_does_not_move():
+    """Only x₀ + x₁ is measured, and x₂ not at all."""
+    end = descend(lambda x: np.array([x[0] + x[1] - 3.0, 2.0 * (x[0] + x[1]) - 6.0]), [1.0, 0.0, 7.0])
+    np.testing.assert_allclose(end.at, [2.0, 1.0, 7.0], atol=1e-10)
+
+
+def test_a_step_to_what_is_no_number_is_not_taken():
+    """√x is none below zero, where the first steps lead."""
+    with np.errstate(invalid="ignore"):
+        end = descend(lambda x: np.array([np.sqrt(x[0] - 0.97) - 0.2]), [5.0])
+    np.testing.assert_allclose(end.at, 1.01, atol=1e-10)
+
+
+def test_a_cost_that_depends_on_nothing_ends_at_once():
+    end = descend(lambda x: np.ones(3), [1.0, 2.0])
+    np.testing.assert_array_equal(end.at, [1.0, 2.0])
+    assert end.history == [1.0]
+
+
+def test_a_point_may_be_anything_that_moves():
+    """A rotation from turned vectors: steps compose, they do not add."""
+    rng = np.random.default_rng(1)
+    vectors, truth = rng.normal(size=(5, 3)), Rotation.from_rotvec([2.0, -1.0, 1.5])
+    seen = truth.apply(vectors)
+
+    def moved(x: Rotation, step: np.ndarray) -> Rotation:
+        return x * Rotation.from_rotvec(step)
+
+    def normal(x: Rotation) -> Normal:
+        left = (x.apply(vectors) - seen).ravel()
+        rows = slope(lambda step: (moved(x, step).apply(vectors) - seen).ravel(), 3)
+        return Normal(left @ left, -rows.T @ left, rows.T @ rows)
+
+    end = levenberg_marquardt(
+        Rotation.identity(), normal, lambda x: float(np.square(x.apply(vectors) - seen).sum()), moved
+    )
+    assert (end.at.inv() * truth).magnitude() < 1e-12
+
+
+def test_a_descent_ends_when_it_is_told():
+    def valley(x: np.ndarray) -> np.ndarray:
+        return np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]])
+
+    seen: list[float] = []
+    assert len(descend(valley, [-1.2, 1.0], iterations=3, progress=seen.append).history) == 4
+    assert len(seen) == 3
+    assert descend(valley, [-1.2, 1.0], tolerance=0.5).cost <= 0.5
+    assert len(descend(valley, [-1.2, 1.0], patience=2, stall=0.9999).history) < 12
+
+
+# Trees from their motions.
+
+
+@pytest.mark.parametrize("tree", TREES)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_any_tree_is_found_from_its_motions(tree, seed):
+    network = scrambled(*tree, seed)
+    found = fit_chain(dataset(network, 300), seed)
+    assert errors(*map(LagrangianDynamics, (found.network, network)), network.prismatic).max() < 1e-8
+    assert found.bodies.unexcited == ()
+    assert found.friction is None
+    assert found.costs.min() == found.history[-1]
+    assert 1 <= len(found.costs) <= 64
+    assert len(found.costs) <= found.evaluations
+
+
+def test_the_gantry_is_found_from_its_motions():
+    robot = load_robot(GANTRY)
+    model = fit(collect(robot, "uniform", 400), "chain", robot=robot)
+    assert errors(model, PinocchioDynamics(robot), joint_tree(robot)[1]).max() < 1e-8
+    assert model.report.test_nmse < 1e-16
+
+
+def test_friction_is_found_with_the_tree():
+    network, rng = scrambled(*BRANCHED, 3), np.random.default_rng(0)
+    friction = JointFriction(rng.uniform(0.2, 2.0, 4), rng.uniform(0.2, 2.0, 4), 0.05)
+    found = fit_chain(dataset(network, friction=friction), friction=True, transition=0.05)
+    np.testing.assert_allclose(found.friction.viscous, friction.viscous, rtol=1e-8)
+    np.testing.assert_allclose(found.friction.coulomb, friction.coulomb, rtol=1e-8)
+    assert found.friction.transition == 0.05
+    assert errors(*map(LagrangianDynamics, (found.network, network)), network.prismatic).max() < 1e-8
+
+
+def unknowns(network: Chain) -> int:
+    """How many directions of its parameters a tree's torque depends on."""
+    q, v, _, a = states(network, 300, seed=5)
+    _, table = derivatives(network.packed_tree(), q, v, a)
+    rows = table.reshape(-1, 3 + COLUMNS * network.nv)[:, : 3 + COLUMNS * network.nv]
+    rows = np.delete(rows, range(3 + COLUMNS - 1, rows.shape[1], COLUMNS), axis=1)  # without armature
+    values = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-12), compute_uv=False)
+    return int((values > 1e-8 * values[0]).sum())
+
+
+@pytest.mark.parametrize("tree", [TREES[2], BRANCHED])
+@pytest.mark.parametrize("seed", range(2))
+def test_no_unbiased_estimate_is_better_in_noise(tree, seed):
+    """White noise σ leaves Σ ‖τ̂ − τ‖² = σ²χ²_p at the samples for p unknowns, the bound of Cramér and Rao."""
+    network, noise, samples = scrambled(*tree, seed), 0.2, 400
+    clean, noisy = dataset(network, samples, seed), dataset(network, samples, seed, noise)
+    found = fit_chain(noisy, seed)
+    tau = found.network.compiled()(clean.q, clean.v, clean.v, clean.a)
+    p = unknowns(network)
+    assert np.square((tau - clean.tau) / noise).sum() < p + 5.0 * np.sqrt(2.0 * p)
+    np.testing.assert_allclose(found.bodies.noise, noise, rtol=4.0 / np.sqrt(2.0 * samples) + p / samples)
+
+
+def test_an_arm_found_in_noise_is_about_as_good_as_one_of_known_geometry():
+    robot, ratios = load_robot("three_link"), []
+    truth = PinocchioDynamics(robot)
+    for seed in range(3):
+        data = collect(robot, "uniform", 400, seed, noise=Noise(torque=0.5))
+        known, found = identify(data, robot), LagrangianDynamics(fit_chain(data, seed, starts=8).network)
+        ratios.append(errors(found, truth) / errors(known, truth))
+    assert (np.median(ratios, axis=0) < 3.0).all()
+
+
+def test_parallel_axes_are_held_parallel_in_noise():
+    """The arm moves in a plane; without this the noise tilts its axes. One seed in four or so speaks against it."""
+    data = collect(load_robot("three_link"), "uniform", 300, seed=2, noise=Noise(torque=0.5))
+    held, free = (fit_chain(data, starts=8, right_angles=right).network for right in (True, False))
+    for network, exact in ((held, True), (free, False)):
+        axes = Rotation.from_rotvec(network.turns.detach().numpy()[1:]).as_matrix()[:, :2, 2]
+        assert (np.abs(axes).max() < 1e-12) == exact
+
+
+def test_noise_falls_with_the_root_of_the_samples():
+    network = scrambled(*BRANCHED, 1)
+    few, many = (
+        errors(
+            *map(LagrangianDynamics, (fit_chain(dataset(network, n, noise=0.2)).network, network)), network.prismatic
+        )
+        for n in (400, 6_400)
+    )
+    assert (many < 0.5 * few).all()
+
+
+def test_the_same_seed_finds_the_same_tree():
+    data = dataset(scrambled(*TREES[3], 2), 200, noise=0.1)
+    one, again = (fit_chain(data, 7, starts=8).network for _ in range(2))
+    for ours, theirs in zip(one.parameters(), again.parameters(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0.0, atol=0.0)
+
+
+def test_the_units_of_torque_do_not_matter():
+    network = scrambled(*TREES[3], 2)
+    data = dataset(network, 200, noise=0.1)
+    one, thousand = (fit_chain(replace(data, tau=c * data.tau), starts=8).network for c in (1.0, 1e3))
+    arguments = states(network)
+    ours, theirs = (x.compiled()(*arguments) for x in (one, thousand))
+    assert relative(1e3 * ours - theirs, theirs) < 1e-4
+
+
+def test_still_poses_say_nothing_of_moments_of_inertia():
+    network = scrambled(*BRANCHED)
+    data = dataset(network)
+    still = replace(data, v=0.0 * data.v, a=0.0 * data.a, tau=LagrangianDynamics(network).gravity(data.q))
+    found = fit_chain(still, names=["hip", "knee", "toe", "heel"])
+    assert found.bodies.excited < found.bodies.base_parameters
+    assert any("hip" in line for line in found.bodies.unexcited)
+    model = LagrangianDynamics(found.network)
+    mass = model.mass_matrix(data.q)
+    assert np.linalg.eigvalsh(mass).min() > -1e-14 * np.abs(mass).max()
+    assert errors(model, LagrangianDynamics(network), network.prismatic)[2] < 1e-6
+
+
+def test_torques_that_never_change_are_data_too():
+    """One pose held again and again: any tree of that weight."""
+    network = scrambled(*BRANCHED)
+    q = np.full((60, 4), 0.3)
+    tau = LagrangianDynamics(network).gravity(q)
+    found = fit_chain(replace(dataset(network, 60), q=q, v=0.0 * q, a=0.0 * q, tau=tau))
+    np.testing.assert_allclose(LagrangianDynamics(found.network).gravity(q), tau, rtol=1e-6)
+    assert found.bodies.unexcited
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"starts": 0}, "starts is 0"),
+        ({"transition": 0.0}, "transition is 0"),
+        ({"regularisation": -1.0}, "regularisation is -1"),
+        ({"epsilon": 0.0}, "epsilon is 0"),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused(options, words):
+    with pytest.raises(ArgumentError, match=words):
+        fit_chain(dataset(scrambled(*TREES[0]), 20), **options)
+
+
+def test_a_motion_without_torque_is_refused():
+    data = dataset(scrambled(*BRANCHED), 50)
+    with pytest.raises(ArgumentError, match="arms of every scale move so"):
+        fit_chain(replace(data, tau=0.0 * data.tau))
+
+
+def test_too_few_samples_are_refused():
+    with pytest.raises(ArgumentError, match="samples of 4 joints are too few"):
+        fit_chain(dataset(scrambled(*BRANCHED), 8))
+
+
+# The model.
+
+
+@pytest.fixture(scope="module")
+def model() -> LagrangianDynamics:
+    robot = load_robot("three_link")
+    return fit(collect(robot, "uniform", 300), "chain", robot=robot, friction=True)
+
+
+def test_a_model_in_a_file_is_the_model(model, tmp_path):
+    nbs.save(model, tmp_path / "model.nbs")
+    again = nbs.load(tmp_path / "model.nbs")
+    q, v, w, a = states(model.network)
+    np.testing.assert_array_equal(again.reference_torque(q, v, w, a), model.reference_torque(q, v, w, a))
+    np.testing.assert_array_equal(again.friction.coulomb, model.friction.coulomb)
+    assert again.report == model.report or again.report is not None
+
+
+def test_a_law_on_the_model_runs_as_machine_code_and_is_the_law_on_the_arm(model):
+    robot = load_robot("three_link")
+    gains = {"feedforward": "reference", "kp": np.full(3, 20.0), "kd": np.full(3, 10.0)}
+    laws = [PD(dynamics, **gains) for dynamics in (model, PinocchioDynamics(robot))]
+    q, v, q_ref, v_ref = states(model.network, 5)
+    ours, theirs = (law.torque(q, v, q_ref, v_ref, 0.0 * q) for law in laws)
+    assert relative(ours - theirs, theirs) < 1e-9
+    plain = laws[0].torque(*(torch.from_numpy(x) for x in (q, v, q_ref, v_ref, 0.0 * q))).detach().numpy()
+    assert relative(ours - plain, ours) < 1e-12
+    assert model.packed_tree() is not None
+
+
+def test_bodies_that_were_found_can_exist(model):
+    factors = model.network.factors.detach().tril()
+    bodies = (factors @ factors.mT).numpy()
+    assert (np.linalg.eigvalsh(bodies) > 0.0).all()
