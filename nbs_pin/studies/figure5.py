@@ -1,6 +1,6 @@
 """The paper's Figure 5: three links, a model learned from data, and what its number says about that model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +121,7 @@ def follow_again(
     seed: int = 0,
     progress: bool = False,
 ) -> dict[str, dict[str, Run]]:
-    """Set-up -> law -> its run along the paper's reference from rest at zero, in MuJoCo, without torque limit or look-ahead.
+    """Set-up -> law -> its run along the paper's reference from rest at zero, in MuJoCo, no torque limit or look-ahead.
 
     learned: models by name, with Ĝ. The NBS law is trained once, on the first of them without its gravity, and has the
     same networks on every model.
@@ -188,8 +188,9 @@ once, under every model. Steady: largest ‖z1‖² of the last 30 %.
 
 {markdown_table(head, lines)}
 
-At or below the paper's {PRINTED:g} without gravity: {"; ".join(without) or "none"}. Any number that a law without a
-model reaches says nothing about a learned one. With gravity, where the law needs Ĝ: {"; ".join(within) or "none"}.
+At or below the paper's {PRINTED:g} without gravity: {"; ".join(without) or "none"}.
+A number that a law without a model reaches says nothing about a learned one. With gravity, where the law
+needs Ĝ: {"; ".join(within) or "none"}.
 
 ![The paper's Figure 5, without and with gravity](figure5.png)
 
@@ -220,7 +221,7 @@ def _draw(runs: Mapping[str, Mapping[str, Run]], path: Path) -> None:
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
 
 
-def _draw_run(axes: Sequence[Any], run: Run, colour: str, name: str, width: float) -> None:
+def _draw_run(axes: np.ndarray, run: Run, colour: str, name: str, width: float) -> None:
     """A column of the picture; the run of the exact model is wide, for others to lie on."""
     z1, t = metrics.error(run), run.t
     look: dict[str, Any] = {"color": colour, "linewidth": width, "alpha": 0.45 if width > 1.0 else 1.0}

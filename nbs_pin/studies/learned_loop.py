@@ -1,10 +1,12 @@
 """Control on learned models: MuJoCo with gravity, every law beside the one on the exact model; the paper's Figure 5."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
+import joblib
 import numpy as np
 
 from nbs_pin import metrics
@@ -24,6 +26,7 @@ from nbs_pin.plotting import ACTUAL, ERROR, picture
 from nbs_pin.progress import tracked
 from nbs_pin.references import Sinusoid
 from nbs_pin.robot import Robot, load_robot
+from nbs_pin.runtime.threads import cores
 from nbs_pin.simulation import simulate
 from nbs_pin.studies import figure5, passive_data
 from nbs_pin.studies.pages import Section, markdown_table, plain, short, write_csv
@@ -85,14 +88,13 @@ def reproduce_learned(folder: Path, seed: int = 0, progress: bool = False, scale
     Raises OSError when a file cannot be written and KeyboardInterrupt on Ctrl-C.
     """
     scale = scale or Scale()
-    robots = {name: load_robot(name) for name in ARMS}
-    learned = {name: learn_chains(robot, scale.samples, seed) for name, robot in robots.items()}
-    rows = [row for name in ARMS for row in follow_all(robots[name], learned[name], scale, progress)]
-    arm, seeds = robots[ARMS[0]], range(seed, seed + scale.seeds)
-    passive = passive_data.learn_passively(arm, seeds, scale.learners, scale.swing, progress)
+    studied = list(_on_arms(scale, seed, progress))
+    rows, chains = [row for found in studied for row in found.rows], studied[0].learned
+    seeds = range(seed, seed + scale.seeds)
+    passive = passive_data.learn_passively(load_robot(ARMS[0]), seeds, scale.learners, scale.swing, progress)
     runs = figure5.follow_again(
         {
-            "a chain, excited data": learned[ARMS[0]][CLEAN],
+            "a chain, excited data": chains[CLEAN],
             "cholesky, the paper's swing": passive.models["cholesky", "one swing", seed],
         },
         epochs=scale.epochs,
@@ -105,6 +107,28 @@ def reproduce_learned(folder: Path, seed: int = 0, progress: bool = False, scale
     figure5.write(runs, folder)
     passive_data.write(passive, folder)
     return [_section(rows, scale, seed), passive_data.section(passive), figure5.section(runs)]
+
+
+class Studied(NamedTuple):
+    """What was learned of an arm, and how laws do on it."""
+
+    learned: dict[str, DynamicsProvider]
+    rows: list[Row]
+
+
+def _on_arms(scale: Scale, seed: int, progress: bool) -> Iterator[Studied]:
+    """Every arm on a core of its own."""
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        pool = joblib.Parallel(n_jobs=min(cores(), len(ARMS)), return_as="generator")
+        studied = iter(pool(joblib.delayed(_on_arm)(name, scale, seed) for name in ARMS))
+        for _ in tracked(ARMS, "control on learned models", progress):
+            yield next(studied)
+
+
+def _on_arm(name: str, scale: Scale, seed: int) -> Studied:
+    robot = load_robot(name)
+    learned = learn_chains(robot, scale.samples, seed)
+    return Studied(learned, follow_all(robot, learned, scale))
 
 
 def learn_chains(robot: Robot, samples: int, seed: int) -> dict[str, DynamicsProvider]:
@@ -134,14 +158,13 @@ def laws(robot: Robot, learned: dict[str, DynamicsProvider]) -> dict[str, Contro
     }
 
 
-def follow_all(robot: Robot, learned: dict[str, DynamicsProvider], scale: Scale, progress: bool = False) -> list[Row]:
+def follow_all(robot: Robot, learned: dict[str, DynamicsProvider], scale: Scale) -> list[Row]:
     """A row per reference and law, the exact NBS first of each reference."""
     rows: list[Row] = []
     chosen = laws(robot, learned)
-    tasks = [(frequency, name) for frequency in FREQUENCIES for name in chosen]
     noise = TorqueNoise(np.full(robot.nv, NOISE.torque), PERIOD)
     first: tuple[float, float | None] = np.nan, None
-    for frequency, name in tracked(tasks, f"{robot.name} on learned models", progress):
+    for frequency, name in product(FREQUENCIES, chosen):
         error, peak = _followed(robot, chosen[name], frequency, scale)
         shaken = None
         if name in (EXACT, CLEAN, NOISY):

@@ -132,9 +132,9 @@ networks learn the acceleration. Relative errors where each was learned, least â
 
 {markdown_table(head, lines)}
 
-c should be 1. What is found instead comes from where each network began, also with states from everywhere: those
-explain every motion of the data and are useless for control (see Figure 5). A few samples with torque settle c; what
-is left then is what the network did not learn.
+c should be 1. What is found instead comes from where each network began, also with states from everywhere: the
+motions are explained and the torques are not, which is no use for control (see Figure 5). A few samples with torque
+settle c; what is left then is what the network did not learn.
 
 `fit(data, "chain")` refuses: "{found.refusal}\""""
     return Section("Data without torque", text, {"passive": plain([row._asdict() for row in found.rows])})
