@@ -69,8 +69,9 @@ def structure_section(trials: Sequence[Trial], folder: Path) -> Section:
 Uniform states of {ARM} at up to {SPEED:g} rad/s without noise, a fifth of them held out; every model by least squares
 on the torque. Relative errors over fresh states, torque: RMS error ÷ deviation; least – **median** – greatest over the
 seeds {seeds[0]} to {seeds[-1]}. At {FAST:g} rad/s nothing was learned: whose T̂ is quadratic in v knows what happens
-there. For `picnn` and `unconstrained`, whose T̂ is not, M and C v are those at rest, and torque is the exact one of
-their L̂. M̂ not ≻ 0: states at which the kinetic energy is none, worst seed.
+there. `picnn` and `unconstrained`, whose T̂ is not, have an M̂ that depends on v: judged is that at rest, their torque
+and what velocity adds to it (C v) are the exact ones of their L̂. M̂ not ≻ 0: share of the states at which T̂ is no
+kinetic energy, worst seed.
 
 {markdown_table(head, _lines(trials))}
 
