@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,14 @@ ERRORS = {
 _JUDGED = ("torque_excited", "torque_uniform")  # what the plain network has as well
 
 
+class Noisy(NamedTuple):
+    """What was found."""
+
+    trials: list[Trial]
+    floors: dict[str, float]
+    """By arm: error of the exact model with the exact friction on fresh trajectories, where joints at rest stick."""
+
+
 def noise_trials(
     arms: Sequence[str],
     sizes: Sequence[int],
@@ -39,23 +47,24 @@ def noise_trials(
     fresh: int,
     progress: bool = False,
     mlp: Mapping[str, Any] | None = None,
-) -> list[Trial]:
+) -> Noisy:
     """Every model of every arm from that many noisy samples, judged on `fresh` states without noise.
 
     mlp: settings of `fit_mlp`.
     """
     settings: dict[str, Mapping[str, Any]] = {MLP: mlp or {}}
-    trials = []
+    trials, floors = [], {}
     for arm in arms:
         robot = load_robot(arm)
         friction = friction_of(robot)
         judge = Judge.of(robot, friction, fresh)
+        floors[arm] = judge.floor(friction)
         for size, seed in tracked(list(product(sizes, seeds)), f"models of {arm} from noisy data", progress):
             data = collect(robot, "excited", size, seed, noise=NOISE, friction=friction)
             for model in MODELS:
                 given = settings.get(model, {"held_out": 0.0})
                 trials.append(attempt(model, data, seed, robot, judge, friction=True, **given))
-    return trials
+    return Noisy(trials, floors)
 
 
 def friction_of(robot: Robot) -> JointFriction:
@@ -64,8 +73,9 @@ def friction_of(robot: Robot) -> JointFriction:
     return JointFriction(VISCOUS * limit, COULOMB * limit)
 
 
-def noise_section(trials: Sequence[Trial], folder: Path) -> Section:
+def noise_section(found: Noisy, folder: Path) -> Section:
     """The tables and pictures, with their files in the folder."""
+    trials = found.trials
     figures = write_trials(trials, folder / "models_noise.csv")
     for name in _JUDGED:
         _draw(trials, name, folder / f"models_noise_{name.removeprefix('torque_')}.png")
@@ -76,7 +86,9 @@ of it at 1 rad/s), encoders of 2^-16 of a turn, from which v and q̈ come by dif
 torque noise. Friction is learned with every model. Judged without noise, on fresh excited trajectories and on uniform
 states, by the torque that the motors need, friction included: RMS error ÷ deviation, its root mean square over the
 joints. `identified` knows the geometry; `chain` the order of the joints; `mlp` only that q is an angle ({MLP}: tanh
-layers on sin q, cos q, v, q̈ and the shape of friction). Medians of the seeds {seeds[0]} to {seeds[-1]}.
+layers on sin q, cos q, v, q̈ and the shape of friction). Medians of the seeds {seeds[0]} to {seeds[-1]}. On
+trajectories even the exact arm with its exact friction is left with {_named(found.floors)}: MuJoCo's joints stick
+before they turn back, with a torque that is no function of their motion.
 
 {_torque_table(trials)}
 
@@ -90,7 +102,12 @@ layers on sin q, cos q, v, q̈ and the shape of friction). Medians of the seeds 
 
 {_ratio(trials)}"""
     worst = {name: _ratios(trials, name) for name in ERRORS}
-    return Section("Models from noisy data", text, {"models_noise": figures, "chain_over_identified": worst})
+    numbers = {"models_noise": figures, "chain_over_identified": worst, "models_noise_floor": found.floors}
+    return Section("Models from noisy data", text, numbers)
+
+
+def _named(floors: Mapping[str, float]) -> str:
+    return ", ".join(f"{short(floor)} ({arm})" for arm, floor in floors.items())
 
 
 def _median(trials: Sequence[Trial], name: str, **case: Any) -> float:

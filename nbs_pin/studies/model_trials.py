@@ -98,6 +98,12 @@ class Judge:
         motions = {"uniform": self.uniform, "fast": self.fast, "excited": self.excited}
         return {f"torque_{name}": _torque_error(torque, motion) for name, motion in motions.items()}
 
+    def floor(self, friction: JointFriction) -> float:
+        """`Trial.torque_excited` of the truth itself with that friction."""
+        motion = self.excited
+        tau = inverse_dynamics(self.truth, motion.q, motion.v, motion.a) + friction.torque(motion.v)
+        return _torque_error(lambda *_: tau, motion)
+
     def model_errors(self, model: DynamicsProvider) -> dict[str, float]:
         """The other errors of a `Trial`; C v as what velocity adds to the torque, which is quick for every model."""
         q, v, rest = self.uniform.q, self.uniform.v, np.zeros_like(self.uniform.v)
