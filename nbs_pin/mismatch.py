@@ -42,16 +42,16 @@ class Mismatch(NamedTuple):
     doubt: float
     """β."""
     trajectories: int
-    """Independent starts."""
+    """Independent starts: those with different states in the first row, as copies of one say nothing new."""
     rms: Float[np.ndarray, " n"]
     """Root mean square of δ per joint [N·m]."""
     t: Float[np.ndarray, " rows"]
     """Time [s]."""
-    q_norm: Float[np.ndarray, "rows trajectories"]
+    q_norm: Float[np.ndarray, "rows starts"]
     """‖q‖ at the rows whose torque acted [rad]."""
-    v_norm: Float[np.ndarray, "rows trajectories"]
+    v_norm: Float[np.ndarray, "rows starts"]
     """‖v‖ [rad/s]."""
-    size: Float[np.ndarray, "rows trajectories"]
+    size: Float[np.ndarray, "rows starts"]
     """‖δ‖ [N·m]."""
 
     def bound(self, q_norm: Float[np.ndarray, "*x"], v_norm: Float[np.ndarray, "*x"]) -> Float[np.ndarray, "*x"]:
@@ -69,7 +69,8 @@ def mismatch(
 ) -> Mismatch:
     """δ on the states of a run of the truth, and the (a, b, c) whose bound is least on average along its reference.
 
-    run: axes between time and joint are starts, drawn independently of each other. friction: of the plant.
+    run: axes between time and joint are starts, drawn independently of each other; those with the same first state
+    count once. friction: of the plant.
     Raises ArgumentError for a run of another number of joints, and a doubt outside (0, 1).
     """
     if not 0.0 < doubt < 1.0:
@@ -84,7 +85,8 @@ def mismatch(
     # Weights that the starts have no part in: the scenario theorem asks for a goal that is fixed before they are drawn.
     weights = [max(float(np.linalg.norm(x, axis=-1).mean()), _LEAST_WEIGHT) for x in (run.q_ref, run.v_ref)]
     constants = _least_bound(norms[0].ravel(), norms[1].ravel(), norms[2].ravel(), weights)
-    count = norms[0].shape[1]
+    first = np.concatenate([x[0].reshape(-1, run.nv) for x in (q, v)], axis=1)
+    count = len(np.unique(first, axis=0))
     rms = np.sqrt(np.mean(delta.reshape(-1, run.nv) ** 2, axis=0))
     return Mismatch(*constants, violation_chance(count, doubt), doubt, count, rms, run.t[:-1], *norms)
 

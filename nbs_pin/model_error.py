@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.checks import PerJoint
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.free_motion import FreeMotion, free_motion
@@ -105,6 +106,8 @@ def compare(
     box: Sequence[PerJoint] | None = None,
     run: Run | None = None,
     motions: int = 10,
+    *,
+    friction: JointFriction | None = None,
 ) -> ModelErrors:
     """How far the model is from the truth on `samples` uniform states of a box, beyond it, and along a run.
 
@@ -112,6 +115,7 @@ def compare(
     joint, for instance where the data of the fit lie; None takes the position limits of the truth's arm, a whole turn
     where they allow it. run: a closed loop with the truth as its plant; several starts make the bound on δ say
     something of further ones (`mismatch.py`). motions: free ones from random states of the box; 0 saves their time.
+    friction: of that plant; it is no part of M, C, G, and what is not stated here is taken for an error of the model.
     Joints that slide are compared in their own units beside those that turn, as M has them.
     Raises ArgumentError for another number of joints, an empty box, or a model that is not finite at some sample.
     """
@@ -142,8 +146,8 @@ def compare(
         box=chosen,
         samples=samples,
         seed=seed,
-        along_run=None if run is None else _along(model, truth, run),
-        mismatch=None if run is None else mismatch(model, truth, run),
+        along_run=None if run is None else _along(model, truth, run, friction),
+        mismatch=None if run is None else mismatch(model, truth, run, friction=friction),
     )
 
 
@@ -182,8 +186,9 @@ def _growth(
     return Growth(SPEEDS, tuple(faster)), Growth(DISTANCES, tuple(farther))
 
 
-def _along(model: DynamicsProvider, truth: DynamicsProvider, run: Run) -> Errors:
+def _along(model: DynamicsProvider, truth: DynamicsProvider, run: Run, friction: JointFriction | None) -> Errors:
     """Errors on at most some thousand states of the run, drawn without return."""
-    q, v, a = (x.reshape(-1, run.nv) for x in (run.q[:-1], run.v[:-1], accelerations(truth, run)))
+    states = run.q[:-1], run.v[:-1], accelerations(truth, run, friction)
+    q, v, a = (x.reshape(-1, run.nv) for x in states)
     rows = np.random.default_rng(0).permutation(len(q))[:_RUN_STATES]
     return judge(model, truth, q[rows], v[rows], a[rows]).errors

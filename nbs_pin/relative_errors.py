@@ -68,12 +68,13 @@ class Box:
 
     @classmethod
     def of_robot(cls, robot: Robot | None, nv: int, speed: PerJoint) -> "Box":
-        """The arm's position limits, [−π, π] for a joint that can turn further or has none."""
+        """The arm's position limits, one turn about their middle for a joint that can turn further or has none.
+
+        A joint that slides keeps its limits. [−π, π] for all joints where no arm is given.
+        """
         if robot is None:
             return cls.of(-np.pi, np.pi, speed, nv)
-        lower, upper = robot.sampling_range
-        whole_turn = upper - lower >= 2.0 * np.pi
-        return cls.of(np.where(whole_turn, -np.pi, lower), np.where(whole_turn, np.pi, upper), speed, nv)
+        return cls.of(*robot.one_turn_range, speed, nv)
 
     def states(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Uniform (q, v, v̇), (count, n) each, v̇ up to `ACCELERATION`."""

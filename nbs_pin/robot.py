@@ -87,6 +87,16 @@ class Robot:
         return np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
 
     @property
+    def one_turn_range(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """(lower, upper) of all configurations worth telling apart [rad, m]: `sampling_range`, of a joint that turns
+        one turn about its middle at most; a joint that slides keeps its limits, however long.
+        """
+        lower, upper = self.sampling_range
+        prismatic = np.array([joint.prismatic for joint in self.joints])
+        longer, middle = ~prismatic & (upper - lower > 2.0 * np.pi), 0.5 * (lower + upper)
+        return np.where(longer, middle - np.pi, lower), np.where(longer, middle + np.pi, upper)
+
+    @property
     def damping(self) -> Float[np.ndarray, " n"]:
         """Viscous joint friction of the URDF [N·m·s/rad]."""
         return np.array([joint.damping for joint in self.joints])

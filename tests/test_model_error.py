@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -17,6 +18,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.error_maps import error_map, telling_joints
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.free_motion import free_motion
+from nbs_pin.learning.excitation import configuration_box
 from nbs_pin.model_error import DISTANCES, SPEEDS, compare
 from nbs_pin.relative_errors import ACCELERATION, Box, Errors, judge
 from tests.test_plotting import drawn, png_size
@@ -123,6 +125,21 @@ def test_the_box_of_an_arm_is_its_limits_but_at_most_a_turn():
     np.testing.assert_array_equal(box.upper, np.pi)  # the file says ±2π
     np.testing.assert_array_equal(Box.of_robot(panda, 7, 2.0).lower, panda.lower)
     np.testing.assert_array_equal(Box.of_robot(None, 2, 1.0).lower, -np.pi)
+
+
+def test_a_long_rail_is_no_turn(tmp_path):
+    """A sliding joint of 0 to 8 m keeps its limits, where data are drawn and where models are compared."""
+    rail = tmp_path / "rail.urdf"
+    text = (Path(__file__).parent / "data" / "gantry.urdf").read_text()
+    rail.write_text(text.replace('lower="4" upper="6" effort="400"', 'lower="0" upper="8" effort="400"'))
+    robot = nbs.load_robot(rail)
+    box = Box.of_robot(robot, robot.nv, 2.0)
+    assert (box.lower[0], box.upper[0]) == (0.0, 8.0)
+    assert (box.lower[1], box.upper[1]) == (3.5, 6.0)
+    np.testing.assert_array_equal((box.lower, box.upper), configuration_box(robot))
+    rail.write_text(rail.read_text().replace('lower="3.5" upper="6"', 'lower="0" upper="9"'))
+    turning = nbs.load_robot(rail).one_turn_range
+    np.testing.assert_allclose((turning[0][1], turning[1][1]), (4.5 - np.pi, 4.5 + np.pi))  # a turn it can make
 
 
 def test_the_scale_of_the_torque_is_found_and_free_motion_does_not_know_it():
@@ -294,6 +311,36 @@ def test_too_few_trajectories_say_nothing(run):
         "q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")}})  # fmt: skip
     found = mismatch.mismatch(perturbed(), TRUTH, one)
     assert (found.violation, found.trajectories) == (1.0, 1)
+
+
+def test_copies_of_a_start_count_once(run):
+    def copied(columns):
+        names = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+        return dataclasses.replace(run, **{name: getattr(run, name)[:, columns] for name in names})
+
+    model = perturbed()
+    found, twice, one = (
+        mismatch.mismatch(model, TRUTH, copied(columns))
+        for columns in (np.arange(12), np.tile(np.arange(12), 2), np.zeros(374, dtype=int))
+    )
+    assert (found.trajectories, twice.trajectories, one.trajectories) == (12, 12, 1)
+    assert twice.violation == found.violation < 1.0
+    assert one.violation == 1.0
+    assert (twice.a, twice.b, twice.c) == pytest.approx((found.a, found.b, found.c))
+
+
+def test_friction_of_the_plant_is_no_error_of_the_model():
+    friction = nbs.JointFriction(np.array([0.8, 0.5, 0.3]), np.array([0.4, 0.3, 0.2]), 0.1)
+    plant, model = nbs.DynamicsPlant(TRUTH, friction=friction), perturbed()
+    law, away = nbs.ComputedTorque(model, kp=100.0, kd=20.0), np.random.default_rng(0).uniform(-0.3, 0.3, (5, 3))
+    run = nbs.simulate(plant, law, nbs.Sinusoid(np.full(3, 0.5), 2.0), 0.3, 0.01, q0=away, effort_limit=np.inf)
+    told, untold = (compare(model, TRUTH, 20, run=run, motions=0, friction=x) for x in (friction, None))
+    np.testing.assert_array_equal(told.mismatch.rms, mismatch.mismatch(model, TRUTH, run, friction=friction).rms)
+    assert (np.abs(told.mismatch.rms / untold.mismatch.rms - 1.0) > 0.01).any()
+    states = [x[:-1].reshape(-1, 3) for x in (run.q, run.v)]
+    a = mismatch.accelerations(TRUTH, run, friction).reshape(-1, 3)
+    assert told.along_run.inverse == pytest.approx(judge(model, TRUTH, *states, a).errors.inverse)
+    assert untold.along_run.inverse != pytest.approx(told.along_run.inverse)
 
 
 def test_the_scenario_promise_is_kept():

@@ -82,11 +82,7 @@ def work(robot: Robot, generator: np.random.Generator) -> Sinusoid:
 
 def configuration_box(robot: Robot) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """(lower, upper) of the configurations to learn from [rad, m]: the joint ranges, of turning joints one turn."""
-    lower, upper = robot.sampling_range
-    prismatic = np.array([joint.prismatic for joint in robot.joints])
-    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-    half = np.where(prismatic, half, np.minimum(half, np.pi))
-    return middle - half, middle + half
+    return robot.one_turn_range
 
 
 def torque_limits(robot: Robot) -> Float[np.ndarray, " n"]:
