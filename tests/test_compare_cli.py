@@ -192,6 +192,17 @@ def test_what_cannot_be_compared_is_refused_in_a_sentence(tmp_path, capsys, opti
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.parametrize("name", ["data.npz", "summary.json", "model.NBS", "gone.npz"])
+def test_a_file_that_is_no_model_is_refused_as_such(tmp_path, capsys, name):
+    if name != "gone.npz":
+        (tmp_path / name).write_bytes(b"PK\x03\x04\xff\xfe")
+    for options in ((), ("--against", "three_link")):
+        assert run(tmp_path / "a", str(tmp_path / name), *options) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{name}' is neither a model nor an arm; give a .nbs file with a model, or an arm" in line
+        assert "UTF-8" not in line
+
+
 def test_a_law_without_a_model_is_refused(tmp_path, capsys):
     nbs.save(nbs.PID.for_robot(nbs.load_robot("two_link")), tmp_path / "pid.nbs")
     assert run(tmp_path / "a", str(tmp_path / "pid.nbs"), "--against", "two_link") == 2

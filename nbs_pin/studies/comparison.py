@@ -31,6 +31,7 @@ FILES = ("errors.png", "errors.csv", "summary.json")
 """What `write_results` writes, the summary last."""
 TRAJECTORIES = 374
 """Starts for which the bound on δ holds for 95 % of further ones, but for one chance in a million (`mismatch.py`)."""
+_ENDINGS = ("", ".nbs", ".urdf", ".xacro", ".xml")
 
 
 class Comparison(NamedTuple):
@@ -46,8 +47,14 @@ class Comparison(NamedTuple):
 def model_of(text: str) -> DynamicsProvider:
     """The model that a .nbs file holds, the one its law believes in if it holds a law, or Pinocchio's of an arm.
 
-    Raises ArgumentError for a law without a model; errors of `load` and `load_robot` else.
+    Raises ArgumentError for a law without a model, and a file that is neither by its ending; errors of `load` and
+    `load_robot` else.
     """
+    if Path(text).suffix not in _ENDINGS:
+        raise ArgumentError(
+            f"'{text}' is neither a model nor an arm; give a .nbs file with a model, or an arm by name or as a .urdf "
+            "or .xacro file."
+        )
     if not text.endswith(".nbs"):
         return PinocchioDynamics(load_robot(text))
     stored: Any = load(text)
