@@ -4,6 +4,7 @@ import csv
 import json
 from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -124,6 +125,44 @@ def test_a_file_that_is_no_dataset_is_refused(tmp_path, change, words):
     ("change", "words"), [({"a": np.full((12, 2), np.inf)}, "inf"), ({"t": -np.arange(12.0)}, "must increase")]
 )
 def test_arrays_that_make_no_dataset_are_refused(change, words):
+    with pytest.raises(ArgumentError, match=words):
+        rebuilt(made(), **change)
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Annotations are not executed, as in a user's session."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_numbers_of_other_kinds_become_float64():
+    data = made()
+    lists = rebuilt(data, **{name: getattr(data, name).tolist() for name in ARRAYS})
+    single = rebuilt(data, **{name: getattr(data, name).astype(np.float32) for name in ARRAYS})
+    whole = rebuilt(data, q=np.ones((12, 2), dtype=int), trajectory=data.trajectory.astype(np.uint8))
+    for other in (lists, single, whole):
+        for name in ARRAYS:
+            assert getattr(other, name).dtype == getattr(data, name).dtype
+    for name in ARRAYS:
+        assert_array_equal(getattr(lists, name), getattr(data, name))
+        assert_allclose(getattr(single, name), getattr(data, name), rtol=1e-6)
+    assert_array_equal(whole.trajectory, data.trajectory)
+    assert rebuilt(data).q is data.q
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"q": [[1.0, 2.0], [3.0]]}, "dataset's q is .*equal rows"),
+        ({"tau": "none"}, "dataset's tau is none"),
+        ({"trajectory": np.full(12, 0.5)}, "trajectory is .*expected whole numbers"),
+        ({"trajectory": np.full(12, np.nan)}, "trajectory is .*expected whole numbers"),
+        ({"prismatic": [0, 2]}, "prismatic is .*expected true or false"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_array_of_numbers_is_refused(change, words):
     with pytest.raises(ArgumentError, match=words):
         rebuilt(made(), **change)
 
@@ -414,6 +453,10 @@ def test_a_log_is_read_whatever_the_order_of_its_columns(tmp_path, measured):
 def test_a_dataset_and_a_run_are_logs(tmp_path, measured):
     measured.save(tmp_path / "data.npz")
     assert_array_equal(load_log(tmp_path / "data.npz").q, measured.q)
+    assert_array_equal(load_log(tmp_path / "data.npz", robot=nbs.load_robot("ur5")).q, measured.q)
+    for other, words in (("ur10", "of ur5, not of ur10"), ("three_link", "6 joints and three_link 3")):
+        with pytest.raises(FileFormatError, match=rf"data\.npz: .*{words}"):
+            load_log(tmp_path / "data.npz", robot=nbs.load_robot(other))
     robot = nbs.load_robot("two_link")
     law = nbs.PD.for_robot(robot)
     run = nbs.simulate(MujocoPlant(robot), law, nbs.Sinusoid.for_robot(robot, 3.0), 0.5, 0.001)

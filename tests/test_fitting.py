@@ -8,6 +8,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 import nbs_pin as nbs
+from nbs_pin.catalogue import find
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.learning import network_fit
@@ -16,6 +17,8 @@ from nbs_pin.learning.fit_report import torque_errors, torque_nmse
 from nbs_pin.learning.fitting import MODELS, fit, parted
 from nbs_pin.learning.network_equations import Equation, Equations
 from nbs_pin.learning.network_fit import fit_network
+from nbs_pin.learning.recipes import collect
+from nbs_pin.learning.same_arm import arm_fault
 from nbs_pin.learning.unexcited import unexcited
 from nbs_pin.networks.families import NETWORKS, make_network
 
@@ -285,6 +288,56 @@ def test_held_out_data_are_of_the_same_arm():
     three = Dataset(*np.zeros((4, 5, 3)), np.arange(5.0), np.arange(5), np.array([0, 1, 2]), np.zeros(3, bool))
     with pytest.raises(ArgumentError, match="held_out has 3 joints and the data 2"):
         fit(states(20), "cholesky", held_out=three)
+
+
+def rows(robot=ROBOT, samples=30, seed=0):
+    """Data that say which arm they are of."""
+    return collect(robot, "uniform", samples, seed)
+
+
+def test_data_of_another_arm_are_refused():
+    """Two arms of seven turning joints in a row: only their names and fingerprints tell them apart."""
+    panda, xarm = nbs.load_robot("panda"), nbs.load_robot("xarm7")
+    data = rows(panda)
+    for model in ("chain", "identified", "residual"):
+        with pytest.raises(ArgumentError, match="the data are of panda, not of xarm7"):
+            fit(data, model, robot=xarm)
+    with pytest.raises(ArgumentError, match="held_out is of xarm7 and the data of panda"):
+        fit(data, "identified", robot=panda, held_out=rows(xarm))
+    with pytest.raises(ArgumentError, match="held_out is of xarm7"):
+        parted(data, rows(xarm))
+
+
+@pytest.mark.parametrize("change", [{"parents": np.array([0, 0])}, {"prismatic": np.array([True, False])}])
+def test_data_of_another_tree_are_refused(change):
+    data, other = states(20), replace(states(20), **change)
+    with pytest.raises(ArgumentError, match=r"those of two_link turning on the base, turning on joint 1; give the arm"):
+        fit(other, "identified", robot=ROBOT)
+    with pytest.raises(ArgumentError, match="the joints of held_out are"):
+        fit(data, "identified", robot=ROBOT, held_out=other)
+
+
+def test_a_nominal_arm_may_be_wrong(tmp_path):
+    """What "identified" and "residual" are for: another description of the same joints, other limits, other gravity."""
+    text = find("two_link").path.read_text().replace('mass value="1"', 'mass value="1.5"')
+    text = text.replace('name="two_link"', 'name="guess"')
+    (tmp_path / "guess.urdf").write_text(text)
+    nominal, data = nbs.load_robot(tmp_path / "guess.urdf"), rows()
+    assert (nominal.name, nominal.sha256 == ROBOT.sha256) == ("guess", False)
+    assert fit(data, "identified", robot=nominal).report.train_nmse < 1e-5
+    assert fit(rows(nominal), "identified", robot=ROBOT).report.train_nmse < 1e-5
+    for robot in (nominal, nbs.load_robot("two_link", gravity=9.0), ROBOT.with_effort_limit(3.0)):
+        assert arm_fault(data, robot) == ""
+    assert parted(data, rows(ROBOT.with_effort_limit(30.0), seed=1))[1] is not None
+    assert arm_fault(states(5), ROBOT) == arm_fault(replace(states(5), robot="mine"), ROBOT) == ""
+
+
+@pytest.mark.parametrize("model", ["cholesky", "chain"])
+def test_single_precision_is_learned_from(model):
+    data = states(60)
+    half = {name: getattr(data, name).astype(np.float32) for name in ("q", "v", "a", "tau", "t")}
+    settings = {"iterations": 2, "widths": (4,)} if model == "cholesky" else {}
+    assert np.isfinite(fit(replace(data, **half), model, **settings).report.train_nmse)
 
 
 def test_every_model_is_in_the_table():

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nbs_pin.checks import floats
 from nbs_pin.exceptions import ArgumentError, FileFormatError
 from nbs_pin.npz import read_npz, require, write_npz
 from nbs_pin.robot import Robot
@@ -17,6 +18,11 @@ from nbs_pin.robot import Robot
 DATASET_FORMAT = "nbs_pin dataset 1"
 """What the `format` entry of a data file says."""
 _STATES = ("q", "v", "a", "tau")
+_KINDS: dict[tuple[str, ...], type] = {
+    (*_STATES, "t"): np.float64,
+    ("trajectory", "parents"): np.int64,
+    ("prismatic",): np.bool_,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +31,9 @@ class Dataset:
 
     The samples of a trajectory are contiguous and in the order of time. Samples of one trajectory resemble each other,
     so only whole trajectories are held out (`split`), and a claim counts them, not samples (docs/theory.md §5).
-    Raises ArgumentError for arrays that do not fit each other, numbers that are not finite, a trajectory that is
-    interrupted or runs backwards, and a tree whose parents do not come first.
+    Lists and numbers of other kinds become arrays of float64, int64 and bool.
+    Raises ArgumentError for what is no array of such numbers, arrays that do not fit each other, numbers that are not
+    finite, a trajectory that is interrupted or runs backwards, and a tree whose parents do not come first.
     """
 
     q: Float[np.ndarray, "samples n"]
@@ -51,6 +58,9 @@ class Dataset:
     """How the data came to be (recipe, seed, noise, friction, …), as JSON can store it."""
 
     def __post_init__(self) -> None:
+        for names, kind in _KINDS.items():
+            for name in names:
+                object.__setattr__(self, name, _array(name, getattr(self, name), kind))
         fault = _fault(self)
         if fault:
             raise ArgumentError(f"dataset{f' of {self.robot}' if self.robot else ''}: {fault}.")
@@ -151,6 +161,17 @@ def _fault(data: Dataset) -> str:
     """What is wrong with a dataset and what to do, or an empty string."""
     arrays = {name: getattr(data, name) for name in (*_STATES, "t", "trajectory", "parents", "prismatic")}
     return _shape_fault(arrays) or _number_fault(arrays) or _order_fault(data) or _tree_fault(data)
+
+
+def _array(name: str, value: Any, kind: type) -> np.ndarray:
+    """The values as an array of that kind, itself where it is one; nothing is rounded to a whole number or a bool."""
+    numbers = floats(f"the dataset's {name}", value)
+    with np.errstate(invalid="ignore"):  # NaN as a whole number is refused below
+        array: np.ndarray = np.asarray(value).astype(kind, copy=False)
+    if kind is not np.float64 and not np.array_equal(array, numbers):
+        expected = "whole numbers" if kind is np.int64 else "true or false for every joint"
+        raise ArgumentError(f"the dataset's {name} is {value!s:.200}, expected {expected}; correct it.")
+    return array
 
 
 def _shape_fault(arrays: Mapping[str, np.ndarray]) -> str:

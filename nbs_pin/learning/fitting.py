@@ -20,6 +20,7 @@ from nbs_pin.learning.fit_report import FitReport, torque_nmse
 from nbs_pin.learning.identification import identify
 from nbs_pin.learning.network_equations import deviation_of
 from nbs_pin.learning.network_fit import NetworkFit, fit_network
+from nbs_pin.learning.same_arm import arm_fault, other_data_fault
 from nbs_pin.learning.unexcited import unexcited
 from nbs_pin.networks.families import make_network
 from nbs_pin.networks.lagrangian import LagrangianNetwork
@@ -94,13 +95,14 @@ def fit(
     Coulomb friction too, which is no part of M, C, G. progress: show a bar.
     settings: loss, optimiser and iterations of a network (`fit_network`) and its widths; what `identify` takes.
     Ctrl-C ends the fit of a network and keeps the best. Raises ArgumentError for an unknown model, settings that are
-    none of its own, a missing robot or one of another number of joints, and data without torque unless the loss is that
-    of the acceleration.
+    none of its own, a missing robot or one that the data are not of (`same_arm.py`; its masses and lengths may be
+    wrong), held_out of another arm, and data without torque unless the loss is that of the acceleration.
     """
     if model not in _FITTERS:
         raise ArgumentError(f"model '{model}' is unknown; choose one of {', '.join(_FITTERS)}.")
-    if robot is not None and robot.nv != data.nv:
-        raise ArgumentError(f"the data have {data.nv} joints and {robot.name} {robot.nv}; give the arm they are of.")
+    fault = "" if robot is None else arm_fault(data, robot)
+    if fault:
+        raise ArgumentError(f"{fault}.")
     start = time.perf_counter()
     train, test = parted(data, held_out, seed)
     fitted = _FITTERS[model](FitTask(model, train, test, seed, robot, friction, progress, settings))
@@ -126,8 +128,9 @@ def fit(
 def parted(data: Dataset, held_out: Dataset | float | None = None, seed: int = 0) -> tuple[Dataset, Dataset | None]:
     """What is learned from, and what is held out for `fit` with these arguments; raises as `fit` does."""
     if isinstance(held_out, Dataset):
-        if held_out.nv != data.nv:
-            raise ArgumentError(f"held_out has {held_out.nv} joints and the data {data.nv}; give data of one arm.")
+        fault = other_data_fault(data, held_out, "held_out")
+        if fault:
+            raise ArgumentError(f"{fault}.")
         return data, held_out
     share = (HELD_OUT if data.trajectories > 1 else 0.0) if held_out is None else held_out
     return (data, None) if share == 0.0 else data.split(share, seed)

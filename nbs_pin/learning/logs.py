@@ -12,6 +12,7 @@ from nbs_pin.exceptions import ArgumentError, FileFormatError
 from nbs_pin.learning.datasets import DATASET_FORMAT, Dataset, joint_tree, load_dataset, trajectory_slices
 from nbs_pin.learning.log_files import Columns, columns_of_arrays, columns_of_csv
 from nbs_pin.learning.measuring import ORDER, derivative
+from nbs_pin.learning.same_arm import arm_fault
 from nbs_pin.npz import read_npz
 from nbs_pin.robot import Robot
 
@@ -43,14 +44,15 @@ def load_log(
     robot: gives names, tree and ranges of the joints; without it, a serial arm of which `prismatic` says what slides.
     Warns of a single trajectory and of a log without torque, from which no model can be had (docs/theory.md §6).
     Raises FileNotFoundError for no file and FileFormatError naming file, row or column and remedy for a missing column,
-    a number that is none, time that does not increase, v that is not dq/dt, a that is not dv/dt, and degrees.
+    a number that is none, time that does not increase, v that is not dq/dt, a that is not dv/dt, degrees, and a dataset
+    of another arm than `robot` (`same_arm.py`).
     """
     path = Path(path)
     names = None if robot is None else robot.joint_names
     if path.suffix.lower() == ".npz":
         stored = read_npz(path)
         if str(stored.get("format", "")) == DATASET_FORMAT:
-            return load_dataset(path)
+            return _of_arm(path, load_dataset(path), robot)
         columns = columns_of_arrays(path, stored, names)
     elif path.suffix.lower() == ".csv":
         columns = columns_of_csv(path, names)
@@ -61,6 +63,14 @@ def load_log(
     data = _dataset(path, columns, tree, window, "" if robot is None else robot.name)
     _check_derivatives(path, data)
     _warn(path, data)
+    return data
+
+
+def _of_arm(path: Path, data: Dataset, robot: Robot | None) -> Dataset:
+    """The data, once they may be of the arm."""
+    fault = "" if robot is None else arm_fault(data, robot)
+    if fault:
+        raise FileFormatError(f"{path}: {fault}.")
     return data
 
 
