@@ -1,7 +1,7 @@
 """Models from noisy data of arms with friction, over sample sizes: the chain, identified inertias, a plain network."""
 
 from collections.abc import Mapping, Sequence
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ ERRORS = {
     "coriolis": "C v",
     "gravity": "G",
 }
+_TIE = 0.05
 _JUDGED = ("torque_excited", "torque_uniform")  # what the plain network has as well
 
 
@@ -128,8 +129,10 @@ def _ratios(trials: Sequence[Trial], name: str) -> dict[str, float]:
 
 
 def _ranking(trials: Sequence[Trial], name: str, arm: str, size: int) -> list[str]:
-    """The models, best first."""
-    return sorted(MODELS, key=lambda model: _median(trials, name, arm=arm, samples=size, model=model))
+    """The models, best first; those that differ by less than `_TIE` from what knows more of the arm stay behind it."""
+    error = {model: _median(trials, name, arm=arm, samples=size, model=model) for model in MODELS}
+    ahead = any(error[b] < (1.0 - _TIE) * error[a] for a, b in combinations(MODELS, 2))
+    return sorted(MODELS, key=lambda model: error[model]) if ahead else list(MODELS)
 
 
 def _draw(trials: Sequence[Trial], name: str, path: Path) -> None:
@@ -196,7 +199,7 @@ def _order(trials: Sequence[Trial]) -> str:
         told.append(
             f"Errors of the {ERRORS[name]} are in the order {usual} {said}.".replace("the torque on", "torque on")
         )
-    return "\n".join(told)
+    return "\n".join([*told, f"Less than {_TIE:.0%} is no difference here."])
 
 
 def _ratio(trials: Sequence[Trial]) -> str:
