@@ -29,6 +29,7 @@ from nbs_pin.learning.physical_tree import FREE, PARALLEL, RIGHT, PhysicalTree
 from nbs_pin.learning.recipes import collect
 from nbs_pin.learning.regressor import RobotGeometry, Scalars
 from nbs_pin.learning.tree_guess import Measured, TreeGuess
+from nbs_pin.learning.unexcited import unexcited
 from nbs_pin.networks.chain import Chain, Tree, random_tree
 from nbs_pin.robot import load_robot
 from nbs_pin.runtime.layout import Packed
@@ -49,11 +50,12 @@ BRANCHED = TREES[4]
 BOXES = st.integers(0, 10_000), st.floats(0.0, 30.0)
 
 
-def scrambled(parents, prismatic, seed=0, spread=0.05, epsilon=1e-12) -> Chain:
-    """A random tree with bodies of any shape."""
+def scrambled(parents, prismatic, seed=0, spread=0.05, epsilon=1e-12, rotors=False) -> Chain:
+    """A random tree with bodies of any shape, and with rotors if wanted."""
     network, rng = Chain(parents, prismatic, epsilon, seed), np.random.default_rng(seed)
-    for parameter in network.parameters():
-        parameter.data += spread * torch.from_numpy(rng.normal(size=parameter.shape))
+    for name, parameter in network.named_parameters():
+        if name != "rotors" or rotors:
+            parameter.data += spread * torch.from_numpy(rng.normal(size=parameter.shape))
     return network
 
 
@@ -141,7 +143,7 @@ def test_kinetic_energy_is_quadratic_in_the_velocity(tree):
 @pytest.mark.parametrize("tree", TREES)
 def test_the_definition_and_the_kernels_are_one(tree):
     for seed in range(3):
-        network = scrambled(*tree, seed, epsilon=0.01)
+        network = scrambled(*tree, seed, epsilon=0.01, rotors=True)
         arguments = states(network, seed=seed)
         expected = network.torque(*map(torch.from_numpy, arguments)).detach().numpy()
         assert relative(network.compiled()(*arguments) - expected, expected) < 1e-12
@@ -174,10 +176,8 @@ def test_a_massless_tree_is_its_floor(seed, spread):
     assert not network.gravity(q).any()
 
 
-@pytest.mark.parametrize("name", ["ur5", GANTRY])
-def test_with_the_parameters_of_an_arm_the_chain_is_the_arm(name):
-    """Every arm is in the class: its placements and bodies put in by hand."""
-    robot = load_robot(name)
+def chain_of(robot) -> Chain:
+    """The arm as a chain: its placements and bodies put in by hand."""
     truth, (parents, prismatic) = PinocchioDynamics(robot), joint_tree(robot)
     weights = truth.packed_tree().weights
     joints = weights[3:].reshape(robot.nv, BODY)
@@ -192,6 +192,15 @@ def test_with_the_parameters_of_an_arm_the_chain_is_the_arm(name):
             body[:3, 3], body[3, 3] = row[13:16], row[12]
             body = np.triu(body) + np.triu(body, 1).T
             network.factors[j] = torch.from_numpy(np.linalg.cholesky(body + 1e-13 * np.eye(4)))
+    return network
+
+
+@pytest.mark.parametrize("name", ["ur5", GANTRY])
+def test_with_the_parameters_of_an_arm_the_chain_is_the_arm(name):
+    """Every arm is in the class."""
+    robot = load_robot(name)
+    truth, (_, prismatic) = PinocchioDynamics(robot), joint_tree(robot)
+    network = chain_of(robot)
     model = LagrangianDynamics(network)
     assert errors(model, truth, prismatic).max() < 1e-9
     q = states(network)[0]
@@ -683,3 +692,43 @@ def test_bodies_that_were_found_can_exist(model):
     factors = model.network.factors.detach().tril()
     bodies = (factors @ factors.mT).numpy()
     assert (np.linalg.eigvalsh(bodies) > 0.0).all()
+
+
+def test_rotors_behind_gears_are_found_with_the_tree():
+    robot = nbs.load_robot("two_link")
+    data = collect(robot, "uniform", 300, 0)
+    rotors = np.array([0.3, 0.7])
+    fitted = fit(replace(data, tau=data.tau + rotors * data.a), "chain", rotor_inertia=True)
+    truth = nbs.PinocchioDynamics(robot)
+    q = np.random.default_rng(1).uniform(-np.pi, np.pi, (20, 2))
+    np.testing.assert_allclose(fitted.mass_matrix(q), truth.mass_matrix(q) + np.diag(rotors), atol=1e-9)
+    np.testing.assert_allclose(fitted.network.rotors[1] ** 2, 0.7, rtol=0.3)  # the first one's share is its body's
+    without = fit(replace(data, tau=data.tau + rotors * data.a), "chain")
+    assert without.report.train_nmse > 1e-4  # no tree of bodies has rotors
+
+
+def test_joints_that_never_move_do_not_spoil_the_others():
+    robot = nbs.load_robot("three_link")
+    data, truth = collect(robot, "uniform", 300, 0), nbs.PinocchioDynamics(robot)
+    moves = np.arange(3) < 2
+    q, v, a = np.where(moves, data.q, 0.7), data.v * moves, data.a * moves
+    data = replace(data, q=q, v=v, a=a, tau=nbs.inverse_dynamics(truth, q, v, a))
+    report = fit(data, "chain", seed=0).report
+    assert report.train_nmse < 1e-12
+    assert report.stopped == "converged"
+
+
+def test_a_small_box_leaves_gravity_elsewhere_open():
+    robot = load_robot("ur5")
+    network, data = chain_of(robot), collect(robot, "uniform", 400, 0)
+    small = replace(data, q=0.02 * data.q / np.pi)
+    assert any(line.startswith("gravity of") for line in unexcited(network, small))
+    assert unexcited(network, data) == ()
+
+
+def test_noise_alone_is_said_to_be_noise():
+    data = collect(nbs.load_robot("two_link"), "uniform", 300, 0)
+    noise = np.random.default_rng(0).normal(size=data.tau.shape)
+    report = fit(replace(data, tau=noise), "chain", starts=8).report
+    assert report.unexcited[0].startswith("everything: ")
+    assert report.train_nmse > 0.9

@@ -7,6 +7,7 @@
    (`identification.explain`).
 """
 
+import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +37,11 @@ _EXACT = 1e-16
 """Weighted residual below which a descent has found the arm."""
 _USUAL = 8
 """Random trees that show which torques are usual."""
+_ONE_AT_A_TIME = threading.Lock()
+_AXIS = 4
+"""Numbers that place the axis of a joint."""
+_TRIES, _REACHED = 4, 2.0
+"""Trees that physical bodies are sought for, until their residual is at most so many times that of any bodies."""
 _WAVE = 8
 """Descents between two looks at the results."""
 _SAME, _FAR = 0.02, 0.1
@@ -62,6 +68,8 @@ class ChainFit:
     """Steps of all descents."""
     costs: Float[np.ndarray, " starts"]
     """Torque nMSE where each descent of the search ended."""
+    settled: bool
+    """Whether one tree explained the data, or the best minimum was met often enough, and physical bodies reach it."""
     bodies: IdentificationReport
     """How the bodies were found, and what the data do not excite."""
     seconds: float
@@ -73,6 +81,7 @@ def fit_chain(
     seed: int = 0,
     *,
     friction: bool = False,
+    rotor_inertia: bool = False,
     transition: float = 0.01,
     regularisation: float = 0.3,
     starts: int = 64,
@@ -84,40 +93,53 @@ def fit_chain(
     """The rigid tree that moves as the data do; of the arm only the order and the kinds of its joints are given.
 
     friction: also find viscous and Coulomb coefficients ≥ 0, for the speed `transition` [rad/s] at which they turn.
+    rotor_inertia: also find the inertias ≥ 0 of rotors behind gears, which an arm has and a tree of bodies has not.
     regularisation: see `identify`. starts: most random trees to descend from; a search ends as soon as one explains the
     data to rounding, or the best minimum has been met often enough. epsilon: ε of the network [kg·m²]. right_angles:
     axes of neighbouring joints that the data do not tell from parallel or perpendicular become so, as most arms are
     built, which spares part of what unknown geometry costs under noise. names: what to call the joints.
-    progress: show a bar at a terminal.
+    progress: show a bar at a terminal. Ctrl-C ends the search and goes on with the best tree so far, if there is one.
     Raises ArgumentError for data without torque, which arms of every scale explain, and as `identify` does.
     """
     began = time.perf_counter()
     positive("transition", transition, "rad/s")
     positive("regularisation", regularisation, "measurements")
-    if starts < 1:
-        raise ArgumentError(f"starts is {starts}, expected 1 or more random trees to descend from; 64 is usual.")
+    if not (isinstance(starts, int) and starts >= 1):
+        raise ArgumentError(f"starts is {starts}, expected a whole number ≥ 1 of random trees; 64 is usual.")
     if not data.tau.any():
         raise ArgumentError(f"{data!r} has no torque: arms of every scale move so; record one with motors on.")
-    scalars = Scalars(friction, rotor_inertia=False, transition=transition)
+    network = Chain(data.parents.tolist(), data.prismatic.tolist(), epsilon)
+    scalars = Scalars(friction, rotor_inertia, transition)
     measured, layout = _measured(data, scalars), _layout(data.parents, data.prismatic)
     handy, rng = _in_handy_units(measured, layout), np.random.default_rng(seed)
-    with threadpool_limits(1, "blas"):  # threads below the threads of the search would only wait for each other
+    # BLAS threads below the threads of the search would only wait for each other; the limit is the whole process's.
+    with _ONE_AT_A_TIME, threadpool_limits(1, "blas"):
         descents = _search(handy, layout, starts, rng, progress)
-        best = min(descents, key=_cost)
-        polished = _polished(best.at, handy)
         called = [f"joint {i}" for i in range(data.nv)] if names is None else names
-        bodies = explain(TreeGeometry(polished.at, data.parents, called), data, scalars, regularisation)
-        physical = _physical(polished.at, bodies, measured, regularisation, right_angles)
-    network = Chain(data.parents.tolist(), data.prismatic.tolist(), epsilon)
+        tries = []
+        for descent in sorted(descents, key=_cost)[:_TRIES]:
+            polished = _polished(descent.at, handy)
+            geometry = TreeGeometry(polished.at, data.parents, called)
+            bodies = explain(geometry, data, scalars, regularisation, others=_AXIS * data.nv)
+            physical = _physical(polished.at, bodies, measured, regularisation, right_angles)
+            tries.append((physical.whole().cost(measured), physical, bodies, descent))
+            reached = tries[-1][0] <= _REACHED * polished.at.cost(handy) + _EXACT
+            if reached:
+                break
+        _, physical, bodies, best = min(tries, key=lambda found: found[0])
     with torch.no_grad():
-        for name, value in physical.guess.tree(np.linalg.cholesky(physical.whole().bodies))._asdict().items():
+        for name, value in physical.guess.tree(_triangular(physical.factors))._asdict().items():
             getattr(network, name).copy_(torch.from_numpy(value))
+        if rotor_inertia:
+            network.rotors.copy_(torch.from_numpy(np.sqrt(physical.drag[-1])))
+    costs = np.array([_cost(descent) for descent in descents])
     return ChainFit(
         network=network,
         friction=JointFriction(physical.drag[0], physical.drag[1], transition) if friction else None,
         history=np.array(best.history),
         evaluations=sum(len(descent.history) for descent in descents),
-        costs=np.array([_cost(descent) for descent in descents]),
+        costs=costs,
+        settled=reached and _settled(costs),
         bodies=bodies.report,
         seconds=time.perf_counter() - began,
     )
@@ -192,7 +214,12 @@ def _search(
 
     with ThreadPoolExecutor(cores()) as pool:
         for _ in tracked(range(-(-starts // _WAVE)), label, progress):
-            descents.extend(pool.map(descend, rng.spawn(min(_WAVE, starts - len(descents)))))
+            try:
+                descents.extend(list(pool.map(descend, rng.spawn(min(_WAVE, starts - len(descents))))))
+            except KeyboardInterrupt:
+                if not descents:
+                    raise
+                break
             if _settled(np.array([_cost(x) for x in descents])):
                 break
     return descents
@@ -239,3 +266,8 @@ def _physical(guess: TreeGuess, bodies: Bodies, data: Measured, strength: float,
         if worse < _UNLIKELY + _LIKELY * np.count_nonzero(held.at.angles):
             return held.at
     return free.at
+
+
+def _triangular(factors: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """Lower triangular factors of the same FFᵀ, which need not be positive definite after rounding: FᵀQ = R, L = Rᵀ."""
+    return np.linalg.qr(factors.swapaxes(1, 2), mode="r").swapaxes(1, 2)

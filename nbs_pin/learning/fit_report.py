@@ -34,9 +34,10 @@ class FitReport:
     train_nmse: float
     """Mean over joints of mean squared torque error over torque variance (`torque_nmse`)."""
     test_nmse: float | None
-    """The same on what was held out, None where nothing was."""
+    """The same on what was held out, None where nothing was; optimistic for a network, whose iteration it chose."""
     stopped: str
-    """Why it ended: "converged", "iterations", "held out" (no better there any more) or "interrupted"."""
+    """Why it ended: "converged", "iterations", "held out" (no better there any more), "interrupted", or, of a chain,
+    "starts": no other random tree met the best minimum, or no physical bodies reach it; give more data or starts."""
     unexcited: tuple[str, ...]
     """What the data leave open, the worst first."""
     details: Mapping[str, Any] = field(default_factory=dict)

@@ -29,6 +29,8 @@ from nbs_pin.robot import Robot
 ModelName: TypeAlias = Literal["chain", "cholesky", "homogenised", "picnn", "unconstrained", "residual", "identified"]
 """What `fit` knows: rigid trees and networks, which need no description of the arm, a network that corrects the arm's
 nominal model, and inertias that are put into its URDF's geometry."""
+_USELESS = 0.9
+"""Share of the torque's variance left unexplained beyond which a model says nothing."""
 HELD_OUT = 0.2
 """Share of the trajectories that `fit` holds out by default."""
 _WIDTHS = {"cholesky": (32, 32), "homogenised": (20, 20), "picnn": (16, 16, 16), "unconstrained": (32, 32)}
@@ -119,7 +121,7 @@ def fit(
         train_nmse=torque_nmse(bare, train, fitted.friction),
         test_nmse=None if test is None else torque_nmse(bare, test, fitted.friction),
         stopped=fitted.stopped,
-        unexcited=fitted.unexcited,
+        unexcited=_useless(bare, train, fitted.friction) + fitted.unexcited,
         details=fitted.details,
     )
     return fitted.assemble(report)
@@ -134,6 +136,18 @@ def parted(data: Dataset, held_out: Dataset | float | None = None, seed: int = 0
         return data, held_out
     share = (HELD_OUT if data.trajectories > 1 else 0.0) if held_out is None else held_out
     return (data, None) if share == 0.0 else data.split(share, seed)
+
+
+def _useless(model: DynamicsProvider, data: Dataset, friction: JointFriction | None) -> tuple[str, ...]:
+    """What to say of a fit that explains next to nothing: torque that is noise, or does not change."""
+    nmse = torque_nmse(model, data, friction)
+    if np.isnan(nmse) and data.tau.any():
+        return ("everything: the torque never varies, so nothing was learned of how it does",)
+    if nmse > _USELESS and data.tau.any():
+        return (
+            f"everything: {nmse:.0%} of the torque's variance is unexplained, as if it were noise or another arm's",
+        )
+    return ()
 
 
 def _fit_family(task: FitTask) -> Fitted:
@@ -159,7 +173,7 @@ def _fit_family(task: FitTask) -> Fitted:
 
 def _fit_chain(task: FitTask) -> Fitted:
     """A rigid tree, of which the data give only the order of the joints."""
-    settings = task.known("transition", "regularisation", "starts", "epsilon")
+    settings = task.known("rotor_inertia", "transition", "regularisation", "starts", "epsilon", "right_angles")
     names = None if task.robot is None else task.robot.joint_names
     found = fit_chain(task.data, task.seed, friction=task.friction, names=names, progress=task.progress, **settings)
     network, bodies = found.network, found.bodies
@@ -169,7 +183,8 @@ def _fit_chain(task: FitTask) -> Fitted:
         parameters=sum(x.numel() for x in network.parameters()) + (2 * task.data.nv if found.friction else 0),
         history=tuple(found.history.tolist()),
         evaluations=found.evaluations,
-        unexcited=bodies.unexcited,
+        stopped="converged" if found.settled else "starts",
+        unexcited=unexcited(network, task.data, friction=found.friction, names=names or ()),
         details={
             "starts": len(found.costs),
             "nmse_of_starts": found.costs.tolist(),

@@ -113,9 +113,10 @@ class Bodies(NamedTuple):
         return JointFriction(self.scalars[0], self.scalars[1], scalars.transition) if scalars.friction else None
 
 
-def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation: float) -> Bodies:
+def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation: float, others: int = 0) -> Bodies:
     """The physically consistent bodies, friction and rotors that explain the data best, for that geometry.
 
+    others: numbers of the geometry that were fitted to the same data, which count where the noise is estimated.
     Raises ArgumentError as `identify` does.
     """
     start = time.perf_counter()
@@ -123,7 +124,7 @@ def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation:
     expected = expectation(geometry, data, scalars, triangles)
     equations = expected.in_units(triangles)
     base = _base_directions(geometry, data, scalars, expected)
-    noise = _noise(equations, base.shape[1], len(data))
+    noise = _noise(equations, base.shape[1] + others, len(data))
     design, target = _weighted(equations, noise)
     fit = consistent_fit(design, target, data.nv, regularisation)
     weak, values = _unexcited(design, base)

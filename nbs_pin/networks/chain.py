@@ -15,15 +15,16 @@ from nbs_pin.runtime.layout import Packed
 from nbs_pin.runtime.tree_layout import tree_workspace
 from nbs_pin.runtime.tree_rows import tree_torques
 
-_LAST_ROW = [[0.0, 0.0, 0.0, 1.0]]
-
 
 class Chain(LagrangianNetwork):
-    """T̂ = ½ Σ_j ‖Ṫ_j L_j‖² + ½ε‖v‖², V̂ = −Σ_j g·T_j L_j(L_jᵀ)₄, with T_j = T_parent(j) A_j E(q_j) (docs/theory.md §6).
+    """T̂ = ½ Σ_j ‖Ṫ_j L_j‖² + ½ Σ_j (r_j² + ε) v_j², V̂ = −Σ_j g·T_j L_j(L_jᵀ)₄, T_j = T_parent(j) A_j E(q_j).
+
+    Source: docs/theory.md §6.
 
     A linear recursion along the tree: T_j is the 4×4 homogeneous transform of body j, A_j that of its joint at q = 0,
     and E turns about z, or slides along z. L_jL_jᵀ is the body's pseudo-inertia [[Σ m xxᵀ, Σ m x], [·, m]], so for all
-    parameter values every body is physical, T̂ is exactly quadratic and M̂ = Σ_j A_jᵀA_j + ε1 ⪰ ε1.
+    parameter values every body is physical, T̂ is exactly quadratic and M̂ = Σ_j A_jᵀA_j + diag(r² + ε) ⪰ ε1. r_j² is the
+    inertia of the joint's rotor, zero at the start.
 
     parents: 0 for the base, i + 1 for joint i. prismatic: joints that slide. epsilon: ε [kg·m², kg]. seed: of a random
     start, with links of some 0.3 m and 1 kg and gravity of 9.81 m/s² in a random direction.
@@ -38,6 +39,8 @@ class Chain(LagrangianNetwork):
     """(n, 4, 4) L_j, whose lower triangle is read."""
     field: Tensor
     """(3,) gravity g in the base frame [m/s²]."""
+    rotors: Tensor
+    """(n,) r: square roots of the rotors' inertias."""
 
     def __init__(
         self,
@@ -58,13 +61,14 @@ class Chain(LagrangianNetwork):
         self.nv, self.epsilon = len(self.parents), epsilon
         for name, value in random_tree(self.nv, np.random.default_rng(seed))._asdict().items():
             setattr(self, name, nn.Parameter(torch.from_numpy(value)))
+        self.rotors = nn.Parameter(torch.zeros(self.nv, dtype=torch.float64))
 
     def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
-        """M̂(q) = Σ_j A_jᵀA_j + ε1 [kg·m²], column i of A_j being ∂_iT_j L_j."""
+        """M̂(q) = Σ_j A_jᵀA_j + diag(r² + ε) [kg·m²], column i of A_j being ∂_iT_j L_j."""
         frames = self._frames(q)
         rates = self._rates(frames)  # (…, n joints, n bodies, 4, 4)
         columns = (rates @ self.factors.tril()).flatten(-2).flatten(-2)
-        return columns @ columns.mT + self.epsilon * torch.eye(self.nv, dtype=q.dtype, device=q.device)
+        return columns @ columns.mT + torch.diag(self.rotors.square() + self.epsilon)
 
     def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """V̂(q) [J]."""
@@ -76,17 +80,18 @@ class Chain(LagrangianNetwork):
         return -torch.einsum("...ijk,k->...i", (rates @ self._moments())[..., :3, 0], self.field)
 
     def packed_tree(self) -> Packed:
-        """The same tree for the kernels of `runtime/trees.py`, ε as armature."""
+        """The same tree for the kernels of `runtime/trees.py`, r² + ε as armature."""
         with torch.no_grad():
             rotations, factors = rotation_matrices(self.turns), self.factors.tril()
             inertia = (factors @ factors.mT).numpy()
+            armature = (self.rotors.square() + self.epsilon).numpy()
         layout, upper = [self.nv], np.triu_indices(3)
         weights = [-self.field.detach().numpy()]
         for i, (parent, slides) in enumerate(zip(self.parents, self.prismatic, strict=True)):
             layout += [parent, int(slides)]
             body = inertia[i]
             place = [rotations[i].numpy().ravel(), self.positions[i].detach().numpy()]
-            weights += [*place, body[3, 3:], body[:3, 3], body[:3, :3][upper], np.array([self.epsilon])]
+            weights += [*place, body[3, 3:], body[:3, 3], body[:3, :3][upper], armature[i : i + 1]]
         return Packed(np.array(layout, dtype=np.int64), np.concatenate(weights))
 
     def compiled(self) -> CompiledTorque:
