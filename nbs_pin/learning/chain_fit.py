@@ -270,4 +270,4 @@ def _physical(guess: TreeGuess, bodies: Bodies, data: Measured, strength: float,
 
 def _triangular(factors: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
     """Lower triangular factors of the same FFᵀ, which need not be positive definite after rounding: FᵀQ = R, L = Rᵀ."""
-    return np.linalg.qr(factors.swapaxes(1, 2), mode="r").swapaxes(1, 2)
+    return np.asarray(np.linalg.qr(factors.swapaxes(1, 2), mode="r")).swapaxes(1, 2)

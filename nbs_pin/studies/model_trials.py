@@ -93,7 +93,7 @@ class Judge:
         data = collect(robot, "excited", samples, FRESH_SEED, friction=friction or False)
         return cls(truth, uniform, fast, Motion(data.q, data.v, data.a, data.tau))
 
-    def torque_errors(self, torque: Torque) -> dict[str, float]:
+    def torque_errors(self, torque: Torque) -> dict[str, Any]:
         """The errors of the torque in a `Trial`."""
         motions = {"uniform": self.uniform, "fast": self.fast, "excited": self.excited}
         return {f"torque_{name}": _torque_error(torque, motion) for name, motion in motions.items()}
@@ -104,7 +104,7 @@ class Judge:
         tau = inverse_dynamics(self.truth, motion.q, motion.v, motion.a) + friction.torque(motion.v)
         return _torque_error(lambda *_: tau, motion)
 
-    def model_errors(self, model: DynamicsProvider) -> dict[str, float]:
+    def model_errors(self, model: DynamicsProvider) -> dict[str, Any]:
         """The other errors of a `Trial`; C v as what velocity adds to the torque, which is quick for every model."""
         q, v, rest = self.uniform.q, self.uniform.v, np.zeros_like(self.uniform.v)
         found, true = (
