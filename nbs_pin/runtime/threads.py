@@ -17,7 +17,7 @@ def cores() -> int:
 
 
 def over_cores(function: Callable[[slice], None], rows: int, fewest: int = FEWEST_ROWS) -> None:
-    """`function` of slices of at least `fewest` rows, which make up all, at once; at most one for each of the `cores`."""
+    """`function` of slices of at least `fewest` rows, which make up all, at once; one per core at most."""
     parts = min(cores(), rows // fewest)
     if parts < 2:
         function(slice(0, rows))
