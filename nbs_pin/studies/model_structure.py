@@ -40,6 +40,8 @@ ERRORS = {
     "torque_uniform": f"torque, |v| ≤ {SPEED:g}",
     "torque_fast": f"torque, |v| ≤ {FAST:g}",
 }
+EDGE = 1e-4
+"""Left end of the picture's axis."""
 
 
 def structure_trials(
@@ -83,20 +85,27 @@ def plot_structures(trials: Sequence[Trial], path: str | Path) -> Path:
     """Draws the errors of every model and seed and writes the picture (PNG); returns its path.
 
     A panel per quantity, a row per model, a dot per seed and a bar at the median; least samples hollow, most filled.
+    What lies below `EDGE` is drawn there as an arrow, its median beside it.
     """
     models, sizes = list(dict.fromkeys(t.model for t in trials)), sorted({t.samples for t in trials})
     seconds = [np.median(column(chosen(trials, model=model, samples=sizes[-1]), "seconds")) for model in models]
     labels = [f"{model}: {WHAT[model]}\n{took:.2g} s a fit" for model, took in zip(models, seconds, strict=True)]
+    right = 1.6 * max(column(trials, name).max() for name in ERRORS)
     with picture(path, 14.0, 1.3 + 0.8 * len(models)) as figure:
         grid = figure.subplots(1, len(ERRORS), sharex=True, sharey=True)
         colours = (ACTUAL, REFERENCE, TORQUE, ERROR, ERROR)
         for axes, (name, label), colour in zip(grid, ERRORS.items(), colours, strict=True):
             for (row, model), (k, size) in product(enumerate(models), enumerate(sizes)):
-                y = row + 0.36 * (k + 0.5) / len(sizes) - 0.18
+                y = row + 0.6 * ((k + 0.5) / len(sizes) - 0.5)
                 _draw_seeds(axes, column(chosen(trials, model=model, samples=size), name), y, colour, size == sizes[-1])
             for edge in range(1, len(models)):
                 axes.axhline(edge - 0.5, color=LIMIT, linewidth=0.4, alpha=0.5)
-            axes.set(xscale="log", xlabel="relative error", ylim=(len(models) - 0.5, -0.5))
+            axes.set(
+                xscale="log",
+                xlabel="relative error",
+                xlim=(0.7 * EDGE, max(right, 100.0 * EDGE)),
+                ylim=(len(models) - 0.5, -0.5),
+            )
             axes.set_title(label, loc="left")
             axes.grid(False, axis="y")
         grid[0].set_yticks(range(len(models)), labels)
@@ -108,11 +117,17 @@ def plot_structures(trials: Sequence[Trial], path: str | Path) -> Path:
 
 
 def _draw_seeds(axes: Any, values: np.ndarray, y: float, colour: str, filled: bool) -> None:
-    """A dot per seed about the height y, and their median."""
-    spread = np.linspace(-0.06, 0.06, len(values)) if len(values) > 1 else np.zeros(1)
-    face = colour if filled else "white"
-    axes.plot(values, y + spread, "o", color=colour, markerfacecolor=face, markersize=4.2, alpha=0.8)
-    axes.plot([np.median(values)] * 2, [y - 0.13, y + 0.13], color=colour, linewidth=1.4)
+    """A dot per seed about the height y, and their median; an arrow for those too small for the axis."""
+    spread = np.linspace(-0.07, 0.07, len(values)) if len(values) > 1 else np.zeros(len(values))
+    look = {"color": colour, "markerfacecolor": colour if filled else "white", "markersize": 4.2, "alpha": 0.8}
+    small, middle = values < EDGE, float(np.median(values))
+    axes.plot(values[~small], y + spread[~small], "o", **look)
+    if small.any():
+        axes.plot(EDGE, y, "<", **look)
+    if middle < EDGE:
+        axes.annotate(short(middle), (EDGE, y), xytext=(6, 0), textcoords="offset points", va="center", color=colour)
+    else:
+        axes.plot([middle] * 2, [y - 0.12, y + 0.12], color=colour, linewidth=1.4)
 
 
 def _lines(trials: Sequence[Trial]) -> list[list[str]]:
