@@ -28,8 +28,8 @@ class Reproduce:
     part: Literal["paper", "fair", "lnn", "models", "all"] = "paper"
     """paper: its Table I, its figures and its sweep over α. fair: every law tuned alike and judged on fresh starts.
     lnn: its Figure 5, control on learned models, and what data without torque leave open.
-    models: learned models against the truth, from clean data, from noisy data, and what structure is worth; more than
-    an hour."""
+    models: learned models against the truth, from clean data, from noisy data, and what structure is worth;
+    about an hour."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
     """First of the seeds; five to ten are run of everything random."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/reproduce")
