@@ -135,7 +135,9 @@ def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
 
 def _drift(errors: ModelErrors) -> str:
     """The energy drift, as a bound where the integrator drifts as much."""
-    resolved = errors.motion is None or errors.energy_drift > 2.0 * float(errors.motion.floor.max())
+    if errors.motion is None:
+        return "not run"
+    resolved = errors.energy_drift > 2.0 * float(errors.motion.floor.max())
     return f"{'' if resolved else '≤ '}{number(errors.energy_drift)}"
 
 

@@ -2,7 +2,7 @@
 
 δ = (M − M̂) v̇ + (C − Ĉ) v + (G − Ĝ) [N·m], the true torque minus the modelled one at the acceleration the arm has:
 M̂v̇ + Ĉv + Ĝ + δ = τ + τ_d (paper, the equation before its Theorem 4). The corrected theorem asks for
-‖δ‖ ≤ a‖q‖ + b‖v‖ + c, and v̇ depends on the law, so the constants hold for a law, not for a model (docs/theory.md §5).
+‖δ‖ ≤ a‖q‖ + b‖v‖ + c, and v̇ depends on the law, so the constants hold for a law, not for a model (docs/theory.md §6).
 """
 
 from typing import NamedTuple
@@ -131,5 +131,5 @@ def _least_bound(
             break
         chosen = np.union1d(chosen, worst)
     a, b, c = (scale * np.maximum(constants, 0.0)).tolist()
-    lack = size - points @ np.array([a, b, c])
-    return a, b, c + max(0.0, float(lack.max())) * (1.0 + 1e-12)
+    bound = a * q_norm + b * v_norm + c  # as `Mismatch.bound` computes it
+    return a, b, c + max(0.0, float((size - bound).max())) + 4.0 * np.finfo(float).eps * float(bound.max())

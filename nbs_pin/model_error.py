@@ -115,7 +115,7 @@ def compare(
     joint, for instance where the data of the fit lie; None takes the position limits of the truth's arm, a whole turn
     where they allow it. run: a closed loop with the truth as its plant; several starts make the bound on δ say
     something of further ones (`mismatch.py`). motions: free ones from random states of the box; 0 saves their time.
-    friction: of that plant; it is no part of M, C, G, and what is not stated here is taken for an error of the model.
+    friction: of that plant; it is no part of M, C, G, but v̇ along the run is wrong without it.
     Joints that slide are compared in their own units beside those that turn, as M has them.
     Raises ArgumentError for another number of joints, an empty box, or a model that is not finite at some sample.
     """

@@ -137,8 +137,20 @@ def test_a_recorded_run_can_be_the_closed_loop(wrong, tmp_path, capsys):
     assert run(tmp_path / "b", wrong, "--against", "two_link", "--along", str(tmp_path / "run.npz")) == 2
 
 
+def test_a_run_with_joint_friction_is_refused():
+    """Its torques do not tell the acceleration, so friction would count as the model's error."""
+    robot = nbs.load_robot("two_link")
+    plant = nbs.MujocoPlant(
+        robot, joint_friction=nbs.JointFriction(viscous=np.array([0.5, 0.5]), coulomb=np.array([0.1, 0.1]))
+    )
+    law = nbs.ComputedTorque(nbs.PinocchioDynamics(robot), kp=100.0, kd=20.0)
+    recorded = nbs.simulate(plant, law, nbs.Sinusoid.for_robot(robot, 1.0), 0.1, 0.002)
+    with pytest.raises(nbs.ArgumentError, match="friction acted"):
+        comparison.compare_models(nbs.PinocchioDynamics(robot), robot, samples=20, run=recorded)
+
+
 def test_a_model_whose_law_is_unstable_still_has_its_errors(tmp_path):
-    """Gravity three hundred times too strong: what the closed loop does is a result, not a crash."""
+    """Gravity beyond all measure: what the closed loop does is a result, not a crash."""
     robot = nbs.load_robot("two_link").with_effort_limit(np.inf)
     model = nbs.AnalyticDynamics(masses=(1e-3, 1e6), gravity=1e9, robot=robot)
     result = comparison.compare_models(model, robot, samples=20, trajectories=3)

@@ -301,7 +301,7 @@ def test_the_chance_is_the_binomial_tail(trajectories, chance):
     epsilon = mismatch.violation_chance(trajectories)
     tail = sum(math.comb(trajectories, i) * epsilon**i * (1 - epsilon) ** (trajectories - i) for i in range(3))
     assert tail == pytest.approx(1e-6, rel=1e-6)
-    if chance:  # docs/theory.md §5: the fewest for this chance
+    if chance:  # docs/theory.md §6: the fewest for this chance
         assert epsilon <= chance < mismatch.violation_chance(trajectories - 1)
 
 

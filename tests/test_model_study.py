@@ -18,7 +18,7 @@ from nbs_pin.model_error import compare
 from nbs_pin.robot import load_robot
 from nbs_pin.studies import model_study
 from nbs_pin.studies.inverse_mlp import fit_mlp
-from nbs_pin.studies.model_noise import Noisy, friction_of, noise_section
+from nbs_pin.studies.model_noise import Noisy, _ranking, _ratios, friction_of, noise_section
 from nbs_pin.studies.model_structure import structure_section
 from nbs_pin.studies.model_trials import MLP, SPEED, Judge, Trial, attempt, chosen, column
 from nbs_pin.studies.pages import Section
@@ -247,6 +247,15 @@ def test_medians_are_over_the_seeds():
     assert sorted(column(chosen(trials, model="chain", samples=300), "gravity")) == [1.0, 2.0, 5.0]
     assert chosen(trials, model="chain", seed=1) == [trials[1]]
     assert asdict(trials[1])["gravity"] == 5.0
+    known = [trial("identified", 300, error, seed=k) for k, error in enumerate((1.0, 1.0, 4.0))]
+    assert _ratios(trials + known, "gravity") == {"three_link, 300": 2.0}  # of means it would be 4/3
+
+
+def test_what_differs_by_less_than_a_twentieth_keeps_its_place():
+    errors = {"identified": 1.0, "chain": 0.99, MLP: 0.5}
+    assert _ranking([trial(m, 300, e) for m, e in errors.items()], "gravity", "three_link", 300) == [
+        MLP, "identified", "chain",
+    ]  # fmt: skip
 
 
 def test_the_table_of_structures_shows_the_spread(tmp_path):

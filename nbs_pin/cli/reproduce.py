@@ -31,7 +31,7 @@ class Reproduce:
     models: learned models against the truth, from clean data, from noisy data, and what structure is worth;
     about an hour."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
-    """First of the seeds; five to ten are run of everything random."""
+    """First of the seeds; every page says how many were run."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/reproduce")
     """Folder for the results."""
     force: bool = False

@@ -5,6 +5,7 @@
 2. The same once more on all samples, each joint weighted by the residual it was left with.
 3. For that geometry, the bodies that can exist and explain the data best, as for an arm whose geometry is known
    (`identification.explain`).
+4. Placements and these bodies together, then once more with axes at right angles where the data allow it.
 """
 
 import threading
@@ -12,6 +13,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -68,10 +70,11 @@ class ChainFit:
     """Steps of all descents."""
     costs: Float[np.ndarray, " starts"]
     """Torque nMSE where each descent of the search ended."""
-    settled: bool
-    """Whether one tree explained the data, or the best minimum was met often enough, and physical bodies reach it."""
+    stopped: str
+    """"converged": one tree explained the data, or the best minimum was met often enough, and physical bodies reach it.
+    "starts": neither. "interrupted": Ctrl-C ended the search."""
     bodies: IdentificationReport
-    """How the bodies were found, and what the data do not excite."""
+    """How the bodies were found, for the placements of the search."""
     seconds: float
     """What it took [s]."""
 
@@ -86,7 +89,6 @@ def fit_chain(
     regularisation: float = 0.3,
     starts: int = 64,
     epsilon: float = 1e-12,
-    names: Sequence[str] | None = None,
     right_angles: bool = True,
     progress: bool = False,
 ) -> ChainFit:
@@ -97,8 +99,8 @@ def fit_chain(
     regularisation: see `identify`. starts: most random trees to descend from; a search ends as soon as one explains the
     data to rounding, or the best minimum has been met often enough. epsilon: ε of the network [kg·m²]. right_angles:
     axes of neighbouring joints that the data do not tell from parallel or perpendicular become so, as most arms are
-    built, which spares part of what unknown geometry costs under noise. names: what to call the joints.
-    progress: show a bar at a terminal. Ctrl-C ends the search and goes on with the best tree so far, if there is one.
+    built, which spares part of what unknown geometry costs under noise. progress: show a bar at a terminal. Ctrl-C ends
+    the search and goes on with the best tree so far, if there is one.
     Raises ArgumentError for data without torque, which arms of every scale explain, and as `identify` does.
     """
     began = time.perf_counter()
@@ -114,35 +116,41 @@ def fit_chain(
     handy, rng = _in_handy_units(measured, layout), np.random.default_rng(seed)
     # BLAS threads below the threads of the search would only wait for each other; the limit is the whole process's.
     with _ONE_AT_A_TIME, threadpool_limits(1, "blas"):
-        descents = _search(handy, layout, starts, rng, progress)
-        called = [f"joint {i}" for i in range(data.nv)] if names is None else names
-        tries = []
+        descents, interrupted = _search(handy, layout, starts, rng, progress)
+        tries: list[_Try] = []
         for descent in sorted(descents, key=_cost)[:_TRIES]:
             polished = _polished(descent.at, handy)
-            geometry = TreeGeometry(polished.at, data.parents, called)
-            bodies = explain(geometry, data, scalars, regularisation, others=_AXIS * data.nv)
+            bodies = explain(TreeGeometry(polished.at), data, scalars, regularisation, others=_AXIS * data.nv)
             physical = _physical(polished.at, bodies, measured, regularisation, right_angles)
-            tries.append((physical.whole().cost(measured), physical, bodies, descent))
-            reached = tries[-1][0] <= _REACHED * polished.at.cost(handy) + _EXACT
-            if reached:
+            cost = physical.whole().cost(measured)
+            tries.append(_Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(handy) + _EXACT))
+            if tries[-1].reached:
                 break
-        _, physical, bodies, best = min(tries, key=lambda found: found[0])
-    with torch.no_grad():
-        for name, value in physical.guess.tree(_triangular(physical.factors))._asdict().items():
-            getattr(network, name).copy_(torch.from_numpy(value))
-        if rotor_inertia:
-            network.rotors.copy_(torch.from_numpy(np.sqrt(physical.drag[-1])))
-    costs = np.array([_cost(descent) for descent in descents])
+    best = min(tries, key=lambda found: found.cost)
+    _write(best.physical, network, rotor_inertia)
+    costs, drag = np.array([_cost(descent) for descent in descents]), best.physical.drag
+    converged = tries[-1].reached and _settled(costs)
     return ChainFit(
         network=network,
-        friction=JointFriction(physical.drag[0], physical.drag[1], transition) if friction else None,
-        history=np.array(best.history),
+        friction=JointFriction(drag[0], drag[1], transition) if friction else None,
+        history=np.array(best.descent.history),
         evaluations=sum(len(descent.history) for descent in descents),
         costs=costs,
-        settled=reached and _settled(costs),
-        bodies=bodies.report,
+        stopped="interrupted" if interrupted else "converged" if converged else "starts",
+        bodies=best.bodies.report,
         seconds=time.perf_counter() - began,
     )
+
+
+class _Try(NamedTuple):
+    """Physical bodies for one tree of the search."""
+
+    cost: float
+    descent: Descent[TreeGuess]
+    bodies: Bodies
+    physical: PhysicalTree
+    reached: bool
+    """Whether they explain the data about as well as any bodies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,13 +158,16 @@ class TreeGeometry:
     """The placements of a guess, as `identification` asks for them."""
 
     guess: TreeGuess
-    parents: Int[np.ndarray, " n"]
-    names: Sequence[str]
 
     @property
-    def places(self) -> tuple[list[int], Float[np.ndarray, "n 3"]]:
+    def names(self) -> Sequence[str]:
+        """Numbers: data know no names."""
+        return [f"joint {i + 1}" for i in range(len(self.guess.positions))]
+
+    @property
+    def places(self) -> tuple[Sequence[int], Float[np.ndarray, "n 3"]]:
         """Parents and positions [m]."""
-        return self.parents.tolist(), self.guess.positions
+        return self.guess.layout[1::2].tolist(), self.guess.positions
 
     def regressor(
         self, q: Float[np.ndarray, "rows n"], v: Float[np.ndarray, "rows n"], a: Float[np.ndarray, "rows n"]
@@ -198,8 +209,11 @@ def _cost(descent: Descent[TreeGuess]) -> float:
 
 def _search(
     data: Measured, layout: np.ndarray, starts: int, rng: np.random.Generator, progress: bool
-) -> list[Descent[TreeGuess]]:
-    """Descents from random trees on a few samples, until one is good enough or the best has been met often enough."""
+) -> tuple[list[Descent[TreeGuess]], bool]:
+    """Descents from random trees on a few samples, until one is good enough or the best has been met often enough.
+
+    Also whether Ctrl-C ended it, which it does once there is a tree to go on with.
+    """
     few = data.some(np.sort(rng.permutation(len(data.q))[:_FEW]))
     descents: list[Descent[TreeGuess]] = []
 
@@ -219,10 +233,10 @@ def _search(
             except KeyboardInterrupt:
                 if not descents:
                     raise
-                break
+                return descents, True
             if _settled(np.array([_cost(x) for x in descents])):
                 break
-    return descents
+    return descents, False
 
 
 def _settled(costs: np.ndarray) -> bool:
@@ -266,6 +280,15 @@ def _physical(guess: TreeGuess, bodies: Bodies, data: Measured, strength: float,
         if worse < _UNLIKELY + _LIKELY * np.count_nonzero(held.at.angles):
             return held.at
     return free.at
+
+
+def _write(tree: PhysicalTree, network: Chain, rotor_inertia: bool) -> None:
+    """The tree into the parameters of the network."""
+    with torch.no_grad():
+        for name, value in tree.guess.tree(_triangular(tree.factors))._asdict().items():
+            getattr(network, name).copy_(torch.from_numpy(value))
+        if rotor_inertia:
+            network.rotors.copy_(torch.from_numpy(np.sqrt(tree.drag[-1])))
 
 
 def _triangular(factors: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:

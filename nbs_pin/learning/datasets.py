@@ -30,7 +30,7 @@ class Dataset:
     """Samples of an arm in motion; row k of every array belongs to one instant.
 
     The samples of a trajectory are contiguous and in the order of time. Samples of one trajectory resemble each other,
-    so only whole trajectories are held out (`split`), and a claim counts them, not samples (docs/theory.md §5).
+    so only whole trajectories are held out (`split`), and a claim counts them, not samples (docs/theory.md §6).
     Lists and numbers of other kinds become arrays of float64, int64 and bool.
     Raises ArgumentError for what is no array of such numbers, arrays that do not fit each other, numbers that are not
     finite, a trajectory that is interrupted or runs backwards, and a tree whose parents do not come first.

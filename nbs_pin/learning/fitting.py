@@ -174,8 +174,8 @@ def _fit_family(task: FitTask) -> Fitted:
 def _fit_chain(task: FitTask) -> Fitted:
     """A rigid tree, of which the data give only the order of the joints."""
     settings = task.known("rotor_inertia", "transition", "regularisation", "starts", "epsilon", "right_angles")
-    names = None if task.robot is None else task.robot.joint_names
-    found = fit_chain(task.data, task.seed, friction=task.friction, names=names, progress=task.progress, **settings)
+    names = () if task.robot is None else task.robot.joint_names
+    found = fit_chain(task.data, task.seed, friction=task.friction, progress=task.progress, **settings)
     network, bodies = found.network, found.bodies
     return Fitted(
         assemble=lambda report: LagrangianDynamics(network, task.robot, found.friction, report),
@@ -183,8 +183,8 @@ def _fit_chain(task: FitTask) -> Fitted:
         parameters=sum(x.numel() for x in network.parameters()) + (2 * task.data.nv if found.friction else 0),
         history=tuple(found.history.tolist()),
         evaluations=found.evaluations,
-        stopped="converged" if found.settled else "starts",
-        unexcited=unexcited(network, task.data, friction=found.friction, names=names or ()),
+        stopped=found.stopped,
+        unexcited=unexcited(network, task.data, friction=found.friction, names=names),
         details={
             "starts": len(found.costs),
             "nmse_of_starts": found.costs.tolist(),

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 T = TypeVar("T")
+_FLOOR = 0.1
 _WEAKEST, _STRONGEST = 1e-14, 1e8
 
 
@@ -39,12 +40,10 @@ def levenberg_marquardt(
     tolerance: float = 1e-28,
     patience: int = 10,
     stall: float = 0.01,
-    floor: float = 0.1,
-    progress: Callable[[float], None] = lambda cost: None,
 ) -> Descent[T]:
     """Descend from `start`, where a point x may be anything that `moved(x, δ)` takes a step on.
 
-    (H + λD) δ = g with D = diag H + `floor` · max(diag H): Marquardt's scaling, kept from zero so that a direction that
+    (H + λD) δ = g with D = diag H + 0.1 max(diag H): Marquardt's scaling, kept from zero so that a direction that
     the data hardly see does not move. Pure scaling lets such directions run to where two of them are invisible
     together, and convergence stops there. λ follows the ratio of actual to predicted gain (Nielsen 1999).
 
@@ -54,7 +53,7 @@ def levenberg_marquardt(
     x, at, damping, growth = start, normal(start), 1e-2, 2.0
     history = [at.cost]
     while at.cost > tolerance and len(history) <= iterations and at.gradient.any():
-        scale = np.diag(at.hessian) + floor * np.diag(at.hessian).max()
+        scale = np.diag(at.hessian) + _FLOOR * np.diag(at.hessian).max()
         step = np.linalg.solve(at.hessian + damping * np.diag(scale), at.gradient)
         there = moved(x, step)
         gain = at.cost - cost(there)
@@ -67,7 +66,6 @@ def levenberg_marquardt(
         damping = max(damping * max(0.2, 1.0 - (2.0 * gain / predicted - 1.0) ** 3), _WEAKEST)
         x, at, growth = there, normal(there), 2.0
         history.append(at.cost)
-        progress(at.cost)
         if len(history) > patience and history[-1] > (1.0 - stall) * history[-1 - patience]:
             break
     return Descent(x, at.cost, history)

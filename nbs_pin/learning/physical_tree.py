@@ -29,7 +29,7 @@ class PhysicalTree:
     factors: Float[np.ndarray, "n 4 4"]
     """L of the pseudo-inertias LLᵀ, in any order of columns."""
     drag: Float[np.ndarray, "kinds n"]
-    """Friction coefficients > 0."""
+    """Friction coefficients and rotor inertias > 0."""
     expected: Expected
     strength: float
     """γ."""

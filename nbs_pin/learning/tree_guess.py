@@ -35,7 +35,7 @@ class Measured:
     scale: Float[np.ndarray, " n"]
     """Torque that counts as one [N·m]."""
     kinds: Float[np.ndarray, "kinds rows n"]
-    """What the torque of a joint is linear in beside the bodies: speed, and the sign of Coulomb friction."""
+    """What the torque of a joint is linear in beside the bodies (`regressor.Scalars`): v, its sign, v̇."""
 
     def some(self, rows: np.ndarray) -> "Measured":
         """Those rows."""
@@ -60,7 +60,7 @@ class TreeGuess:
     bodies: Float[np.ndarray, "n 4 4"]
     """Pseudo-inertias [[Σ m xxᵀ, Σ m x], [·, m]]."""
     drag: Float[np.ndarray, "kinds n"]
-    """Coefficients of `Measured.kinds`."""
+    """Coefficients of `Measured.kinds`: of friction, and rotor inertias."""
 
     @classmethod
     def of(cls, tree: Tree, layout: np.ndarray, kinds: int) -> "TreeGuess":

@@ -23,8 +23,8 @@ class Chain(LagrangianNetwork):
 
     A linear recursion along the tree: T_j is the 4×4 homogeneous transform of body j, A_j that of its joint at q = 0,
     and E turns about z, or slides along z. L_jL_jᵀ is the body's pseudo-inertia [[Σ m xxᵀ, Σ m x], [·, m]], so for all
-    parameter values every body is physical, T̂ is exactly quadratic and M̂ = Σ_j A_jᵀA_j + diag(r² + ε) ⪰ ε1. r_j² is the
-    inertia of the joint's rotor, zero at the start.
+    parameter values every body is physical, T̂ is exactly quadratic and M̂ = Σ_j B_jᵀB_j + diag(r² + ε) ⪰ ε1, column i of
+    B_j being ∂_iT_j L_j in a row. r_j² is the inertia of the joint's rotor, zero at the start.
 
     parents: 0 for the base, i + 1 for joint i. prismatic: joints that slide. epsilon: ε [kg·m², kg]. seed: of a random
     start, with links of some 0.3 m and 1 kg and gravity of 9.81 m/s² in a random direction.
@@ -64,7 +64,7 @@ class Chain(LagrangianNetwork):
         self.rotors = nn.Parameter(torch.zeros(self.nv, dtype=torch.float64))
 
     def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
-        """M̂(q) = Σ_j A_jᵀA_j + diag(r² + ε) [kg·m²], column i of A_j being ∂_iT_j L_j."""
+        """M̂(q) = Σ_j B_jᵀB_j + diag(r² + ε) [kg·m²], column i of B_j being ∂_iT_j L_j."""
         frames = self._frames(q)
         rates = self._rates(frames)  # (…, n joints, n bodies, 4, 4)
         columns = (rates @ self.factors.tril()).flatten(-2).flatten(-2)
@@ -83,14 +83,14 @@ class Chain(LagrangianNetwork):
         """The same tree for the kernels of `runtime/trees.py`, r² + ε as armature."""
         with torch.no_grad():
             rotations, factors = rotation_matrices(self.turns), self.factors.tril()
-            inertia = (factors @ factors.mT).numpy()
-            armature = (self.rotors.square() + self.epsilon).numpy()
+            inertia = (factors @ factors.mT).numpy(force=True)
+            armature = (self.rotors.square() + self.epsilon).numpy(force=True)
         layout, upper = [self.nv], np.triu_indices(3)
-        weights = [-self.field.detach().numpy()]
+        weights = [-self.field.numpy(force=True)]
         for i, (parent, slides) in enumerate(zip(self.parents, self.prismatic, strict=True)):
             layout += [parent, int(slides)]
             body = inertia[i]
-            place = [rotations[i].numpy().ravel(), self.positions[i].detach().numpy()]
+            place = [rotations[i].numpy(force=True).ravel(), self.positions[i].numpy(force=True)]
             weights += [*place, body[3, 3:], body[:3, 3], body[:3, :3][upper], armature[i : i + 1]]
         return Packed(np.array(layout, dtype=np.int64), np.concatenate(weights))
 

@@ -31,8 +31,8 @@ from nbs_pin.runtime.tree_bodies import (
 from nbs_pin.runtime.tree_layout import BASE, BODY, ROW
 from nbs_pin.runtime.trees import gather, place, spread, sweep
 
-COLUMNS, PLACE, INERTIA, ROTOR = 17, 0, 6, 16
-"""Derivatives per joint, and where those of the placement, of m, h, E and of the armature begin."""
+COLUMNS, INERTIA, ROTOR = 17, 6, 16
+"""Derivatives per joint, and where those of m, h, E and of the armature begin, after δ (at 0) and p (at 3)."""
 
 
 @kernel

@@ -83,7 +83,7 @@ def compare_models(
 
     samples, speed, seed, box: as in `compare`. joints: those of the map, from 0; None takes `telling_joints`.
     run: the closed loop, its plant this arm; None simulates `closed_loop` from so many starts, none for 0.
-    Raises ArgumentError for arguments that do not fit, and a run of another arm.
+    Raises ArgumentError for arguments that do not fit, and a run of another arm or one in which joint friction acted.
     """
     truth = PinocchioDynamics(robot)
     check_joints(model, truth)
@@ -91,6 +91,9 @@ def compare_models(
     if run is not None:
         if run.robot_sha256 != robot.sha256:
             raise ArgumentError(f"the run is of the arm '{run.robot}', not of {robot.name}; give one of that arm.")
+        plant = str(run.info.get("plant", ""))
+        if "joint_friction=" in plant and "joint_friction=drop" not in plant:
+            raise ArgumentError("joint friction acted in the run, so its torques do not tell v̇; record one without it.")
         missing = ""
     elif trajectories:
         try:

@@ -203,14 +203,16 @@ limits, from rest {START_ERROR} rad off the reference (`Sinusoid.for_robot`). RM
 over {scale.turns:g} period of the reference. Every NBS law has the same gains and the same untrained networks; only its
 model differs. The chains are learned by `fit(data, "chain")` from {scale.samples} clean samples of excited motions, and
 from {2 * scale.samples} with encoders of 2^-16 of a turn, v and v̇ differentiated from them, and {NOISE.torque:g} N·m
-of torque noise (seed {seed}). In the last columns as much white torque noise acts on every joint, held for 1 ms.
+of torque noise (seed {seed}). In the columns under torque noise as much of it, white,
+acts on every joint, held for 1 ms. Peak torque is that of the run without it, the start included, where limits are met.
 
 {joined}
 
 On the chain from clean data the law's error is at most {worst:.6f} times that on the exact model. On the one from
-noisy data it is up to {short(max(row.rms_error_rad for row in noisy))} rad, {short(max(row.ratio for row in noisy))}
-times that of the exact model where nothing else disturbs, since the exact law then errs by rounding and sampling
-alone; under the torque noise it is at most {shaken:.3f} times as large.
+noisy data it is up to {short(max(row.rms_error_rad for row in noisy))} rad, and up to
+{short(max(row.ratio for row in noisy))} times that of the exact model where nothing else disturbs,
+since the exact law then errs by rounding and sampling alone; under the torque noise it is at most {shaken:.3f} times
+as large.
 
 ![Steady error of every law](learned_loop.png)"""
     return Section("Control on learned models", text, {"learned_loop": plain([row._asdict() for row in rows])})

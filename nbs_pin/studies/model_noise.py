@@ -1,7 +1,7 @@
 """Models from noisy data of arms with friction, over sample sizes: the chain, identified inertias, a plain network."""
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations, product
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -131,8 +131,11 @@ def _ratios(trials: Sequence[Trial], name: str) -> dict[str, float]:
 def _ranking(trials: Sequence[Trial], name: str, arm: str, size: int) -> list[str]:
     """The models, best first; those that differ by less than `_TIE` from what knows more of the arm stay behind it."""
     error = {model: _median(trials, name, arm=arm, samples=size, model=model) for model in MODELS}
-    ahead = any(error[b] < (1.0 - _TIE) * error[a] for a, b in combinations(MODELS, 2))
-    return sorted(MODELS, key=lambda model: error[model]) if ahead else list(MODELS)
+    order: list[str] = []
+    for model in MODELS:
+        better = (k for k, other in enumerate(order) if error[model] < (1.0 - _TIE) * error[other])
+        order.insert(next(better, len(order)), model)
+    return order
 
 
 def _draw(trials: Sequence[Trial], name: str, path: Path) -> None:

@@ -132,9 +132,10 @@ networks learn the acceleration. Relative errors where each was learned, least â
 
 {markdown_table(head, lines)}
 
-c should be 1. What is found instead comes from where each network began, also with states from everywhere: the
-motions are explained and the torques are not, which is no use for control (see Figure 5). A few samples with torque
-settle c; what is left then is what the network did not learn.
+c should be 1. What is found instead comes from where each network began, also with states from everywhere, however
+well the motions are explained: no use for control (see Figure 5). Where they are explained well, a few samples with
+torque settle c; what is left then is what the network did not learn. The networks are smaller than the paper's, and
+learn from at most {_FEW} samples of the swing, evenly spread, or {3 * _FEW} states.
 
 `fit(data, "chain")` refuses: "{found.refusal}\""""
     return Section("Data without torque", text, {"passive": plain([row._asdict() for row in found.rows])})
