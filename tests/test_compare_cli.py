@@ -11,7 +11,9 @@ import pytest
 import nbs_pin as nbs
 from nbs_pin import cli
 from nbs_pin.catalogue import find
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
+from nbs_pin.exceptions import ArgumentError
 from nbs_pin.learning.datasets import Dataset
 from nbs_pin.model_error import compare
 from nbs_pin.networks.families import make_network
@@ -141,11 +143,11 @@ def test_a_run_with_joint_friction_is_refused():
     """Its torques do not tell the acceleration, so friction would count as the model's error."""
     robot = nbs.load_robot("two_link")
     plant = nbs.MujocoPlant(
-        robot, joint_friction=nbs.JointFriction(viscous=np.array([0.5, 0.5]), coulomb=np.array([0.1, 0.1]))
+        robot, joint_friction=JointFriction(viscous=np.array([0.5, 0.5]), coulomb=np.array([0.1, 0.1]))
     )
     law = nbs.ComputedTorque(nbs.PinocchioDynamics(robot), kp=100.0, kd=20.0)
     recorded = nbs.simulate(plant, law, nbs.Sinusoid.for_robot(robot, 1.0), 0.1, 0.002)
-    with pytest.raises(nbs.ArgumentError, match="friction acted"):
+    with pytest.raises(ArgumentError, match="friction acted"):
         comparison.compare_models(nbs.PinocchioDynamics(robot), robot, samples=20, run=recorded)
 
 
