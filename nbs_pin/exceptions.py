@@ -30,3 +30,7 @@ class SimulationDiverged(NbsPinError, ArithmeticError):
 
 class FileFormatError(NbsPinError, ValueError):
     """A data file (run, reference, checkpoint) that is not what it should be; names file, row or key, and remedy."""
+
+
+class CertificateRefused(NbsPinError, ValueError):
+    """A controller or model about which nothing can be promised; names the part, what is wrong with it and the remedy."""

@@ -23,14 +23,15 @@ FLOORS = [
     {"loop", "checkpoints", "relative_errors", "error_maps", "free_motion", "mismatch", "model_error"},
     {"simulation"},
     {"learning"},
-    {"plotting", "charts", "error_charts", "replay_page"},
+    {"certificates"},
+    {"plotting", "charts", "error_charts", "certificate_charts", "replay_page"},
     {"studies"},
     {"cli"},
 ]
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
 HOMES = {
     "mujoco": {"plants.mujoco_plant"},
-    "matplotlib": {"plotting", "charts", "error_charts"},
+    "matplotlib": {"plotting", "charts", "error_charts", "certificate_charts"},
     "meshcat": {"replay_page"},
     "yourdfpy": {"visuals"},
     "trimesh": {"meshes", "visuals", "replay_page"},

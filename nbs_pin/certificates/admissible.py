@@ -1,0 +1,75 @@
+"""The disturbances a certificate is about: every τ_d(t) whose torques stay inside a box or a ball."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.checks import PerJoint, floats
+from nbs_pin.exceptions import ArgumentError
+
+
+@dataclass(frozen=True, eq=False)
+class Admissible:
+    """|τ_d,i| ≤ box_i for every joint or ‖τ_d‖ ≤ radius [N·m], at every instant; nothing else is asked of τ_d(t)."""
+
+    box: Float[np.ndarray, " n"] | None = None
+    """Largest |τ_d,i| [N·m]."""
+    radius: float | None = None
+    """Largest ‖τ_d‖ [N·m]."""
+
+    @classmethod
+    def of(cls, disturbance: "PerJoint | Admissible", nv: int) -> "Admissible":
+        """nv bounds are a box, one number is a ball; raises ArgumentError unless they are finite and ≥ 0."""
+        if isinstance(disturbance, Admissible):
+            if disturbance.box is not None and len(disturbance.box) != nv:
+                raise ArgumentError(
+                    f"the disturbance has {len(disturbance.box)} bounds for {nv} joints; give one for each."
+                )
+            return disturbance
+        given = floats("disturbance", disturbance)
+        if given.shape not in ((), (nv,)) or not np.isfinite(given).all() or not (given >= 0.0).all():
+            raise ArgumentError(
+                f"disturbance is {disturbance}, expected one bound ≥ 0 on ‖τ_d‖ or {nv}, one on each |τ_d,i| [N·m]."
+            )
+        return cls(radius=float(given)) if given.ndim == 0 else cls(box=given)
+
+    def energy(self, metric: Float[np.ndarray, "n n"]) -> float:
+        """At least sup τ_dᵀ A τ_d for the positive definite A, and just that for a diagonal A or a ball.
+
+        Over a box: Σ |A_ij| box_i box_j. Rounded up.
+        """
+        n = len(metric)
+        if self.box is not None:
+            value = float(self.box @ np.abs(metric) @ self.box)
+        else:
+            # The spectrum from the symmetric eigenvalue solver, with its error n·eps·‖A‖ eight times over.
+            slack = 8.0 * n * np.finfo(float).eps * float(np.linalg.norm(metric))
+            value = (self.radius or 0.0) ** 2 * (float(np.linalg.eigvalsh(metric)[-1]) + slack)
+        return value * (1.0 + 1e-12)
+
+    @cached_property
+    def is_zero(self) -> bool:
+        """Whether only τ_d = 0 is admissible."""
+        return not self.radius if self.box is None else not self.box.any()
+
+    def contains(self, tau_d: Float[np.ndarray, "*batch n"]) -> bool:
+        """Whether every torque is admissible, to twelve digits."""
+        if self.box is not None:
+            return bool((np.abs(tau_d) <= self.box * (1.0 + 1e-12)).all())
+        return bool((np.linalg.norm(tau_d, axis=-1) <= (self.radius or 0.0) * (1.0 + 1e-12)).all())
+
+    def towards(self, direction: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n"]:
+        """The admissible torque of greatest inner product with each direction: a corner of the box, or d·g/‖g‖."""
+        if self.box is not None:
+            return self.box * np.sign(direction)
+        size = np.linalg.norm(direction, axis=-1, keepdims=True)
+        return (self.radius or 0.0) * direction / np.where(size > 0.0, size, 1.0)
+
+    def __str__(self) -> str:
+        if self.box is None:
+            return f"‖τ_d‖ ≤ {self.radius:g} N·m"
+        if len(set(self.box.tolist())) == 1:
+            return f"|τ_d,i| ≤ {self.box[0]:g} N·m on every joint"
+        return f"|τ_d,i| ≤ ({', '.join(f'{x:g}' for x in self.box)}) N·m"

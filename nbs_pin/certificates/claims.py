@@ -1,0 +1,57 @@
+"""What is claimed, and how it is known."""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from nbs_pin.exceptions import ArgumentError
+
+
+class Label(StrEnum):
+    """How a claim is known, the strongest first."""
+
+    PROVED = "PROVED"
+    """By structure, everywhere, or by finitely many evaluations that a theorem extends to everywhere."""
+    VERIFIED = "VERIFIED"
+    """Exhaustively on a box."""
+    PROBABILISTIC = "PROBABILISTIC"
+    """With a confidence, for what is drawn as the samples were."""
+    EMPIRICAL = "EMPIRICAL"
+    """On samples; others may break it."""
+
+
+def weakest(*labels: Label) -> Label:
+    """The label of what follows from claims with these labels; PROVED for none."""
+    order = list(Label)
+    return max(labels, key=order.index, default=Label.PROVED)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One number of a certificate, with the way it is known."""
+
+    name: str
+    """What it is, in words, with its symbol."""
+    value: float
+    """The number; inf for a bound that is none."""
+    unit: str
+    """SI, empty for a pure number."""
+    label: Label
+    because: str
+    """Where it comes from, and what it assumes beyond the assumptions of the certificate."""
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.value):
+            raise ArgumentError(f"the claim '{self.name}' is not a number; give its value, inf for no bound.")
+
+    def plain(self) -> dict[str, Any]:
+        """The claim as JSON can store it, null for infinity."""
+        value = self.value if math.isfinite(self.value) else None
+        return {
+            "name": self.name,
+            "value": value,
+            "unit": self.unit,
+            "label": str(self.label),
+            "because": self.because,
+        }
