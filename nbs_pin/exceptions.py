@@ -33,4 +33,4 @@ class FileFormatError(NbsPinError, ValueError):
 
 
 class CertificateRefused(NbsPinError, ValueError):
-    """A controller or model about which nothing can be promised; names the part, what is wrong with it and the remedy."""
+    """A controller or model of which nothing can be promised; names the part, what is wrong with it and the remedy."""

@@ -21,7 +21,7 @@ class Admissible:
 
     @classmethod
     def of(cls, disturbance: "PerJoint | Admissible", nv: int) -> "Admissible":
-        """nv bounds are a box, one number is a ball; raises ArgumentError unless they are finite and ≥ 0."""
+        """One bound per joint is a box, a single number a ball; raises ArgumentError unless they are finite and ≥ 0."""
         if isinstance(disturbance, Admissible):
             if disturbance.box is not None and len(disturbance.box) != nv:
                 raise ArgumentError(
