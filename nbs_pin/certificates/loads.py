@@ -1,0 +1,231 @@
+"""Loads that the model leaves out, as disturbances: a payload, joint friction, gravity that is not what it seems.
+
+Each is a box |τ_d,i| ≤ b_i along a reference: the greatest torque that the load takes on the reference itself, times a
+margin for what the arm does beside it. That is EMPIRICAL: the margin is a choice. A load whose torque depends on the
+posture alone has a bound everywhere instead, by lever arms, which is PROVED.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float
+
+from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.claims import Claim, Label, weakest
+from nbs_pin.checks import PerJoint, floats, positive
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.references import DesiredMotion
+from nbs_pin.robot import Robot
+from nbs_pin.state import Reference
+
+MARGIN = 1.5
+"""How many times the torque on the reference the arm may need beside it, unless said otherwise."""
+_SAMPLES = 2001
+_OUTWARD = 1.0 + 1e-9
+"""Each bound is made so much larger, far more than the rounding of the operations behind it."""
+
+
+class Load(NamedTuple):
+    """A disturbance, and how it is known to be one."""
+
+    admissible: Admissible
+    """|τ_d,i| ≤ box_i [N·m]."""
+    claim: Claim
+    """The largest of the bounds, with label and reason."""
+
+
+def payload(
+    robot: Robot,
+    mass: float,
+    reference: DesiredMotion,
+    *,
+    frame: str | None = None,
+    position: Float[np.ndarray, "3"] | None = None,
+    duration: float = 10.0,
+    margin: float = MARGIN,
+) -> Load:
+    """The torque of a point mass [kg] that the model knows nothing of: its weight and its inertia along the reference.
+
+    frame: the link that carries it, None takes `tool_frame`. position: of the mass in that frame [m], None its origin.
+    duration: how much of the reference counts [s]. margin: times the peak of |ΔM a + ΔC v + ΔG|.
+    Raises ArgumentError for numbers out of range and a link that does not exist.
+    """
+    positive("the payload", mass, "kg")
+    joint, at = _place(robot, frame, position)
+    loaded = robot.model.copy()
+    loaded.appendBodyToJoint(joint, pin.Inertia(mass, at, np.zeros((3, 3))), pin.SE3.Identity())
+    desired = _sampled(robot, reference, duration)
+    torques = [np.array(_rnea(loaded, desired)) - np.array(_rnea(robot.model, desired))]
+    what = f"a payload of {mass:g} kg at {frame or tool_frame(robot)}"
+    return _along(what, np.abs(torques[0]).max(axis=0), margin, duration)
+
+
+def weight(
+    robot: Robot, mass: float, *, frame: str | None = None, position: Float[np.ndarray, "3"] | None = None
+) -> Load:
+    """The torque that a point mass [kg] takes while the arm stands still, in any posture: m ‖g‖ × lever arm. PROVED.
+
+    frame, position: as in `payload`. The torque of its inertia, when it is moved, is not in it.
+    Raises ArgumentError for numbers out of range, a link that does not exist, and a sliding joint without end.
+    """
+    positive("the payload", mass, "kg")
+    joint, at = _place(robot, frame, position)
+    box = mass * float(np.linalg.norm(robot.gravity_vector)) * _levers(robot, joint, at) * _OUTWARD
+    because = "weight × the longest lever arm there is, a sum of link lengths; at rest only: inertia is not in it"
+    return _load(f"weight of a payload of {mass:g} kg", box, Label.PROVED, because)
+
+
+def friction(
+    robot: Robot,
+    reference: DesiredMotion | None = None,
+    *,
+    viscous: PerJoint | None = None,
+    coulomb: PerJoint | None = None,
+    duration: float = 10.0,
+    margin: float = MARGIN,
+) -> Load:
+    """Joint friction b·v + c·sign(v) that the law does not feed forward: c_i everywhere, b_i|v_i| along the reference.
+
+    viscous [N·m·s/rad], coulomb [N·m]: one for all joints or one per joint; None takes the URDF's. The speed counts
+    with the margin. PROVED where there is only Coulomb friction.
+    Raises ArgumentError when there is no friction at all, and when viscous friction has no reference to take speeds of.
+    """
+    b = _one_each("viscous", robot.damping if viscous is None else viscous, robot.nv)
+    c = _one_each("coulomb", robot.friction if coulomb is None else coulomb, robot.nv)
+    JointFriction(b, c)  # which refuses what is no friction
+    if not (b.any() or c.any()):
+        raise ArgumentError(f"{robot.name} states no joint friction; give viscous and coulomb coefficients.")
+    if not b.any():
+        return _load("joint friction", c.copy(), Label.PROVED, "Coulomb friction is never more than its coefficient")
+    if reference is None:
+        raise ArgumentError("viscous friction grows with speed; give the reference whose speeds count.")
+    peak = np.abs(_sampled(robot, reference, duration).v).max(axis=0)
+    return _along("joint friction", b * peak, margin, duration, constant=c)
+
+
+def gravity_error(
+    robot: Robot,
+    error: float,
+    reference: DesiredMotion | None = None,
+    *,
+    duration: float = 10.0,
+    margin: float = MARGIN,
+) -> Load:
+    """Gravity that differs from the model's by a vector of at most `error` [m/s²], in any direction.
+
+    A base tilted by α is 2‖g‖ sin(α/2). Torques of gravity are linear in g, so the worst direction is exact. Without a
+    reference the bound holds in every posture (PROVED, by lever arms); with one it is that of its postures, times the
+    margin. Raises ArgumentError for numbers out of range and a sliding joint without end.
+    """
+    positive("the gravity error", error, "m/s²")
+    what = f"gravity wrong by {error:g} m/s²"
+    bodies = [(j, inertia.mass, inertia.lever) for j, inertia in enumerate(robot.model.inertias) if j > 0]
+    everywhere = error * sum((mass * _levers(robot, j, at) for j, mass, at in bodies), np.zeros(robot.nv)) * _OUTWARD
+    if reference is None:
+        return _load(what, everywhere, Label.PROVED, "‖Δg‖ × Σ mass × the longest lever arm, a sum of link lengths")
+    desired, columns = _sampled(robot, reference, duration), []
+    for axis in np.eye(3):
+        model = robot.model.copy()
+        model.gravity.linear = axis
+        columns.append(_rnea(model, Reference(desired.q, 0.0 * desired.v, 0.0 * desired.a)))
+    peak = error * np.linalg.norm(np.array(columns), axis=0).max(axis=0)
+    return _along(what, peak, margin, duration, most=everywhere)
+
+
+def total(*loads: "Load | Admissible") -> Admissible:
+    """All of them at once: boxes add; a ball ‖τ_d‖ ≤ r counts as the box |τ_d,i| ≤ r beside boxes, balls add to a ball.
+
+    Raises ArgumentError for none, and for boxes of different numbers of joints.
+    """
+    parts = [load.admissible if isinstance(load, Load) else load for load in loads]
+    boxes = [part.box for part in parts if part.box is not None]
+    radius = sum(part.radius for part in parts if part.radius is not None)
+    if not parts or len({len(box) for box in boxes}) > 1:
+        raise ArgumentError("total adds disturbances of one arm; give at least one, all for the same joints.")
+    return Admissible(box=sum(boxes, np.full(len(boxes[0]), radius))) if boxes else Admissible(radius=radius)
+
+
+def tool_frame(robot: Robot) -> str:
+    """The link farthest from the last joint among those it carries: where a tool or a payload usually is."""
+    frames = [f for f in robot.model.frames if f.type == pin.FrameType.BODY and f.parentJoint == robot.nv]
+    return str(max(frames, key=lambda f: float(np.linalg.norm(f.placement.translation))).name)
+
+
+def _place(robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | None) -> tuple[int, np.ndarray]:
+    """The joint that carries the point, and the point in its frame [m]."""
+    name = tool_frame(robot) if frame is None else frame
+    bodies = {f.name: f for f in robot.model.frames if f.type == pin.FrameType.BODY and f.parentJoint > 0}
+    if name not in bodies:
+        raise ArgumentError(f"{robot.name} has no moving link '{name}'; give one of {', '.join(bodies)}.")
+    at = np.zeros(3) if position is None else floats("position", position)
+    if at.shape != (3,) or not np.isfinite(at).all():
+        raise ArgumentError(f"position is {position}, expected three finite numbers [m]; correct it.")
+    return int(bodies[name].parentJoint), np.array(bodies[name].placement.act(at))
+
+
+def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
+    """Per joint the greatest |torque| that a unit force at a point of body `joint` can have, in any posture [m].
+
+    A joint that turns: the distance of the point from its axis, at most the sum of the link lengths between them; one
+    that slides: 1. Joints that do not carry the point: 0.
+    """
+    model, levers = robot.model, np.zeros(robot.nv)
+    motions, point, beyond = model.createData().joints, at, 0.0
+    while joint > 0:
+        slides = robot.joints[joint - 1].prismatic
+        axis = np.array(motions[joint].S)[:3] if slides else np.array(motions[joint].S)[3:]
+        levers[joint - 1] = 1.0 if slides else np.linalg.norm(np.cross(axis, point)) + beyond
+        travel = max(abs(robot.lower[joint - 1]), abs(robot.upper[joint - 1])) if slides else 0.0
+        if not np.isfinite(travel):
+            raise ArgumentError(f"joint '{robot.joint_names[joint - 1]}' slides without end; give it position limits.")
+        beyond += float(np.linalg.norm(point)) + travel
+        point, joint = np.array(model.jointPlacements[joint].translation), int(model.parents[joint])
+    return levers
+
+
+def _sampled(robot: Robot, reference: DesiredMotion, duration: float) -> Reference:
+    """The reference at evenly spaced times [s]."""
+    positive("duration", duration, "s")
+    desired = Reference(*(np.asarray(x, dtype=float) for x in reference(np.linspace(0.0, duration, _SAMPLES))))
+    if any(x.shape != (_SAMPLES, robot.nv) or not np.isfinite(x).all() for x in desired):
+        raise ArgumentError(
+            f"the reference is not a finite motion of the {robot.nv} joints of {robot.name}; correct it."
+        )
+    return desired
+
+
+def _rnea(model: pin.Model, desired: Reference) -> list[np.ndarray]:
+    """Torques [N·m] at every instant."""
+    data = model.createData()
+    return [np.array(pin.rnea(model, data, *row)) for row in zip(*desired, strict=True)]
+
+
+def _along(what: str, peak: Float[np.ndarray, " n"], margin: float, duration: float, constant: PerJoint = 0.0) -> Load:
+    """The bound margin × peak + constant."""
+    if not 1.0 <= margin < np.inf:
+        raise ArgumentError(f"margin is {margin}, expected a finite number of at least 1; 1.5 is usual.")
+    because = (
+        f"{margin:g} × the peak over {_SAMPLES} instants of {duration:g} s of the reference; "
+        "the arm beside its reference may need more"
+    )
+    return _load(what, np.minimum(margin * peak + constant, most), Label.EMPIRICAL, because)
+
+
+def _load(what: str, box: Float[np.ndarray, " n"], label: Label, because: str) -> Load:
+    return Load(
+        Admissible.of(box, len(box)), Claim(f"{what}, the largest |τ_d,i|", float(box.max()), "N·m", label, because)
+    )
+
+
+def _one_each(name: str, value: PerJoint, nv: int) -> Float[np.ndarray, " n"]:
+    array = floats(name, value)
+    if array.shape not in ((), (nv,)):
+        raise ArgumentError(f"{name} is {value}, expected one number or {nv}, one per joint; correct it.")
+    return np.full(nv, array)
+
+
+def label_of(*loads: Load) -> Label:
+    """The weakest of their labels; PROVED for none."""
+    return weakest(*(load.claim.label for load in loads))
