@@ -202,8 +202,15 @@ def _rnea(model: pin.Model, desired: Reference) -> list[np.ndarray]:
     return [np.array(pin.rnea(model, data, *row)) for row in zip(*desired, strict=True)]
 
 
-def _along(what: str, peak: Float[np.ndarray, " n"], margin: float, duration: float, constant: PerJoint = 0.0) -> Load:
-    """The bound margin × peak + constant."""
+def _along(
+    what: str,
+    peak: Float[np.ndarray, " n"],
+    margin: float,
+    duration: float,
+    constant: PerJoint = 0.0,
+    most: PerJoint = np.inf,
+) -> Load:
+    """The bound margin × peak + constant, or `most` where that is less."""
     if not 1.0 <= margin < np.inf:
         raise ArgumentError(f"margin is {margin}, expected a finite number of at least 1; 1.5 is usual.")
     because = (
