@@ -1,0 +1,43 @@
+"""Spectra and sums moved to the safe side by more than floating point can err (docs/certificates.md)."""
+
+import numpy as np
+from jaxtyping import Float
+
+SLACK = 1e-9
+"""Relative allowance for the rounding of everything that leads to a bound: about 1e6 times what such sums lose."""
+
+
+def spectrum_slack(matrix: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
+    """8 n ε ‖A‖_F: more than the symmetric eigenvalue solver's error, by Weyl's inequality."""
+    n = matrix.shape[-1]
+    return np.asarray(8.0 * n * np.finfo(float).eps * np.linalg.norm(matrix, axis=(-2, -1)))
+
+
+def least_eigenvalues(matrices: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
+    """At most λ_min of each symmetric matrix."""
+    return np.asarray(np.linalg.eigvalsh(matrices)[..., 0] - spectrum_slack(matrices))
+
+
+def largest_eigenvalues(matrices: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
+    """At least λ_max of each symmetric matrix."""
+    return np.asarray(np.linalg.eigvalsh(matrices)[..., -1] + spectrum_slack(matrices))
+
+
+def least_eigenvalue(matrix: Float[np.ndarray, "n n"]) -> float:
+    """At most λ_min of a symmetric matrix."""
+    return float(least_eigenvalues(matrix))
+
+
+def largest_eigenvalue(matrix: Float[np.ndarray, "n n"]) -> float:
+    """At least λ_max of a symmetric matrix."""
+    return float(largest_eigenvalues(matrix))
+
+
+def up(value: float) -> float:
+    """A bound from above, moved up by the allowance."""
+    return float(value) + SLACK * abs(float(value))
+
+
+def down(value: float) -> float:
+    """A bound from below, moved down by the allowance."""
+    return float(value) - SLACK * abs(float(value))
