@@ -55,3 +55,32 @@ class Claim:
             "label": str(self.label),
             "because": self.because,
         }
+
+
+@dataclass(frozen=True)
+class Condition:
+    """An inequality that a theorem asks for, with the numbers on both sides: left > right."""
+
+    name: str
+    left: float
+    right: float
+    unit: str
+    label: Label
+    because: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether left > right."""
+        return self.left > self.right
+
+    def plain(self) -> dict[str, Any]:
+        """The condition as JSON can store it, null for infinity."""
+        sides = {key: x if math.isfinite(x) else None for key, x in (("left", self.left), ("right", self.right))}
+        return {
+            "name": self.name,
+            **sides,
+            "holds": self.holds,
+            "unit": self.unit,
+            "label": str(self.label),
+            "because": self.because,
+        }

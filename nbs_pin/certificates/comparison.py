@@ -1,0 +1,143 @@
+"""Two numbers that bound a closed loop: how far Φ and W = ½z2ᵀM z2 can go under every admissible disturbance.
+
+Along every motion (docs/certificates.md §2), with y² = z2ᵀD₀z2 and some x, s, σ
+
+    Φ̇ = −x² + s,     x² ≥ 2ρΦ,   |s| ≤ xy/√δ,
+    Ẇ ≤ −s − (1 − β)y² + αxy − 2ωW + σ,     2κW ≤ y² ≤ 2νW,   σ ≤ t y.
+
+What no choice of x, y, s, σ can leave, no motion leaves: neither a level of V = Φ + W, nor a polygon below it.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+_SHARES = np.linspace(0.0, 1.0, 401)[1:-1]
+_STEEPNESS = np.concatenate([np.linspace(1.0, 4.0, 91)[:-1], np.geomspace(4.0, 1e4, 160)])
+_ROWS = 240
+_HALVINGS = 14
+_OUTWARD = 1.0 + 1e-9
+"""Each bound is made so much larger, far more than the rounding of the few thousand operations behind it."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The constants of the two inequalities; every one on the safe side."""
+
+    rho: float
+    """ρ = λ_min(2Λ^½SΛ^½) [1/s]."""
+    delta: float
+    """δ = λ_min(Λ^½D₀Λ^½)."""
+    kappa: float
+    """κ = 1/max λ(D₀^-½MD₀^-½) [1/s], 0 where none is known."""
+    nu: float
+    """ν = 1/min λ(D₀^-½MD₀^-½) [1/s], inf where none is known."""
+    omega: float
+    """ω [1/s]."""
+    t: float
+    """√Δ, Δ = sup τ_dᵀD₀⁻¹τ_d [W], and what a model's constant error adds."""
+    alpha: float = 0.0
+    """α, of a model's error in proportion to ‖q‖ and ‖v‖."""
+    beta: float = 0.0
+    """β, of a model's error in proportion to ‖v‖."""
+
+    @property
+    def is_dissipative(self) -> bool:
+        """Whether x² − αxy + (1 − β)y² is positive definite: the condition of Theorem 4."""
+        return self.beta < 1.0 and self.alpha**2 < 4.0 * (1.0 - self.beta)
+
+
+class Level(NamedTuple):
+    """V̇ ≤ −cV + cV∞, so that V(t) ≤ e^{−ct}V(0) + V∞, and V ≤ V∞ is never left."""
+
+    c: float
+    """[1/s]."""
+    storage: float
+    """V∞ [J], inf where c is 0."""
+
+
+def decay(comparison: Comparison, share: float = 0.0) -> float:
+    """The largest c found with x² − αxy + (1 − β − share)y² + 2ωW ≥ c(Φ + W) [1/s], 0 where there is none.
+
+    Two parts, ηx² ≥ 2ηρΦ and r y² + 2ωW ≥ 2(rκ + ω)W, with (1 − η)(1 − β − share − r) ≥ α²/4 and r ≥ 0.
+    """
+    k = comparison
+    rest = 1.0 - k.beta - share
+    if k.alpha == 0.0:
+        return max(0.0, min(2.0 * k.rho, 2.0 * (rest * k.kappa + k.omega))) if rest >= 0.0 else 0.0
+    eta = _SHARES
+    r = rest - 0.25 * k.alpha**2 / (1.0 - eta)
+    c = np.where(r >= 0.0, np.minimum(2.0 * eta * k.rho, 2.0 * (r * k.kappa + k.omega)), 0.0)
+    return float(c.max(initial=0.0))
+
+
+def level(comparison: Comparison) -> Level:
+    """The least V∞ over all shares θ of y² that pay for the disturbance: ty ≤ θy² + t²/4θ, V∞ = t²/(4θ c(θ))."""
+    if comparison.t == 0.0:
+        c = decay(comparison) / _OUTWARD
+        return Level(c, 0.0 if c > 0.0 else np.inf)
+    found = Level(0.0, np.inf)
+    for share in (*_SHARES.tolist(), 1.0):
+        c = decay(comparison, share) / _OUTWARD
+        storage = comparison.t**2 / (4.0 * share * c) * _OUTWARD if c > 0.0 else np.inf
+        if storage < found.storage:
+            found = Level(c, storage)
+    return found
+
+
+def reach(comparison: Comparison, storage: float) -> float:
+    """Φ∞ [J]: the least found such that {V ≤ V∞} cut off by a polygon from (Φ∞, 0) upwards is never left.
+
+    storage: V∞ of `level`. Every edge descends m times as fast in W as it advances in Φ, and is only taken when
+    Ẇ + mΦ̇ ≤ 0 on all of it, whatever x, y, s, σ do.
+    """
+    if not 0.0 < storage < np.inf:
+        return storage
+    k = replace(comparison, t=comparison.t * _OUTWARD)
+    low, high = 0.0, storage
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        if _closes(k, middle, storage):
+            high = middle
+        else:
+            low = middle
+    return min(storage, high * _OUTWARD)
+
+
+def _closes(k: Comparison, potential: float, storage: float) -> bool:
+    """Whether steep edges lead from (Φ, 0) up to the line Φ + W = V∞."""
+    rows = storage * np.linspace(0.0, 1.0, _ROWS + 1) ** 2
+    phi = potential
+    for low, high in zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True):
+        end = phi - (high - low) / _STEEPNESS
+        steep = np.flatnonzero((end >= 0.0) & (_growth(k, end, low, high) <= 0.0))
+        if not len(steep):
+            return False
+        phi = float(end[steep[-1]])
+        if phi + high >= storage:
+            return True
+    return False
+
+
+def _growth(k: Comparison, end: np.ndarray, low: float, high: float) -> np.ndarray:
+    """At least max Ẇ + mΦ̇ over Φ ≥ end and W from low to high, for every m of `_STEEPNESS`, m ≥ 1.
+
+    With a = (m − 1)/√δ + α it is max axy − m x² − (1 − β)y² + ty − 2ωW over x ≥ x₀ and y₀ ≤ y ≤ y₁: for given y the
+    best x is max(x₀, ay/2m), which leaves a quadratic in y on either side of y = 2mx₀/a, greatest at a border or where
+    its slope is 0.
+    """
+    m, g = _STEEPNESS, 1.0 - k.beta
+    a = (m - 1.0) / np.sqrt(k.delta) + k.alpha
+    x0 = np.sqrt(2.0 * k.rho * np.maximum(end, 0.0))
+    y0, y1 = np.sqrt(2.0 * k.kappa * low), np.sqrt(2.0 * k.nu * high)
+    bend = g - a * a / (4.0 * m)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        switch = np.where(a > 0.0, 2.0 * m * x0 / a, y0)
+        free = np.where(bend > 0.0, k.t / (2.0 * bend), switch)
+    ends = [np.full_like(m, y0), np.full_like(m, y1 if np.isfinite(y1) else y0)]
+    candidates = np.clip(np.stack([*ends, switch, (a * x0 + k.t) / (2.0 * g), free]), y0, y1)
+    x = np.maximum(x0, a * candidates / (2.0 * m))
+    values = a * x * candidates - m * x * x - g * candidates**2 + k.t * candidates
+    worst = values.max(axis=0) - 2.0 * k.omega * low
+    return np.where((bend > 0.0) | np.isfinite(y1), worst, np.inf) + 1e-12 * k.t**2
