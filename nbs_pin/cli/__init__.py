@@ -17,6 +17,7 @@ from rich.console import Console
 
 from nbs_pin import __version__
 from nbs_pin.cli.bench import Bench
+from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.learn import Learn
@@ -34,12 +35,13 @@ Command: TypeAlias = (
     | Annotated[Collect, tyro.conf.subcommand("collect")]
     | Annotated[Learn, tyro.conf.subcommand("learn")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Certify, tyro.conf.subcommand("certify")]
     | Annotated[Replay, tyro.conf.subcommand("replay")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Robots, tyro.conf.subcommand("robots")]
 )
-NAMES = ("track", "train", "collect", "learn", "compare", "replay", "reproduce", "bench", "robots")
+NAMES = ("track", "train", "collect", "learn", "compare", "certify", "replay", "reproduce", "bench", "robots")
 BAD_INPUT, INTERRUPTED = 2, 130
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` shows the options of a command; "
