@@ -132,9 +132,12 @@ def test_the_level_is_the_one_in_closed_form():
 def test_a_models_error_slows_the_decay_until_theorem_4_fails():
     k = Comparison(2.0, 1.0, 3.0, math.inf, 0.0, 1.0)
     rates = [decay(dataclasses.replace(k, alpha=a)) for a in (0.0, 0.5, 1.0, 1.9)]
-    assert rates == sorted(rates, reverse=True) and rates[-1] > 0.0
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] > 0.0
     worse = dataclasses.replace(k, alpha=2.01)
-    assert not worse.is_dissipative and decay(worse) == 0.0 and level(worse).storage == math.inf
+    assert not worse.is_dissipative
+    assert decay(worse) == 0.0
+    assert level(worse).storage == math.inf
 
 
 def test_the_reach_is_tighter_than_the_level_on_a_panda_with_constant_damping():
@@ -184,7 +187,8 @@ def test_one_joint_with_networks_stays_inside_its_bound(one_joint_arm, seed):
     curvature = one_joint.largest_curvature(law.potential)
     z = np.linspace(-20.0, 20.0, 2001)[:, None]
     second = law.potential.terms(z, np.ones_like(z))[2][:, 0] - 1.0
-    assert 0.0 <= second.min() and second.max() <= curvature
+    assert second.min() >= 0.0
+    assert second.max() <= curvature
     extra = one_joint.largest_extra_damping(law.damping)
     assert (law.damping.matrix(z)[:, 0, 0] - 1.0).max() <= extra
     certificate = nbs.certify(law, np.array([1.0]))
@@ -203,7 +207,8 @@ def test_inertia_shaped_bounds_rest_on_chosen_constants_alone(name):
     gains = gains_for_robot(robot, law.dynamics, bandwidth=8.0, period=0.001)
     storage = (25.0 / gains.damping).sum() / (8.0 * 8.0)
     assert certificate.label is Label.PROVED
-    assert certificate.storage == pytest.approx(storage, rel=1e-6) and certificate.storage >= storage
+    assert certificate.storage == pytest.approx(storage, rel=1e-6)
+    assert certificate.storage >= storage
     assert certificate.potential <= certificate.storage
     assert certificate.rate >= 8.0 * (1.0 - 1e-9)
     assert (certificate.joint_errors <= np.sqrt(2.0 * storage / gains.stiffness) * (1.0 + 1e-6)).all()
@@ -228,8 +233,8 @@ def test_the_bound_grows_in_proportion_to_the_disturbance():
 
 def test_no_random_disturbance_breaks_a_bound():
     """Two arms, both kinds of damping; the thousand of each arm are `nbs-pin reproduce --part certificates`."""
-    from nbs_pin.certificates.torque_waves import random_disturbances
     from nbs_pin.certificates.adversary import worst_of
+    from nbs_pin.certificates.torque_waves import random_disturbances
 
     for name, damping in (("two_link", "inertial"), ("two_link", "bounded"), ("three_link", "bounded")):
         robot = nbs.load_robot(name)
@@ -239,7 +244,8 @@ def test_no_random_disturbance_breaks_a_bound():
         waves = random_disturbances(admissible, 400, 0.002, 40, np.random.default_rng(0))
         peaks = worst_of(law, waves, nbs.Sinusoid.for_robot(robot, 2.0), period=0.002)
         assert (peaks.joint_errors <= certificate.joint_errors).all()
-        assert (peaks.error <= certificate.error).all() and peaks.error.max() > 0.0
+        assert (peaks.error <= certificate.error).all()
+        assert peaks.error.max() > 0.0
 
 
 def test_the_storage_function_keeps_its_promise_from_a_start():
@@ -255,7 +261,8 @@ def test_the_storage_function_keeps_its_promise_from_a_start():
     assert (v <= certificate.storage_bound(run.t, float(v[0])) * (1.0 + 1e-3)).all()
     overshoot, joints = certificate.from_start(float(v[0]))
     z1 = run.q - run.q_ref
-    assert np.linalg.norm(z1, axis=1).max() <= overshoot and (np.abs(z1).max(axis=0) <= joints).all()
+    assert np.linalg.norm(z1, axis=1).max() <= overshoot
+    assert (np.abs(z1).max(axis=0) <= joints).all()
     assert any(line.name == "‖z1‖ from the start" and line.value == overshoot for line in certificate.lines)
 
 
@@ -288,7 +295,8 @@ def test_theorem_4_for_a_model_of_other_masses():
     certificate = nbs.certify(law, np.zeros(2), reference=reference, duration=0.3, mismatch=delta)
     assert certificate.label is Label.PROBABILISTIC
     theorem = next(c for c in certificate.conditions if c.name.startswith("Theorem 4"))
-    assert theorem.holds and theorem.left < 1.0
+    assert theorem.holds
+    assert theorem.left < 1.0
     assert np.linalg.norm(run.q[-1] - run.q_ref[-1], axis=-1).max() <= certificate.error
     few = mismatch(belief, truth, dataclasses.replace(run, **{f: getattr(run, f)[:, :1] for f in PER_START}))
     assert nbs.certify(law, np.zeros(2), reference=reference, duration=0.3, mismatch=few).label is Label.EMPIRICAL
@@ -310,7 +318,8 @@ def test_errors_beyond_half_a_turn_of_a_continuous_joint_prove_nothing():
     robot = nbs.load_robot("kinova")
     law = nbs.NeuralBackstepping.for_robot(robot)
     fine, wild = nbs.certify(law, np.full(robot.nv, 0.1)), nbs.certify(law, np.full(robot.nv, 1e3))
-    assert fine.label is Label.PROVED and wild.label is Label.EMPIRICAL
+    assert fine.label is Label.PROVED
+    assert wild.label is Label.EMPIRICAL
     assert not next(c for c in wild.conditions if "continuous" in c.name).holds
 
 

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from nbs_pin.certificates.learned import ModelError, model_error
 from nbs_pin.certificates.margins import headroom, sampled_control
 from nbs_pin.certificates.rounding import least_eigenvalue
 from nbs_pin.checks import PerJoint, positive
+from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -90,7 +91,7 @@ class Certificate:
 
 
 def certify(
-    controller: NeuralBackstepping,
+    controller: Controller,
     disturbance: PerJoint | Admissible,
     *,
     reference: DesiredMotion | None = None,
@@ -110,6 +111,7 @@ def certify(
     Raises CertificateRefused when law or model give no ground for a bound, ArgumentError for arguments that do not fit.
     """
     constants = constants_of(controller)
+    controller = cast(NeuralBackstepping, controller)  # any other law was refused
     admissible = Admissible.of(disturbance, controller.nv)
     _check_arguments(reference, duration, q0, v0, mismatch, period)
     error = _NO_ERROR

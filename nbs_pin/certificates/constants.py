@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +12,7 @@ from nbs_pin.certificates.inertia import largest_inertia_bound, least_inertia_bo
 from nbs_pin.certificates.model_structure import check_model
 from nbs_pin.certificates.rounding import largest_eigenvalue, least_eigenvalue
 from nbs_pin.certificates.structure import check_structure
+from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -44,12 +46,14 @@ class Constants:
     lines: tuple[Claim, ...]
 
 
-def constants_of(controller: NeuralBackstepping) -> Constants:
+def constants_of(law: Controller) -> Constants:
     """The constants of a controller, after a check of its structure and of its model's.
 
     Raises CertificateRefused where those give no ground for a proof.
     """
-    structure, model = check_structure(controller), check_model(controller.dynamics)
+    structure = check_structure(law)
+    controller = cast(NeuralBackstepping, law)  # any other law was refused
+    model = check_model(controller.dynamics)
     floor = _floor(controller, structure)
     stiffness, rate = (np.asarray(gain.numpy()) for gain in (controller.potential.stiffness, controller.rate))
     omega, root = float(controller.inertial_rate), np.sqrt(rate)
