@@ -49,33 +49,39 @@ def least_inertia_bound(arm: Arm) -> Claim:
         "determinant by articulated inertias": determinant_bound(tree),
     }
     because = max(bounds, key=lambda key: bounds[key])
-    if not bounds[because] > 0.0:
+    value = max(bounds[because], 0.0)
+    if value == 0.0:
         because = "a body without inertia of its own, or travel without end, leaves no bound above 0"
-    return Claim("least inertia, a₁ ⪯ M(q)", bounds[because], "kg·m²", Label.PROVED, because)
+    return Claim("least inertia, a₁ ⪯ M(q)", value, "kg·m²", Label.PROVED, because)
 
 
-def trace_bound(arm: Arm | RigidTree, weight: Float[np.ndarray, "n n"]) -> float:
+def trace_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> float:
     """At least max_q trace(W⁻¹M(q)) for a diagonal W; for any other, with its diagonal scaled down below it."""
-    tree = arm if isinstance(arm, RigidTree) else RigidTree.of(arm)
+    tree = RigidTree.of(arm)
     return up(float(np.sum(_body_traces(tree, 1.0 / _diagonal_below(weight)))))
 
 
-def trigonometric_bound(arm: Arm | RigidTree, weight: Float[np.ndarray, "n n"], poses: int = POSES) -> float:
+def trigonometric_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int = POSES) -> float:
     """At least max_q λ_max(W^-½MW^-½) from its values at equally spaced poses (`pose_grid`).
 
     The value is inf where a joint slides without end.
     """
-    tree = arm if isinstance(arm, RigidTree) else RigidTree.of(arm)
-    return np.inf if len(tree.endless) else up(pose_grid_bound(tree, weight, poses))
+    tree = RigidTree.of(arm)
+    if len(tree.endless):
+        return np.inf
+    # What the Cholesky factor of W can lose, for W scaled to a unit diagonal.
+    spread = tree.nv * float(np.max(np.diag(weight) / _diagonal_below(weight)))
+    return up(pose_grid_bound(tree, weight, poses)) * (1.0 + 64.0 * tree.nv * np.finfo(float).eps * spread)
 
 
-def pencil_bound(arm: Arm | RigidTree) -> float:
+def pencil_bound(arm: Arm) -> float:
     """At most min_q λ_min(M(q)), from the bodies' speeds alone.
 
-    2T ≥ Σ m_i‖v_i‖² + e_i‖ω_i‖², v_i of the centre of mass and e_i the least inertia about it, while |q̇_i| ≤ ‖ω_i‖ + ‖ω_p‖
-    for a joint that turns and |q̇_i| ≤ ‖v_i‖ + ‖v_p‖ + R_i‖ω_p‖ for one that slides, with p the parent and R_i ≥ ‖c_i − c_p‖.
+    2T ≥ Σ m_i‖v_i‖² + e_i‖ω_i‖², with v_i of the centre of mass and e_i the least inertia about it, while |q̇_i| is at
+    most ‖ω_i‖ + ‖ω_p‖ for a joint that turns, p its parent, and ‖v_i‖ + ‖v_p‖ + R_i‖ω_p‖, R_i ≥ ‖c_i − c_p‖, for one
+    that slides.
     """
-    tree = arm if isinstance(arm, RigidTree) else RigidTree.of(arm)
+    tree = RigidTree.of(arm)
     n = tree.nv
     energies = np.concatenate([tree.mass, tree.least_inertia()])
     shares = np.zeros((n, 2 * n))
@@ -92,12 +98,13 @@ def pencil_bound(arm: Arm | RigidTree) -> float:
     return down(1.0 / largest_eigenvalue(scaled @ scaled.T) + float(tree.armature.min()))
 
 
-def determinant_bound(arm: Arm | RigidTree) -> float:
+def determinant_bound(arm: Arm) -> float:
     """At most min_q λ_min(M(q)), from λ_min ≥ det·((n−1)/tr)^(n−1) and det M ≥ ∏ d_i.
 
-    d_i = s_iᵀI_is_i is the inertia of body i alone about (along) its joint. Taken of M, and of M scaled by the greatest M_ii to a diagonal of at most 1, which suits joints of unlike size.
+    d_i = s_iᵀI_is_i is the inertia of body i alone about (along) its joint. Taken of M, and of M scaled by the greatest
+    M_ii to a diagonal of at most 1, which suits joints of unlike size.
     """
-    tree = arm if isinstance(arm, RigidTree) else RigidTree.of(arm)
+    tree = RigidTree.of(arm)
     n = tree.nv
     greatest = np.array([np.sum(_body_traces(tree, row)) for row in np.eye(n)])
     trace = min(float(np.sum(_body_traces(tree, np.ones(n)))), float(greatest.sum()))
@@ -114,6 +121,8 @@ def determinant_bound(arm: Arm | RigidTree) -> float:
 
 def _body_traces(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """At least Σ_i w_i M_ii over all poses, by body: its mass on its greatest lever arms, its inertia, its rotor."""
+    if len(tree.endless):
+        return np.full(tree.nv, np.inf)
     levers = lever_arms(tree, weights)
     turning = np.where(tree.prismatic, 0.0, weights)
     total = weights * tree.armature
@@ -125,7 +134,9 @@ def _body_traces(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> Float[np.
 
 
 def _apart(tree: RigidTree, i: int) -> float:
-    """‖c_i − c_parent‖ at most [m], for a joint that slides."""
+    """‖c_i − c_parent‖ at most [m], for a joint that slides; 0 where the parent never turns and it does not matter."""
+    if tree.absent[i]:
+        return 0.0
     ends = np.array([tree.lower[i], tree.upper[i]])
     if not np.isfinite(ends).all():
         return np.inf

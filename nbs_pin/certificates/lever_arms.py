@@ -22,7 +22,7 @@ Levers: TypeAlias = Callable[[Float[np.ndarray, "*batch 3"]], Float[np.ndarray, 
 def lever_arms(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> list[Levers]:
     """For each body a function of points in its frame [m] that is at least V_i, all poses considered.
 
-    weights: w ≥ 0 of each joint. Raises nothing; a prismatic joint without ends gives infinity.
+    weights: w ≥ 0 of each joint. No joint may be `endless`.
     """
     radius = _radii(tree)
     levers: list[Levers] = []
@@ -66,9 +66,7 @@ def _sliding(tree: RigidTree, i: int, weight: float, before: Levers) -> Levers:
     rotation, ends = tree.rotation[i], tree.placed(i, stops)[1]
 
     def value(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-        if not np.isfinite(ends).all():
-            return np.full(points.shape[:-1], np.inf)
-        return weight + np.max([before(points @ rotation.T + end) for end in ends], axis=0)
+        return np.asarray(weight + np.max([before(points @ rotation.T + end) for end in ends], axis=0))
 
     return value
 

@@ -96,7 +96,7 @@ def _greatest_sample(
             seen = _seen(behind[i], motions[i].reshape(*axes, *motions[i].shape[1:]))
         behind[tree.parents[i]] = behind[tree.parents[i]] + seen
     greatest = 0.0
-    for at in motions[outer] if varying else [None]:
+    for at in motions[outer] if varying else motions[0]:
         energies = list(behind)
         for i in reversed(range(outer + 1)):
             seen = _seen(energies[i], at if i == outer else motions[i][0])

@@ -12,8 +12,8 @@ from nbs_pin.robot import Robot
 from nbs_pin.runtime.layout import Packed
 from nbs_pin.runtime.tree_layout import ARMATURE, BASE, BODY, FIRST, MASS, SECOND
 
-Arm: TypeAlias = Robot | Packed
-"""A robot, or any rigid tree of turning joints as `runtime/tree_layout.py` packs it (a chain network's too)."""
+Arm: TypeAlias = "Robot | Packed | RigidTree"
+"""A robot, or any rigid tree as `runtime/tree_layout.py` packs it (a chain network's too), or what is read of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +44,8 @@ class RigidTree:
 
         Raises ArgumentError for a joint that neither turns nor slides.
         """
+        if isinstance(arm, RigidTree):
+            return arm
         packed = arm if isinstance(arm, Packed) else pack_model(arm.model)
         n = int(packed.layout[0])
         joints = packed.layout[1:].reshape(n, 2)

@@ -1,0 +1,232 @@
+"""Bounds on M(q) over all configurations: never left by sampled or adversarial poses, and not far from them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import minimize
+
+from nbs_pin import load_robot
+from nbs_pin.certificates.claims import Label
+from nbs_pin.certificates.inertia import (
+    determinant_bound,
+    largest_inertia_bound,
+    least_inertia_bound,
+    pencil_bound,
+    trace_bound,
+    trigonometric_bound,
+)
+from nbs_pin.certificates.lever_arms import lever_arms
+from nbs_pin.certificates.pose_grid import Plan
+from nbs_pin.certificates.rigid_tree import RigidTree
+from nbs_pin.certificates.rounding import down, largest_eigenvalue, least_eigenvalue, up
+from nbs_pin.dynamics.pinocchio import pack_model
+from nbs_pin.exceptions import ArgumentError
+
+FEW = 20_000
+"""Poses sampled by `trigonometric_bound` where the test is about truth, not tightness."""
+
+
+def masses(model, poses):
+    """M at each pose, whole."""
+    data = model.createData()
+    upper = np.array([np.triu(pin.crba(model, data, q)) for q in poses])
+    return upper + np.triu(upper, 1).transpose(0, 2, 1)
+
+
+def extremes(model, weight, poses, starts=2):
+    """Greatest λ(W⁻¹M) and least λ(M) found by sampling and by descent from the best samples."""
+    scale = 1.0 / np.sqrt(np.diag(weight))
+    data = model.createData()
+
+    def spectrum(q, s):
+        return np.linalg.eigvalsh(masses_of(q) * s * s[:, None])
+
+    def masses_of(q):
+        m = np.triu(pin.crba(model, data, q))
+        return m + np.triu(m, 1).T
+
+    whole = masses(model, poses)
+    great, small = np.linalg.eigvalsh(whole * scale * scale[:, None])[:, -1], np.linalg.eigvalsh(whole)[:, 0]
+    highest, lowest, ones = great.max(), small.min(), np.ones(model.nv)
+    for q in poses[np.argsort(-great)[:starts]]:
+        highest = max(highest, -minimize(lambda x: -spectrum(x, scale)[-1], q, options={"maxiter": 30}).fun)
+    for q in poses[np.argsort(small)[:starts]]:
+        lowest = min(lowest, np.exp(minimize(lambda x: np.log(spectrum(x, ones)[0]), q, options={"maxiter": 30}).fun))
+    return highest, lowest
+
+
+def random_model(rng, kinds, branched=False, rotors=False):
+    """A tree of random bodies: 'r' turns, 'p' slides, along random axes."""
+    model = pin.Model()
+    for i, kind in enumerate(kinds):
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        joint = pin.JointModelRevoluteUnaligned(axis) if kind == "r" else pin.JointModelPrismaticUnaligned(axis)
+        place = pin.SE3(np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.uniform(-0.5, 0.5, 3))
+        place.rotation = place.rotation * np.linalg.det(place.rotation)
+        parent = int(rng.integers(0, i + 1)) if branched else i
+        index = model.addJoint(parent, joint, place, f"joint{i}")
+        size = rng.uniform(0.05, 0.3, 3)
+        body = pin.Inertia.FromBox(float(rng.uniform(0.2, 3.0)), *size)
+        model.appendBodyToJoint(index, body, pin.SE3(np.eye(3), rng.uniform(-0.3, 0.3, 3)))
+    if rotors:
+        model.armature = rng.uniform(0.05, 0.2, model.nv)
+    return model
+
+
+def tree_of(model, travel=0.4):
+    """The model with sliding joints limited to ∓travel."""
+    tree = RigidTree.of(pack_model(model))
+    ends = np.where(tree.prismatic, travel, np.inf)
+    return replace(tree, lower=-ends, upper=ends)
+
+
+def poses_of(tree, rng, count):
+    """Uniform poses, sliding joints at their ends half of the time."""
+    q = rng.uniform(-np.pi, np.pi, (count, tree.nv))
+    travel = np.where(tree.prismatic, tree.upper, 1.0)
+    slides = np.where(rng.random(q.shape) < 0.5, np.sign(q), q / np.pi) * travel
+    return np.where(tree.prismatic, slides, q)
+
+
+@pytest.mark.parametrize("name", ["two_link", "three_link", "panda", "ur5", "z1", "so100", "double_pendulum"])
+def test_no_pose_leaves_the_bounds(name):
+    robot, rng = load_robot(name), np.random.default_rng(1)
+    weight = np.diag(rng.uniform(0.5, 2.0, robot.nv) * np.diag(masses(robot.model, np.zeros((1, robot.nv)))[0]))
+    highest, lowest = extremes(robot.model, weight, rng.uniform(-np.pi, np.pi, (3000, robot.nv)))
+    above, below = largest_inertia_bound(robot, weight, FEW), least_inertia_bound(robot)
+    assert above.label is below.label is Label.PROVED
+    assert highest <= above.value <= 2.0 * highest
+    assert 0.0 < below.value <= lowest
+    assert highest <= trace_bound(robot, weight)
+    assert max(pencil_bound(robot), determinant_bound(robot)) == below.value
+
+
+@pytest.mark.parametrize(("name", "over", "under"), [("panda", 1.25, 10.0), ("ur5", 1.1, 10.0)])
+def test_bounds_are_close(name, over, under):
+    robot, rng = load_robot(name), np.random.default_rng(2)
+    eye = np.eye(robot.nv)
+    highest, lowest = extremes(robot.model, eye, rng.uniform(-np.pi, np.pi, (5000, robot.nv)))
+    assert highest <= largest_inertia_bound(robot, eye).value <= over * highest
+    assert lowest / under <= least_inertia_bound(robot).value <= lowest
+    assert trace_bound(robot, eye) <= 2.3 * highest
+
+
+@pytest.mark.parametrize("branched", [False, True])
+@pytest.mark.parametrize("kinds", ["rrrr", "prrr", "rprp", "pprr", "rppr", "rrrp", "p", "r"])
+def test_trees_of_turning_and_sliding_joints(kinds, branched):
+    rng = np.random.default_rng(len(kinds) + 10 * kinds.count("p") + branched)
+    model = random_model(rng, kinds, branched, rotors=branched)
+    tree = tree_of(model)
+    poses = poses_of(tree, rng, 2000)
+    whole = masses(model, poses)
+    root = np.sqrt(rng.uniform(0.5, 2.0, tree.nv))
+    great = np.linalg.eigvalsh(whole / root / root[:, None])[:, -1].max()
+    trace = np.trace(whole / root**2, axis1=1, axis2=2).max()
+    small = np.linalg.eigvalsh(whole)[:, 0].min()
+    weight = np.diag(root**2)
+    assert great <= trigonometric_bound(tree, weight, 3000) <= 3.0 * great
+    assert trace <= trace_bound(tree, weight) <= 1.7 * trace
+    assert 0.0 < determinant_bound(tree) <= small
+    assert 0.0 < pencil_bound(tree) <= small
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_weight(seed):
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, "rrrr")
+    factor = rng.normal(size=(4, 4))
+    weight = factor @ factor.T + 0.1 * np.eye(4)
+    values = np.linalg.eigvals(np.linalg.solve(weight, masses(model, rng.uniform(-np.pi, np.pi, (2000, 4))))).real
+    packed = pack_model(model)
+    assert values.max() <= trigonometric_bound(packed, weight, 3000) <= 2.0 * values.max()
+    assert values.max() <= trace_bound(packed, weight)
+    assert largest_inertia_bound(packed, weight).value <= 1.2 * values.max()
+
+
+def test_bounds_scale_with_the_weight():
+    robot = load_robot("ur3")
+    eye = np.eye(robot.nv)
+    for bound in (trace_bound, trigonometric_bound):
+        assert bound(robot, 4.0 * eye) == pytest.approx(0.25 * bound(robot, eye), rel=1e-6)
+
+
+def test_lever_arms_are_those_of_the_poses():
+    robot, rng = load_robot("panda"), np.random.default_rng(3)
+    tree, model = RigidTree.of(robot), robot.model
+    data, weights = model.createData(), rng.uniform(0.5, 2.0, robot.nv)
+    tip = rng.uniform(-0.3, 0.3, 3)
+    tree = replace(tree, centre=np.vstack([tree.centre[:-1], tip]))
+    claimed = float(lever_arms(tree, weights)[-1](tip))
+    found = 0.0
+    for q in rng.uniform(-np.pi, np.pi, (3000, robot.nv)):
+        pin.forwardKinematics(model, data, q)
+        point = data.oMi[robot.nv].act(tip)
+        arms = [np.cross(frame.rotation[:, 2], point - frame.translation) for frame in list(data.oMi)[1:]]
+        found = max(found, float(weights @ np.sum(np.square(arms), axis=1)))
+    assert found <= claimed <= 1.25 * found
+
+
+def test_endless_travel_is_refused_with_the_reason():
+    model = random_model(np.random.default_rng(4), "rpr")
+    claim = largest_inertia_bound(pack_model(model), np.eye(3))
+    assert claim.value == np.inf
+    assert "slides" in claim.because
+    assert trace_bound(pack_model(model), np.eye(3)) == np.inf
+    assert least_inertia_bound(pack_model(model)).value == 0.0
+
+
+def test_travel_that_changes_nothing_may_be_endless():
+    model = random_model(np.random.default_rng(5), "ppr")
+    packed = pack_model(model)
+    great = np.linalg.eigvalsh(masses(model, np.random.default_rng(5).uniform(-3, 3, (500, 3))))[:, -1].max()
+    assert great <= largest_inertia_bound(packed, np.eye(3)).value <= 1.2 * great
+
+
+def test_point_masses_leave_only_what_is_known():
+    model = pin.Model()
+    for i in range(3):
+        kind = pin.JointModelRZ() if i % 2 else pin.JointModelRX()
+        joint = model.addJoint(i, kind, pin.SE3.Identity(), f"joint{i}")
+        model.appendBodyToJoint(
+            joint, pin.Inertia(1.0, np.array([0.0, 0.0, 1.0]), np.zeros((3, 3))), pin.SE3.Identity()
+        )
+    claim = least_inertia_bound(pack_model(model))
+    assert claim.value == 0.0
+    assert "inertia" in claim.because
+
+
+@pytest.mark.parametrize("weight", [np.eye(3), -np.eye(2), np.array([[1.0, 0.5], [0.4, 1.0]]), np.ones((2, 2))])
+def test_a_weight_that_is_none_is_refused(weight):
+    with pytest.raises(ArgumentError, match="weight"):
+        largest_inertia_bound(load_robot("two_link"), weight)
+
+
+@pytest.mark.parametrize("angles", [3, 4, 5, 7, 12])
+def test_polynomials_that_are_nowhere_negative_between_samples(angles):
+    """|a + b e^{iθ} + c e^{2iθ}|² over a fine grid never exceeds the sampled maximum times the factor; sharp at a peak
+    halfway between samples."""
+    rng, factor = np.random.default_rng(6), Plan(0, 1, angles).factor
+    coefficients = rng.normal(size=(500, 3, 2)) @ np.array([1.0, 1j])
+    fine = np.linspace(0.0, 2.0 * np.pi, 2001)
+    coarse = 2.0 * np.pi * np.arange(angles) / angles
+    at = [np.abs(coefficients @ np.exp(1j * np.outer(range(3), t))) ** 2 for t in (fine, coarse)]
+    assert np.all(at[0].max(1) <= factor * at[1].max(1))
+    if angles % 2 == 0:
+        peak = 1.0 + np.cos(2.0 * (coarse - np.pi / angles))
+        assert factor * peak.max() == pytest.approx(2.0)
+
+
+def test_rounding_goes_the_safe_way():
+    rng = np.random.default_rng(7)
+    for n in (1, 4, 9):
+        q, _ = np.linalg.qr(rng.normal(size=(n, n)))
+        values = np.sort(rng.uniform(-1.0, 1.0, n))
+        matrix = (q * values) @ q.T
+        matrix = 0.5 * (matrix + matrix.T)
+        assert values[0] - 1e-12 <= least_eigenvalue(matrix) < values[0]
+        assert values[-1] < largest_eigenvalue(matrix) <= values[-1] + 1e-12
+    assert down(-1.0) < -1.0 < up(-1.0)
+    assert down(1.0) < 1.0 < up(1.0)
