@@ -1,0 +1,170 @@
+"""Where V goes: the rate of the storage function over each control period, and the torques behind every term of it.
+
+The law is a law of continuous time; what an arm gets differs from it by a torque w,
+
+    w = (M̂v̇ + Ĉv + Ĝ + friction − τ) + (τ_command − law) + (τ − τ_command) = unexplained + held + cut,
+
+and V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ((ωM̂ + D)z2 + f(v) − f(φ)) + z2ᵀw for every model, exact or learned: M̂ in V, M̂ in w. So a
+certificate for w in the admissible set needs no other assumption than that (docs/certificates.md).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.dynamics.equations import inverse_dynamics
+from nbs_pin.state import Reference, Run
+
+_TOGETHER = 4096  # states a network sees at once
+
+
+class Instants(NamedTuple):
+    """What is known of a loop at control instants, any number of them."""
+
+    t: Float[np.ndarray, "*rows"]
+    """Time [s]."""
+    q: Float[np.ndarray, "*rows n"]
+    """Configuration [rad]."""
+    v: Float[np.ndarray, "*rows n"]
+    """Velocity [rad/s]."""
+    q_ref: Float[np.ndarray, "*rows n"]
+    """Desired configuration [rad]."""
+    v_ref: Float[np.ndarray, "*rows n"]
+    """Desired velocity [rad/s]."""
+    a_ref: Float[np.ndarray, "*rows n"]
+    """Desired acceleration [rad/s²]."""
+    tau: Float[np.ndarray, "*rows n"]
+    """Torque applied from then on [N·m]."""
+    tau_command: Float[np.ndarray, "*rows n"]
+    """Torque asked for [N·m]."""
+
+    @classmethod
+    def of(cls, run: Run) -> "Instants":
+        """All instants of a run, its starts one after the other: (starts·rows, …)."""
+        starts = int(np.prod(run.q.shape[1:-1], dtype=int))
+        named = (run.q, run.v, run.q_ref, run.v_ref, run.a_ref, run.tau, run.tau_command)
+        rows = (x.reshape(len(run.t), starts, run.nv).swapaxes(0, 1) for x in named)
+        return cls(np.tile(run.t, (starts, 1)), *rows)
+
+    def rows(self, which: Any) -> "Instants":
+        """Those rows of every field."""
+        return Instants(*(x[which] for x in self))
+
+
+class Balance(NamedTuple):
+    """V̇ over control periods and its terms, at the middle of each; `change` is the sum of the five others."""
+
+    change: Float[np.ndarray, "*rows"]
+    """V̇ [W] as V itself changed."""
+    potential: Float[np.ndarray, "*rows"]
+    """−∇ΦᵀΛ∇Φ [W]."""
+    damping: Float[np.ndarray, "*rows"]
+    """−z2ᵀ((ωM + D)z2 + f(v) − f(φ)) [W], f the friction that is fed forward."""
+    disturbance: Float[np.ndarray, "*rows"]
+    """z2ᵀτ_d [W] of all that the model leaves unexplained."""
+    held: Float[np.ndarray, "*rows"]
+    """z2ᵀ(τ_command − law) [W]: the torque was held, the law moved on."""
+    saturation: Float[np.ndarray, "*rows"]
+    """z2ᵀ(τ − τ_command) [W]."""
+    z2: Float[np.ndarray, "*rows n"]
+    """v − φ [rad/s]."""
+    unexplained: Float[np.ndarray, "*rows n"]
+    """M̂v̇ + Ĉv + Ĝ + friction − τ [N·m]: disturbance, and error of the model."""
+    lag: Float[np.ndarray, "*rows n"]
+    """τ_command − law [N·m]."""
+    cut: Float[np.ndarray, "*rows n"]
+    """τ − τ_command [N·m]."""
+    state_norms: Float[np.ndarray, "*rows 2"]
+    """‖q‖ [rad] and ‖v‖ [rad/s]."""
+
+
+def storage_of(controller: NeuralBackstepping, at: Instants) -> Float[np.ndarray, "*rows"]:
+    """V [J] at the instants."""
+    return _in_parts(controller.storage, at.q, at.v, at.q_ref, at.v_ref)[0]
+
+
+def balance(controller: NeuralBackstepping, before: Instants, after: Instants) -> Balance:
+    """V̇ and its terms between instants and the next, to second order in the time between them."""
+    h = (after.t - before.t)[..., None]
+    change = (storage_of(controller, after) - storage_of(controller, before)) / h[..., 0]
+    q, v = _middle(before.q, after.q, before.v, after.v, h), 0.5 * (before.v + after.v)
+    target = Reference(
+        _middle(before.q_ref, after.q_ref, before.v_ref, after.v_ref, h),
+        _middle(before.v_ref, after.v_ref, before.a_ref, after.a_ref, h),
+        0.5 * (before.a_ref + after.a_ref),
+    )
+    needed, law, lost, z2, friction = _in_parts(
+        lambda *rows: _torques(controller, *rows), q, v, (after.v - before.v) / h, *target
+    )
+    unexplained, lag, cut = needed - before.tau, before.tau_command - law, before.tau - before.tau_command
+    return Balance(
+        change=change,
+        potential=-lost[..., 0],
+        damping=-lost[..., 1] - _dot(z2, friction),
+        disturbance=_dot(z2, unexplained),
+        held=_dot(z2, lag),
+        saturation=_dot(z2, cut),
+        z2=z2,
+        unexplained=unexplained,
+        lag=lag,
+        cut=cut,
+        state_norms=np.stack([np.linalg.norm(q, axis=-1), np.linalg.norm(v, axis=-1)], axis=-1),
+    )
+
+
+def beyond(
+    admissible: Admissible, torque: Float[np.ndarray, "*rows n"], allowance: Float[np.ndarray, "*rows"] | float = 0.0
+) -> Float[np.ndarray, "*rows n"]:
+    """What must be taken from each torque to make it admissible [N·m], the norm `allowance` being granted."""
+    if admissible.box is not None:
+        rest = torque - np.clip(torque, -admissible.box, admissible.box)
+    else:
+        size = np.linalg.norm(torque, axis=-1, keepdims=True)
+        rest = torque * np.maximum(1.0 - (admissible.radius or 0.0) / np.where(size > 0.0, size, 1.0), 0.0)
+    size = np.linalg.norm(rest, axis=-1)
+    granted = np.maximum(1.0 - allowance / np.where(size > 0.0, size, 1.0), 0.0)
+    return np.asarray(rest * granted[..., None])
+
+
+def _torques(
+    controller: NeuralBackstepping,
+    q: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    q_ref: np.ndarray,
+    v_ref: np.ndarray,
+    a_ref: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """The torque of this motion, that of the law, the two losses of V, z2, and what friction takes beyond f(φ)."""
+    e, dynamics, friction = controller.errors(q, v, q_ref, v_ref, a_ref), controller.dynamics, controller.friction
+    needed, extra = inverse_dynamics(dynamics, q, v, a), np.zeros_like(q)
+    if friction is not None:
+        needed, extra = needed + friction.torque(v), friction.torque(v) - friction.torque(e.v_r)
+    first = _dot(e.gradient, controller.rate.numpy() * e.gradient)
+    second = controller.dissipation(q, v, q_ref, v_ref) - first
+    law = controller.torque(q, v, q_ref, v_ref, a_ref)
+    return needed, law, np.stack([first, second], axis=-1), e.z2, extra
+
+
+def _middle(x0: np.ndarray, x1: np.ndarray, rate0: np.ndarray, rate1: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """The value in the middle of a step h, by Hermite's cubic."""
+    return np.asarray(0.5 * (x0 + x1) + 0.125 * h * (rate0 - rate1))
+
+
+def _in_parts(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The function of rows (…, n), some thousand at once."""
+    shape, n = arrays[0].shape[:-1], arrays[0].shape[-1]
+    rows = [np.ascontiguousarray(x).reshape(-1, n) for x in arrays]
+    found = []
+    for k in range(0, max(len(rows[0]), 1), _TOGETHER):
+        value = function(*(x[k : k + _TOGETHER] for x in rows))
+        found.append(value if isinstance(value, tuple) else (value,))
+    return tuple(np.concatenate(x).reshape(*shape, *x[0].shape[1:]) for x in zip(*found, strict=True))
+
+
+def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.asarray((x * y).sum(axis=-1))
