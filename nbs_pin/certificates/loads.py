@@ -25,6 +25,7 @@ MARGIN = 1.5
 _SAMPLES = 2001
 _OUTWARD = 1.0 + 1e-9
 """Each bound is made so much larger, far more than the rounding of the operations behind it."""
+_ROUNDING = 1e-12
 
 
 class Load(NamedTuple):
@@ -176,11 +177,13 @@ def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> Float[np.nd
     while joint > 0:
         slides = robot.joints[joint - 1].prismatic
         axis = np.array(motions[joint].S)[:3] if slides else np.array(motions[joint].S)[3:]
-        levers[joint - 1] = 1.0 if slides else np.linalg.norm(np.cross(axis, point)) + beyond
+        length = float(np.linalg.norm(point))
+        # A point on the axis has a lever of rounding errors.
+        levers[joint - 1] = 1.0 if slides else np.linalg.norm(np.cross(axis, point)) + beyond + _ROUNDING * length
         travel = max(abs(robot.lower[joint - 1]), abs(robot.upper[joint - 1])) if slides else 0.0
         if not np.isfinite(travel):
             raise ArgumentError(f"joint '{robot.joint_names[joint - 1]}' slides without end; give it position limits.")
-        beyond += float(np.linalg.norm(point)) + travel
+        beyond += length + travel
         point, joint = np.array(model.jointPlacements[joint].translation), int(model.parents[joint])
     return levers
 
