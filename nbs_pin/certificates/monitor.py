@@ -42,8 +42,8 @@ class Monitored:
     """What V was not to exceed [J], from V(0)."""
     error: Float[np.ndarray, " rows"]
     """‖z1‖ [rad]."""
-    error_bound: float
-    """What ‖z1‖ was not to exceed [rad], from V(0)."""
+    error_bound: Float[np.ndarray, " rows"]
+    """What ‖z1‖ was not to exceed [rad], from V(0); it falls as the promise does."""
     balance: Balance
     """V̇ and its terms between one row and the next, (rows − 1, …)."""
     saturated: Bool[np.ndarray, " periods"]
@@ -103,7 +103,9 @@ def monitor(
     initial = float(storage[0])
     promise = np.asarray(certificate.storage_bound(at.t - at.t[0], initial))
     z1 = controller.dynamics.difference(at.q, at.q_ref)
-    size, bound = np.linalg.norm(z1, axis=-1), certificate.from_start(initial)[0]
+    # Bounds of ‖z1‖ go with √Φ, and Φ ≤ V ≤ the promise; from V(0) = 0 there is a better one, the same at all times.
+    fallen = np.sqrt(promise / promise[0]) if initial > 0.0 else np.ones(len(promise))
+    size, bound = np.linalg.norm(z1, axis=-1), certificate.from_start(initial)[0] * fallen
     setting = _Setting.of(certificate, mismatch, flow, at)
     failures = _failures(flow, setting, _wraps(controller, z1), recorded)
     over = storage > promise * (1.0 + _ROUNDING) + _EPS * (1.0 + initial)
