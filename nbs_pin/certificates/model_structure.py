@@ -185,11 +185,11 @@ def _known_claims(provider: DynamicsProvider) -> tuple[Claim, Claim] | None:
     if isinstance(provider, AnalyticDynamics):
         return _two_link(provider), _christoffel()
     tree = provider.packed_tree()
-    if isinstance(provider, PinocchioDynamics) and not np.array_equal(
-        tree.weights, pack_model(provider.robot.model)[1]
-    ):
+    if tree is None:
+        return None
+    if isinstance(provider, PinocchioDynamics) and not _same(tree, pack_model(provider.robot.model)):
         refuse(f"the model is not of {provider.robot.name}, the arm it names", "build it again from that arm")
-    positive = None if tree is None else _tree_positive(tree)
+    positive = _tree_positive(tree)
     return None if positive is None else (positive, _christoffel())
 
 

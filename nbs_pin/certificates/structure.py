@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import matvec
+from nbs_pin.arrays import Array, is_torch_array, matvec
 from nbs_pin.certificates.claims import Claim, Label
 from nbs_pin.certificates.model_structure import (
     check_finite,
@@ -147,16 +147,18 @@ def _convexity(phi: Potential, odd_gain: str) -> tuple[_Known, float]:
     least = 0.0
     for numpy in (True, False):
         layers = network.layers(numpy=numpy)
-        weights = [float(layer.wy.min()) for layer in layers if layer.wy is not None]
+        weights = [float(_array(layer.wy).min()) for layer in layers if layer.wy is not None]
         if weights and not min(weights) >= 0.0:
             refuse(f"ψ has the effective weight {min(weights):.3g} in W^(y), so it need not be convex", "keep them ≥ 0")
-        if not all(bool(np.isfinite(layer.wx.sum())) for layer in network.layers(numpy=True)):
-            refuse("ψ has weights that are not finite", "load the last sound checkpoint")
         if len(layers[-1].wx) != 1 or layers[0].wx.shape[1] != phi.nv:
             refuse("the network of ψ is no scalar function of the error", f"give one of {phi.nv} inputs and one output")
         least = min(weights, default=0.0)
     activation = _activation(network.activation)
     return _known(why or activation, "weights W^(y) ≥ 0, σ convex and non-decreasing; value: the least of W^(y)"), least
+
+
+def _array(x: Array) -> Float[np.ndarray, "*shape"]:
+    return x.numpy(force=True) if is_torch_array(x) else x
 
 
 def _activation(activation: Activation) -> str:
@@ -173,29 +175,31 @@ def _activation(activation: Activation) -> str:
 
 def _falsify_activation(activation: Activation) -> None:
     """Raises CertificateRefused with a witness unless σ, σ', σ'' look like those of a convex, non-decreasing σ."""
-    tail = np.geomspace(1e-9, 1e3, 400)
+    name, tail = type(activation).__name__, np.geomspace(1e-9, 1e2, 400)
     x = np.unique(np.concatenate([-tail, np.linspace(-4.0, 4.0, 1601), tail]))
     value, slope, bend = (np.asarray(part, dtype=float) for part in activation.derivatives(x))
-    name, at = type(activation).__name__, lambda bad: f"{x[int(np.argmax(bad))]:.3g}"
     if not (np.isfinite(value).all() and np.isfinite(slope).all() and np.isfinite(bend).all()):
-        refuse(f"the activation {name} is not finite everywhere", "give a finite σ, σ' and σ''")
-    if (slope < 0.0).any():
-        refuse(f"the activation {name} decreases at x = {at(slope < 0.0)}", "give a non-decreasing σ")
-    gap = value[:, None] - value - slope * (x[:, None] - x)  # of σ(y) over its tangent at x
-    size = np.abs(value[:, None]) + np.abs(value) + np.abs(slope * (x[:, None] - x))
-    bent = (gap < -1e-9 * size).any(axis=0) | (bend < 0.0)
-    if bent.any():
-        refuse(f"the activation {name} is not convex, or σ' not its slope, at x = {at(bent)}", "give a convex σ")
+        refuse(f"the activation {name} is not finite within ±100", "give a finite σ, σ' and σ''")
+    along = slope * (x[:, None] - x)
+    gap = value[:, None] - value - along  # of σ(y), row y, over its tangent at x, column x
+    rounding = 1e-9 * (np.abs(value[:, None]) + np.abs(value) + np.abs(along))
+    falls = slope < -1e-12 * np.abs(slope).max()
+    bent = (gap < -rounding).any(axis=0) | (bend < -1e-12 * np.abs(bend).max())
+    for bad, fault in ((falls, "decreases"), (bent, "is not convex, or σ' not its slope,")):
+        if bad.any():
+            at = x[int(bad.argmax())]
+            refuse(f"the activation {name} {fault} at x = {at:.3g}", "give a convex, non-decreasing σ")
     _falsify_bend(activation, x)
 
 
 def _falsify_bend(activation: Activation, x: Float[np.ndarray, " m"]) -> None:
     """Raises CertificateRefused where σ'' is not the derivative of σ', looking ever closer at steps that disagree."""
     a, b = x[:-1], x[1:]
-    for _ in range(30):
+    least = 1e-13 * float(np.abs(activation.derivatives(x[np.abs(x) < 4.0])[1]).max())
+    for _ in range(20):
         (_, s_a, c_a), (_, s_b, c_b) = activation.derivatives(a), activation.derivatives(b)
         allowed = np.abs(c_b - c_a) + 1e-3 * (np.abs(c_a) + np.abs(c_b))
-        rounding = 1e-9 * (np.abs(s_a) + np.abs(s_b))
+        rounding = 1e-12 * (np.abs(s_a) + np.abs(s_b)) + least
         bad = np.abs((s_b - s_a) - 0.5 * (c_a + c_b) * (b - a)) > allowed * (b - a) + rounding
         if not bad.any():
             return
@@ -212,7 +216,10 @@ def _zero(phi: Potential, convex: _Known) -> _Known:
     """How ψ(0) = 0 and ∇ψ(0) = 0 are known; raises CertificateRefused where they do not hold."""
     zero = np.zeros(phi.nv)
     value, gradient, _ = phi.terms(zero, zero)
-    if not (value == 0.0 and not gradient.any()):
+    size, slope, _ = phi.terms(zero + 1.0, zero)
+    # The smooth form subtracts what f(0) and ∇f(0) are, to rounding; the paper's is zero to the last bit.
+    allowed = 0.0 if phi.form == "paper" else 1e-9
+    if abs(value) > allowed * abs(size) or np.abs(gradient).max() > allowed * np.abs(slope).max():
         refuse(
             f"Φ(0) = {float(value):.3g} and ‖∇Φ(0)‖ = {np.linalg.norm(gradient):.3g}, so errors do not end at zero",
             "the paper's ψ takes no biases and needs σ(0) = σ'(0) = 0: take form 'smooth' for others",
