@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from nbs_pin.certificates.claims import Claim, Label
 from nbs_pin.certificates.lever_arms import lever_arms
+from nbs_pin.certificates.multipliers import least_by_multipliers
 from nbs_pin.certificates.pose_grid import pose_grid_bound
 from nbs_pin.certificates.rigid_tree import Arm, RigidTree
 from nbs_pin.certificates.rounding import down, largest_eigenvalue, least_eigenvalue, up
@@ -39,13 +40,14 @@ def largest_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int
 
 
 def least_inertia_bound(arm: Arm) -> Claim:
-    """a₁ ≤ min_q λ_min(M(q)) [kg·m², or kg along a joint that slides]: the better of pencil and determinant.
+    """a₁ ≤ min_q λ_min(M(q)) [kg·m², or kg along a joint that slides]: the best of the three below.
 
-    The value is 0, with the reason, where both say nothing.
+    The value is 0, with the reason, where all say nothing.
     """
     tree = RigidTree.of(arm)
     bounds = {
-        "bodies' rotation and translation, free of the pose (pencil)": pencil_bound(tree),
+        "energy and what no pose changes, by multipliers": multiplier_bound(tree),
+        "speeds of the bodies alone (pencil)": pencil_bound(tree),
         "determinant by articulated inertias": determinant_bound(tree),
     }
     because = max(bounds, key=lambda key: bounds[key])
@@ -72,6 +74,14 @@ def trigonometric_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int =
     # What the Cholesky factor of W can lose, for W scaled to a unit diagonal.
     spread = tree.nv * float(np.max(np.diag(weight) / _diagonal_below(weight)))
     return up(pose_grid_bound(tree, weight, poses)) * (1.0 + 64.0 * tree.nv * np.finfo(float).eps * spread)
+
+
+def multiplier_bound(arm: Arm) -> float:
+    """At most min_q λ_min(M(q)), nearly that, from the conditions on the bodies' twists that no pose changes.
+
+    `multipliers` has them. 0 where bodies without inertia leave a motion without energy.
+    """
+    return down(least_by_multipliers(RigidTree.of(arm)))
 
 
 def pencil_bound(arm: Arm) -> float:

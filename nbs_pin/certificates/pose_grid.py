@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.certificates.lever_arms import lever_arms
-from nbs_pin.certificates.rigid_tree import RigidTree
+from nbs_pin.certificates.rigid_tree import RigidTree, cross
 from nbs_pin.certificates.rounding import largest_eigenvalues
 
 FEWEST, MOST = 5, 48
@@ -157,7 +157,7 @@ def _motions(tree: RigidTree, i: int, q: Float[np.ndarray, " samples"]) -> Float
     motions = np.tile(np.eye(6 + tree.nv), (len(q), 1, 1))
     back = np.swapaxes(rotation, 1, 2)
     motions[:, :3, :3] = motions[:, 3:6, 3:6] = back
-    motions[:, :3, 3:6] = -back @ _cross(position)
+    motions[:, :3, 3:6] = -back @ cross(position)
     motions[:, 2 if tree.prismatic[i] else 5, 6 + i] = 1.0
     return motions
 
@@ -166,10 +166,8 @@ def _bodies(tree: RigidTree) -> list[Float[np.ndarray, "m m"]]:
     """Twice the kinetic energy of each body and its rotor."""
     energies = []
     for i in range(tree.nv):
-        to_centre = np.hstack([np.eye(3), -_cross(tree.centre[i])])
         energy = np.zeros((6 + tree.nv, 6 + tree.nv))
-        energy[:6, :6] = tree.mass[i] * to_centre.T @ to_centre
-        energy[3:6, 3:6] += tree.inertia[i]
+        energy[:6, :6] = tree.spatial_inertia(i)
         energy[6 + i, 6 + i] = tree.armature[i]
         energies.append(energy)
     return energies
@@ -188,10 +186,3 @@ def _scales(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> Float[np.ndarr
         speed = float(levers[p](np.zeros(3))) + 1e-3 * spin * length**2 if p >= 0 else 1.0
         scales[i] = 1.0 / np.sqrt(np.concatenate([np.full(3, speed), np.full(3, spin), weights]))
     return scales
-
-
-def _cross(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """[v]×, with [v]× w = v × w."""
-    out = np.zeros((*vectors.shape, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
-    return out - np.swapaxes(out, -1, -2)

@@ -111,3 +111,17 @@ class RigidTree:
         turn[:, 0, 1] = -turn[:, 1, 0]
         turn[:, 2, 2] = 1.0
         return self.rotation[i] @ turn, np.broadcast_to(self.position[i], (len(q), 3))
+
+    def spatial_inertia(self, i: int) -> Float[np.ndarray, "6 6"]:
+        """Twice the kinetic energy of body i as a form of its frame's twist (v, ω), in that frame."""
+        to_centre = np.hstack([np.eye(3), -cross(self.centre[i])])
+        form = self.mass[i] * to_centre.T @ to_centre
+        form[3:, 3:] += self.inertia[i]
+        return form
+
+
+def cross(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """[v]×, with [v]× w = v × w."""
+    out = np.zeros((*vectors.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -vectors[..., 2], vectors[..., 1], -vectors[..., 0]
+    return out - np.swapaxes(out, -1, -2)
