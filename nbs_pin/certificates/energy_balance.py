@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.arrays import matvec
 from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.state import Reference, Run
@@ -87,22 +89,34 @@ def storage_of(controller: NeuralBackstepping, at: Instants) -> Float[np.ndarray
     return _in_parts(controller.storage, at.q, at.v, at.q_ref, at.v_ref)[0]
 
 
-def balance(controller: NeuralBackstepping, before: Instants, after: Instants) -> Balance:
-    """V̇ and its terms between instants and the next, to second order in the time between them."""
-    h = (after.t - before.t)[..., None]
-    change = (storage_of(controller, after) - storage_of(controller, before)) / h[..., 0]
+def balance(
+    controller: NeuralBackstepping,
+    before: Instants,
+    after: Instants,
+    change: Float[np.ndarray, "*rows"],
+    law: MemorylessController | None = None,
+) -> Balance:
+    """V̇ and its terms between instants and the next, to second order in the time between them.
+
+    change: V after less V before [J]. law: the controller compiled, where speed matters.
+    """
+    h, asked = (after.t - before.t)[..., None], (controller if law is None else law).torque
     q, v = _middle(before.q, after.q, before.v, after.v, h), 0.5 * (before.v + after.v)
     target = Reference(
         _middle(before.q_ref, after.q_ref, before.v_ref, after.v_ref, h),
         _middle(before.v_ref, after.v_ref, before.a_ref, after.a_ref, h),
         0.5 * (before.a_ref + after.a_ref),
     )
-    needed, law, lost, z2, friction = _in_parts(
-        lambda *rows: _torques(controller, *rows), q, v, (after.v - before.v) / h, *target
+    wanted, needed, lost, z2, friction = _in_parts(
+        lambda *rows: (asked(*rows[:2], *rows[3:]), *_powers(controller, *rows)),
+        q,
+        v,
+        (after.v - before.v) / h,
+        *target,
     )
-    unexplained, lag, cut = needed - before.tau, before.tau_command - law, before.tau - before.tau_command
+    unexplained, lag, cut = needed - before.tau, before.tau_command - wanted, before.tau - before.tau_command
     return Balance(
-        change=change,
+        change=change / h[..., 0],
         potential=-lost[..., 0],
         damping=-lost[..., 1] - _dot(z2, friction),
         disturbance=_dot(z2, unexplained),
@@ -130,7 +144,7 @@ def beyond(
     return np.asarray(rest * granted[..., None])
 
 
-def _torques(
+def _powers(
     controller: NeuralBackstepping,
     q: np.ndarray,
     v: np.ndarray,
@@ -139,15 +153,14 @@ def _torques(
     v_ref: np.ndarray,
     a_ref: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """The torque of this motion, that of the law, the two losses of V, z2, and what friction takes beyond f(φ)."""
+    """The torque of this motion, the two losses of V, z2, and what friction takes beyond f(φ)."""
     e, dynamics, friction = controller.errors(q, v, q_ref, v_ref, a_ref), controller.dynamics, controller.friction
     needed, extra = inverse_dynamics(dynamics, q, v, a), np.zeros_like(q)
     if friction is not None:
         needed, extra = needed + friction.torque(v), friction.torque(v) - friction.torque(e.v_r)
-    first = _dot(e.gradient, controller.rate.numpy() * e.gradient)
-    second = controller.dissipation(q, v, q_ref, v_ref) - first
-    law = controller.torque(q, v, q_ref, v_ref, a_ref)
-    return needed, law, np.stack([first, second], axis=-1), e.z2, extra
+    force = controller.inertial_rate * matvec(dynamics.mass_matrix(q), e.z2) + controller.damping.force(e.z2)
+    losses = _dot(e.gradient, controller.rate.numpy() * e.gradient), _dot(e.z2, force)
+    return needed, np.stack(losses, axis=-1), e.z2, extra
 
 
 def _middle(x0: np.ndarray, x1: np.ndarray, rate0: np.ndarray, rate1: np.ndarray, h: np.ndarray) -> np.ndarray:
@@ -163,7 +176,7 @@ def _in_parts(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.nda
     for k in range(0, max(len(rows[0]), 1), _TOGETHER):
         value = function(*(x[k : k + _TOGETHER] for x in rows))
         found.append(value if isinstance(value, tuple) else (value,))
-    return tuple(np.concatenate(x).reshape(*shape, *x[0].shape[1:]) for x in zip(*found, strict=True))
+    return tuple(np.concatenate(x).reshape((*shape, *x[0].shape[1:])) for x in zip(*found, strict=True))
 
 
 def _dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:

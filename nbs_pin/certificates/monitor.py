@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,6 +11,7 @@ from jaxtyping import Bool, Float
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.energy_balance import Balance, Instants, balance, beyond, storage_of
+from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.mismatch import Mismatch
@@ -99,7 +101,7 @@ def monitor(
         )
     at = Instants.of(run).rows(start)
     storage, recorded = storage_of(controller, at), run.disturbance.reshape(len(run.t), starts, run.nv)[:, start]
-    flow = balance(controller, at.rows(slice(-1)), at.rows(slice(1, None)))
+    flow = balance(controller, at.rows(slice(-1)), at.rows(slice(1, None)), np.diff(storage))
     initial = float(storage[0])
     promise = np.asarray(certificate.storage_bound(at.t - at.t[0], initial))
     z1 = controller.dynamics.difference(at.q, at.q_ref)
@@ -137,9 +139,11 @@ class WatchMemory(NamedTuple):
     began: float
     """Time of the first instant [s]."""
     initial: float
-    """V then [J]."""
+    """V at that time [J]."""
     last: Instants
     """The instant before."""
+    storage: float
+    """V then [J]."""
     excess: float
     """Energy that torques beyond the admissible ones can have brought and that has not decayed [J]."""
     broken: tuple[str, ...]
@@ -174,6 +178,10 @@ class Watch:
     certificate: Certificate
     mismatch: Mismatch | None = None
 
+    @cached_property
+    def _law(self) -> MemorylessController:
+        return cast(MemorylessController, self.controller.compile())
+
     def step(
         self,
         memory: WatchMemory | None,
@@ -192,17 +200,18 @@ class Watch:
         storage = float(storage_of(self.controller, now))
         if memory is None:
             said = Watched(storage, max(storage, self.certificate.storage), True, (), None, "promise kept")
-            return said, WatchMemory(t, storage, now, 0.0, ())
+            return said, WatchMemory(t, storage, now, storage, 0.0, ())
         step = t - float(memory.last.t)
         if not step > 0.0:
             raise ArgumentError(f"the instant t = {t} s is not after the last, {memory.last.t} s; give them in order.")
         both = Instants(*(np.stack([a, b]) for a, b in zip(memory.last, now, strict=True)))
-        flow = balance(self.controller, both.rows(slice(1)), both.rows(slice(1, None)))
+        change = np.array([storage - memory.storage])
+        flow = balance(self.controller, both.rows(slice(1)), both.rows(slice(1, None)), change, self._law)
         wraps = _wraps(self.controller, self.controller.dynamics.difference(both.q, both.q_ref))
         setting = _Setting.of(self.certificate, self.mismatch, flow, both)
         failed, power = _failures(flow, setting, wraps, None), float(_excess(flow, setting)[0][0])
         excess = _decayed(memory.excess, power, step, self.certificate.level.c)
-        promise = float(self.certificate.storage_bound(np.array(t - memory.began), memory.initial))
+        promise = float(self.certificate.storage_bound(np.array([t - memory.began]), memory.initial)[0])
         is_kept = storage <= promise * (1.0 + _ROUNDING) + _EPS * (1.0 + memory.initial)
         broken = tuple(name for name in ASSUMPTIONS if name in failed or name in memory.broken)
         is_wrong = storage > promise * (1.0 + _DIFFERENCES) + excess and WRAP not in broken
@@ -210,7 +219,7 @@ class Watch:
             broken = (_greatest(flow, setting.admissible, None),)
         return (
             Watched(storage, promise, is_kept, broken, flow, _said("", is_kept, is_wrong, broken)),
-            WatchMemory(memory.began, memory.initial, now, excess, broken),
+            WatchMemory(memory.began, memory.initial, now, storage, excess, broken),
         )
 
 
@@ -239,9 +248,11 @@ class _Setting(NamedTuple):
         admissible, step = certificate.admissible, np.diff(at.t)
         size = float(np.linalg.norm(admissible.box)) if admissible.box is not None else admissible.radius or 0.0
         q, v = flow.state_norms[:, 0], flow.state_norms[:, 1]
+        speed = np.linalg.norm(at.v, axis=-1)
         torque = np.linalg.norm(at.tau[:-1], axis=-1) + np.linalg.norm(flow.unexplained, axis=-1)
+        fastest = np.maximum(speed[1:], speed[:-1])
         granted = np.zeros_like(q) if mismatch is None else mismatch.bound(q, v)
-        return cls(admissible, granted, _OF_BOUND * size + (_OF_TORQUE + (step * v) ** 2) * torque)
+        return cls(admissible, granted, _OF_BOUND * size + (_OF_TORQUE + (step * fastest) ** 2) * torque)
 
     def beyond(self, torque: Float[np.ndarray, "periods n"]) -> Float[np.ndarray, " periods"]:
         """How far each torque is from what is admissible and granted [N·m]."""

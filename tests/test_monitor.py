@@ -1,0 +1,334 @@
+"""The monitor: V̇ is the sum of its terms for any model, promises are kept, and what breaks one is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import nbs_pin as nbs
+from nbs_pin.certificate_charts import plot_certificate, plot_monitor
+from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.adversary import attack, random_disturbances
+from nbs_pin.certificates.certificate import certify
+from nbs_pin.certificates.energy_balance import Instants, balance, beyond, storage_of
+from nbs_pin.certificates.monitor import (
+    DISTURBANCE,
+    MODEL,
+    SAMPLING,
+    SATURATION,
+    UNEXPLAINED,
+    WRAP,
+    Watch,
+    monitor,
+)
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.exceptions import ArgumentError
+from nbs_pin.mismatch import mismatch
+from nbs_pin.networks.families import make_network
+from nbs_pin.references import Hold, Sinusoid
+from nbs_pin.state import Reference
+
+BOUND = np.array([5.0, 3.0])
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return nbs.load_robot("two_link")
+
+
+@pytest.fixture(scope="module")
+def law(robot):
+    return NeuralBackstepping.for_robot(robot, bandwidth=8.0)
+
+
+@pytest.fixture(scope="module")
+def certificate(law):
+    return certify(law, BOUND)
+
+
+def run_of(law, *, truth=None, friction=None, period=0.001, duration=0.3, off=0.0, effort_limit=np.inf, torque=None):
+    robot = law.dynamics.robot
+    plant = nbs.DynamicsPlant(law.dynamics if truth is None else truth, friction=friction)
+    reference = Sinusoid.for_robot(robot, 2.0)
+    start = {} if off == 0.0 else {"q0": reference(np.zeros(1)).q[0] + off}
+    return nbs.simulate(plant, law, reference, duration, period, effort_limit=effort_limit, disturbance=torque, **start)
+
+
+def residual(law, run):
+    """max |V̇ − its terms|, and the size of V̇."""
+    flow = flow_of(law, run)
+    terms = flow.potential + flow.damping + flow.disturbance + flow.held + flow.saturation
+    return np.abs(flow.change - terms).max(), np.abs(flow.change).max()
+
+
+def flow_of(law, run):
+    at = Instants.of(run).rows(0)
+    return balance(law, at.rows(slice(-1)), at.rows(slice(1, None)), np.diff(storage_of(law, at)))
+
+
+def learned(robot, seed=0):
+    return nbs.LagrangianDynamics(make_network("cholesky", [False, False], seed=seed), robot)
+
+
+@pytest.mark.parametrize("case", ["exact", "learned", "friction", "saturated", "paper"])
+def test_the_terms_sum_to_the_rate_of_v_to_second_order(robot, law, case):
+    """The identity of docs/theory.md §2, with M̂ for M and w for τ_d, along motions of the true arm."""
+    kept = {"off": 0.2, "torque": ConstantTorque(BOUND)}
+    if case == "learned":
+        law = NeuralBackstepping(learned(robot), law.potential, law.damping, rate=law.rate.numpy(), inertial_rate=8.0)
+        kept |= {"truth": nbs.PinocchioDynamics(robot)}
+    elif case == "friction":
+        friction = JointFriction(np.array([0.4, 0.2]), np.array([0.5, 0.3]), transition=0.5)
+        law = NeuralBackstepping(
+            law.dynamics, law.potential, law.damping, rate=law.rate.numpy(), inertial_rate=8.0, friction=friction
+        )
+        kept |= {"friction": friction}
+    elif case == "saturated":
+        kept |= {"effort_limit": 20.0}
+    elif case == "paper":
+        law = NeuralBackstepping.for_robot(robot, damping="paper", potential="paper")
+    period = {"paper": 0.0005}.get(case, 0.001)
+    coarse, size = residual(law, run_of(law, period=period, duration=0.1, **kept))
+    fine, _ = residual(law, run_of(law, period=0.5 * period, duration=0.1, **kept))
+    assert coarse < 2e-2 * size
+    # The paper's ∇²Φ jumps where a pre-activation passes 0: within that one period the rate of V has no middle.
+    assert fine < (1.0 if case == "paper" else 0.35) * coarse
+
+
+def test_what_is_unexplained_is_the_disturbance_of_an_exact_model(law):
+    run = run_of(law, torque=SinusoidalTorque(BOUND, 7.0), off=0.1)
+    found = flow_of(law, run).unexplained
+    wanted = BOUND * np.sin(7.0 * (run.t[:-1] + 0.0))[:, None]
+    assert np.abs(found - wanted).max() < 1e-2
+
+
+def test_what_is_unexplained_is_also_the_error_of_the_model(robot, law):
+    """A truth with friction that the model leaves out: viscous·v is what is missing."""
+    friction = JointFriction(np.array([2.0, 1.0]), np.zeros(2))
+    run = run_of(law, friction=friction, off=0.1)
+    found = flow_of(law, run).unexplained
+    middle = 0.5 * (run.v[1:] + run.v[:-1])
+    assert np.abs(found + friction.viscous * middle).max() < 2e-2
+
+
+def test_storage_and_promise_are_those_of_law_and_certificate(law, certificate):
+    run = run_of(law, off=0.1)
+    seen = monitor(run, law, certificate)
+    assert seen.storage == pytest.approx(law.storage(run.q, run.v, run.q_ref, run.v_ref), rel=1e-12)
+    assert np.array_equal(seen.promise, certificate.storage_bound(run.t, float(seen.storage[0])))
+    assert np.array_equal(seen.error, np.linalg.norm(run.q - run.q_ref, axis=-1))
+    assert seen.error_bound[0] == pytest.approx(certificate.from_start(float(seen.storage[0]))[0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_admissible_disturbances_keep_the_promise(law, certificate, seed):
+    torque = random_disturbances(certificate.admissible, 300, 0.001, 8, np.random.default_rng(seed))[seed]
+    run = run_of(law, off=0.05 * seed, torque=lambda t, q, v: torque[min(int(t / 0.001 + 1e-6), 299)] + 0.0 * q)
+    seen = monitor(run, law, certificate)
+    assert seen.is_kept
+    assert not seen.is_wrong
+    assert seen.verdict.startswith("promise kept")
+    assert set(seen.broken) <= {SAMPLING}
+
+
+def test_a_calm_run_breaks_nothing(law, certificate):
+    seen = monitor(run_of(law), law, certificate)
+    assert seen.verdict == "promise kept"
+    assert seen.broken == ()
+    assert not seen.saturated.any()
+
+
+def test_the_worst_attack_keeps_the_promise_and_a_smaller_promise_is_called_wrong(law, certificate):
+    run = attack(law, BOUND, duration=0.3, rounds=3, starts=4).run
+    assert monitor(run, law, certificate).is_kept
+    level = certificate.level._replace(storage=0.05 * certificate.storage)
+    seen = monitor(run, law, replace(certificate, level=level))
+    assert seen.is_wrong
+    assert "the certificate is wrong" in seen.verdict
+    error = 0.5 * float(monitor(run, law, certificate).error.max())
+    seen = monitor(run, law, replace(certificate, error=error))
+    assert seen.is_wrong
+    assert not (seen.storage > seen.promise).any()
+
+
+def test_faster_decay_than_there_is_is_called_wrong(law, certificate):
+    run = run_of(law, off=0.3)
+    level = certificate.level._replace(c=20.0 * certificate.level.c, storage=1e-6)
+    assert monitor(run, law, certificate).is_kept
+    assert monitor(run, law, replace(certificate, level=level)).is_wrong
+
+
+@pytest.mark.parametrize("size", [4.0, 8.0, 16.0])
+def test_a_disturbance_beyond_its_bound_is_named(law, certificate, size):
+    seen = monitor(run_of(law, torque=SquareWave(size * BOUND, 9.0)), law, certificate)
+    assert not seen.is_kept
+    assert not seen.is_wrong
+    assert DISTURBANCE in seen.broken
+    assert not {MODEL, SATURATION, WRAP} & set(seen.broken)
+    assert DISTURBANCE in seen.verdict
+
+
+@pytest.mark.parametrize("limit", [5.0, 10.0])
+def test_saturation_is_named_and_its_intervals_are_those_of_the_run(law, certificate, limit):
+    run = run_of(law, off=0.6, effort_limit=limit)
+    seen = monitor(run, law, certificate)
+    assert np.array_equal(seen.saturated, (run.tau != run.tau_command).any(axis=-1)[:-1])
+    assert seen.saturated.any()
+    assert SATURATION in seen.broken
+    assert not seen.is_wrong
+    assert MODEL not in seen.broken
+
+
+def test_saturation_that_breaks_the_promise_accounts_for_it(law, certificate):
+    seen = monitor(run_of(law, off=0.6, effort_limit=2.0, duration=1.0), law, certificate)
+    assert not seen.is_kept
+    assert not seen.is_wrong
+    assert SATURATION in seen.verdict
+
+
+@pytest.mark.parametrize(("torque", "name"), [(None, UNEXPLAINED), (ConstantTorque([0.1, 0.1]), MODEL)])
+def test_an_arm_that_is_not_the_model_is_named(law, certificate, torque, name):
+    """With a disturbance on record the model is to blame, without one it may be either."""
+    small = certify(law, 0.1 * BOUND)
+    friction = JointFriction(np.array([1.0, 1.0]), np.array([6.0, 6.0]))
+    seen = monitor(run_of(law, friction=friction, torque=torque), law, small)
+    assert name in seen.broken
+    assert not seen.is_wrong
+    assert DISTURBANCE not in seen.broken
+
+
+def test_a_torque_held_too_long_is_named(law):
+    still = certify(law, 0.01 * BOUND)
+    seen = monitor(run_of(law, period=0.01, off=0.3), law, still)
+    assert SAMPLING in seen.broken
+    assert not {MODEL, DISTURBANCE, SATURATION, UNEXPLAINED} & set(seen.broken)
+    assert not seen.is_wrong
+
+
+def test_an_error_that_wraps_is_named():
+    """A continuous joint thrown over its top by a torque no law could hold."""
+    robot = nbs.load_robot("kinova")
+    law = NeuralBackstepping.for_robot(robot)
+    assert robot.continuous.any()
+    joint = int(np.flatnonzero(robot.continuous)[0])
+    certificate = certify(law, np.ones(robot.nv))
+    run = run_of(law, duration=0.01)
+    q = run.q.copy()
+    q[5:, joint] = run.q_ref[5:, joint] + np.pi + 0.01
+    q[:5, joint] = run.q_ref[:5, joint] + np.pi - 0.01
+    seen = monitor(replace(run, q=q), law, certificate)
+    assert WRAP in seen.broken
+    assert not seen.is_wrong
+
+
+def test_a_learned_models_error_is_granted_where_the_certificate_counts_it(robot, law):
+    """‖δ‖ ≤ a‖q‖ + b‖v‖ + c beside τ_d is no broken assumption; more than that is."""
+    model = NeuralBackstepping(learned(robot), law.potential, law.damping, rate=law.rate.numpy(), inertial_rate=8.0)
+    run = run_of(model, truth=nbs.PinocchioDynamics(robot), off=0.05)
+    found = mismatch(model.dynamics, nbs.PinocchioDynamics(robot), run)
+    empirical = certify(law, 0.1 * BOUND)
+    plain = monitor(run, model, empirical)
+    granted = monitor(run, model, empirical, mismatch=found)
+    little = monitor(run, model, empirical, mismatch=found._replace(a=0.0, b=0.0, c=1e-3))
+    assert UNEXPLAINED in plain.broken
+    assert UNEXPLAINED not in granted.broken
+    assert UNEXPLAINED in little.broken
+    assert np.isfinite(plain.storage).all()
+
+
+def test_starts_of_a_batch_are_monitored_one_by_one(law, certificate):
+    robot, starts = law.dynamics.robot, np.array([[0.1, 0.0], [0.0, 0.2], [-0.1, 0.1]])
+    reference = Sinusoid.for_robot(robot, 2.0)
+    q0 = reference(np.zeros(1)).q[0] + starts
+    plant = nbs.DynamicsPlant(law.dynamics)
+    run = nbs.simulate(plant, law, reference, 0.05, 0.001, q0=q0)
+    for k in range(3):
+        alone = monitor(nbs.simulate(plant, law, reference, 0.05, 0.001, q0=q0[k]), law, certificate)
+        assert monitor(run, law, certificate, start=k).storage == pytest.approx(alone.storage, rel=1e-9)
+    with pytest.raises(ArgumentError, match="start 3"):
+        monitor(run, law, certificate, start=3)
+
+
+def watched(watch, run):
+    memory, said = None, []
+    for k in range(len(run.t)):
+        reference = Reference(run.q_ref[k], run.v_ref[k], run.a_ref[k])
+        one, memory = watch.step(memory, float(run.t[k]), run.q[k], run.v[k], reference, run.tau[k], run.tau_command[k])
+        said.append(one)
+    return said
+
+
+@pytest.mark.parametrize(
+    "kept", [{}, {"off": 0.6, "effort_limit": 2.0}, {"torque": SquareWave(8.0 * BOUND, 9.0)}], ids=str
+)
+def test_a_watch_says_live_what_the_monitor_says_afterwards(law, certificate, kept):
+    run = run_of(law, duration=0.1, **kept)
+    seen = monitor(replace(run, disturbance=0.0 * run.disturbance), law, certificate)
+    said = watched(Watch(law, certificate), run)
+    assert [s.storage for s in said] == pytest.approx(seen.storage, rel=1e-9)
+    assert [s.promise for s in said] == pytest.approx(seen.promise, rel=1e-9)
+    assert [not s.is_kept for s in said] == (seen.storage > seen.promise * (1.0 + 1e-9)).tolist()
+    assert said[-1].broken == seen.broken
+    assert said[0].balance is None
+    assert said[5].balance.change[0] == pytest.approx(seen.balance.change[4], rel=1e-9, abs=1e-9)
+
+
+def test_a_watch_calls_a_wrong_certificate_wrong(law, certificate):
+    run = attack(law, BOUND, duration=0.2, rounds=2, starts=2, reference=Hold([0.3, 0.4])).run
+    level = certificate.level._replace(storage=0.05 * certificate.storage)
+    said = watched(Watch(law, replace(certificate, level=level)), run)
+    assert any("the certificate is wrong" in s.verdict for s in said)
+    assert all(s.verdict.startswith("promise kept") for s in watched(Watch(law, certificate), run))
+
+
+def test_a_watch_wants_instants_in_order(law, certificate):
+    run, watch = run_of(law, duration=0.01), Watch(law, certificate)
+    reference = Reference(run.q_ref[0], run.v_ref[0], run.a_ref[0])
+    row = (run.q[0], run.v[0], reference, run.tau[0], run.tau_command[0])
+    _, memory = watch.step(None, 0.5, *row)
+    with pytest.raises(ArgumentError, match="in order"):
+        watch.step(memory, 0.5, *row)
+
+
+def test_a_run_of_another_arm_is_refused(law, certificate):
+    run = run_of(NeuralBackstepping.for_robot(nbs.load_robot("ur5")), duration=0.01)
+    with pytest.raises(ArgumentError, match="this controller"):
+        monitor(run, law, certificate)
+
+
+@pytest.mark.parametrize("admissible", [Admissible(box=np.array([1.0, 2.0])), Admissible(radius=1.5)])
+def test_beyond_is_the_least_torque_to_take_away(admissible):
+    rng = np.random.default_rng(0)
+    torque = rng.normal(0.0, 3.0, (200, 2))
+    rest = beyond(admissible, torque)
+    assert admissible.contains(torque - rest)
+    inside = np.array([admissible.contains(row) for row in torque])
+    assert np.array_equal(~inside, rest.any(axis=-1))
+    for other in admissible.towards(rng.normal(size=(50, 2))):
+        assert (np.linalg.norm(torque - other, axis=-1) >= np.linalg.norm(rest, axis=-1) - 1e-12)[~inside].all()
+    size = np.linalg.norm(rest, axis=-1)
+    granted = np.linalg.norm(beyond(admissible, torque, np.full(200, 0.5)), axis=-1)
+    assert granted == pytest.approx(np.maximum(size - 0.5, 0.0), abs=1e-12)
+
+
+def test_storage_of_many_states_is_that_of_each(law):
+    rng = np.random.default_rng(0)
+    rows = [rng.normal(size=(3, 1500, 2)) for _ in range(7)]
+    at = Instants(np.zeros((3, 1500)), *rows)  # more than fit at once
+    few = law.storage(*(x[:, ::500] for x in rows[:4]))
+    assert storage_of(law, at)[:, ::500] == pytest.approx(few, rel=1e-12)
+
+
+def test_pictures_are_drawn(law, certificate, tmp_path):
+    found = attack(law, BOUND, duration=0.1, rounds=1, starts=2)
+    broken = monitor(run_of(law, off=0.6, effort_limit=2.0), law, certificate)
+    paths = [
+        plot_certificate(certificate, found, tmp_path / "certificate.png"),
+        plot_certificate(certificate, None, tmp_path / "bounds.png"),
+        plot_monitor(monitor(found.run, law, certificate), tmp_path / "kept.png"),
+        plot_monitor(broken, tmp_path / "broken.png"),
+    ]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
+    assert len({path.read_bytes() for path in paths}) == 4
