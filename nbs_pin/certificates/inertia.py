@@ -9,18 +9,19 @@ from jaxtyping import Float
 
 from nbs_pin.certificates.claims import Claim, Label
 from nbs_pin.certificates.lever_arms import lever_arms
-from nbs_pin.certificates.multipliers import least_by_multipliers
+from nbs_pin.certificates.multipliers import largest_by_multipliers, least_by_multipliers
 from nbs_pin.certificates.pose_grid import pose_grid_bound
 from nbs_pin.certificates.rigid_tree import Arm, RigidTree
 from nbs_pin.certificates.rounding import down, largest_eigenvalue, least_eigenvalue, up
 from nbs_pin.exceptions import ArgumentError
 
 POSES = 150_000
-"""Poses that `largest_inertia_bound` looks at, at most."""
+"""Poses that `trigonometric_bound` looks at, at most."""
+MULTIPLIERS = "energy of the bodies and what no pose changes of their twists, by multipliers"
 
 
-def largest_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int = POSES) -> Claim:
-    """At least max_q λ_max(W^-½ M(q) W^-½), so that M(q) ⪯ value·W: the better of the two bounds below.
+def largest_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> Claim:
+    """At least max_q λ_max(W^-½ M(q) W^-½), so that M(q) ⪯ value·W: by multipliers, else the better of two others.
 
     weight: W, symmetric positive definite, usually D₀ [N·m·s/rad]; the value is then 1/κ [s]. I gives a₂ [kg·m²].
     The value is inf, with the reason, where a joint slides without end. Raises ArgumentError for a W that is none.
@@ -31,22 +32,27 @@ def largest_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int
     if len(tree.endless):
         because = f"joint {int(tree.endless[0]) + 1} slides without a stated end, so inertia has no bound"
         return Claim(name, np.inf, "", Label.PROVED, because)
+    value = up(largest_by_multipliers(tree, weight))
+    if np.isfinite(value):
+        return Claim(name, value, "", Label.PROVED, MULTIPLIERS)
     bounds = {
         "trace of W⁻¹M by the greatest lever arms": trace_bound(tree, weight),
-        "finitely many poses, a trigonometric polynomial between them": trigonometric_bound(tree, weight, poses),
+        "finitely many poses, a trigonometric polynomial between them": trigonometric_bound(tree, weight),
     }
     because = min(bounds, key=lambda key: bounds[key])
     return Claim(name, bounds[because], "", Label.PROVED, because)
 
 
 def least_inertia_bound(arm: Arm) -> Claim:
-    """a₁ ≤ min_q λ_min(M(q)) [kg·m², or kg along a joint that slides]: the best of the three below.
+    """a₁ ≤ min_q λ_min(M(q)) [kg·m², or kg along a joint that slides]: by multipliers, else the better of two others.
 
     The value is 0, with the reason, where all say nothing.
     """
     tree = RigidTree.of(arm)
+    name, value = "least inertia, a₁ ⪯ M(q)", down(least_by_multipliers(tree))
+    if value > 0.0:
+        return Claim(name, value, "kg·m²", Label.PROVED, MULTIPLIERS)
     bounds = {
-        "energy and what no pose changes, by multipliers": multiplier_bound(tree),
         "speeds of the bodies alone (pencil)": pencil_bound(tree),
         "determinant by articulated inertias": determinant_bound(tree),
     }
@@ -54,7 +60,13 @@ def least_inertia_bound(arm: Arm) -> Claim:
     value = max(bounds[because], 0.0)
     if value == 0.0:
         because = "a body without inertia of its own, or travel without end, leaves no bound above 0"
-    return Claim("least inertia, a₁ ⪯ M(q)", value, "kg·m²", Label.PROVED, because)
+    return Claim(name, value, "kg·m²", Label.PROVED, because)
+
+
+def multiplier_bounds(arm: Arm, weight: Float[np.ndarray, "n n"]) -> tuple[float, float]:
+    """(a, b) with aW ⪯ M(q) ⪯ bW in every pose, as close as multipliers find them (`multipliers`); a ≥ 0, b ≤ inf."""
+    tree = RigidTree.of(arm)
+    return down(least_by_multipliers(tree, weight)), up(largest_by_multipliers(tree, weight))
 
 
 def trace_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> float:
@@ -69,19 +81,11 @@ def trigonometric_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int =
     The value is inf where a joint slides without end.
     """
     tree = RigidTree.of(arm)
-    if len(tree.endless):
+    if len(tree.endless) or not tree.physical:
         return np.inf
     # What the Cholesky factor of W can lose, for W scaled to a unit diagonal.
     spread = tree.nv * float(np.max(np.diag(weight) / _diagonal_below(weight)))
     return up(pose_grid_bound(tree, weight, poses)) * (1.0 + 64.0 * tree.nv * np.finfo(float).eps * spread)
-
-
-def multiplier_bound(arm: Arm) -> float:
-    """At most min_q λ_min(M(q)), nearly that, from the conditions on the bodies' twists that no pose changes.
-
-    `multipliers` has them. 0 where bodies without inertia leave a motion without energy.
-    """
-    return down(least_by_multipliers(RigidTree.of(arm)))
 
 
 def pencil_bound(arm: Arm) -> float:
@@ -93,7 +97,7 @@ def pencil_bound(arm: Arm) -> float:
     """
     tree = RigidTree.of(arm)
     n = tree.nv
-    energies = np.concatenate([tree.mass, tree.least_inertia()])
+    energies = np.concatenate([tree.mass, tree.least_inertia])
     shares = np.zeros((n, 2 * n))
     for i, p in enumerate(tree.parents.tolist()):
         own = i if tree.prismatic[i] else n + i
@@ -102,6 +106,8 @@ def pencil_bound(arm: Arm) -> float:
             shares[i, own - i + p] = 1.0
             shares[i, n + p] += _apart(tree, i) if tree.prismatic[i] else 0.0
     used = shares.any(axis=0)
+    if not tree.physical:
+        return 0.0
     if not (energies[used] > 0.0).all() or not np.isfinite(shares).all():
         return down(float(tree.armature.min()))
     scaled = shares[:, used] / np.sqrt(energies[used])
@@ -119,7 +125,7 @@ def determinant_bound(arm: Arm) -> float:
     greatest = np.array([np.sum(_body_traces(tree, row)) for row in np.eye(n)])
     trace = min(float(np.sum(_body_traces(tree, np.ones(n)))), float(greatest.sum()))
     if not np.isfinite(trace):
-        return down(float(tree.armature.min()))
+        return 0.0
     about = tree.inertia[:, 2, 2] + tree.mass * (tree.centre[:, :2] ** 2).sum(1)
     own = np.where(tree.prismatic, tree.mass, about) + tree.armature
     if not (own > 0.0).all():
@@ -131,7 +137,7 @@ def determinant_bound(arm: Arm) -> float:
 
 def _body_traces(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """At least Σ_i w_i M_ii over all poses, by body: its mass on its greatest lever arms, its inertia, its rotor."""
-    if len(tree.endless):
+    if len(tree.endless) or not tree.physical:
         return np.full(tree.nv, np.inf)
     levers = lever_arms(tree, weights)
     turning = np.where(tree.prismatic, 0.0, weights)

@@ -1,109 +1,126 @@
-"""The least eigenvalue of the inertia matrix over all poses, from what poses cannot change (docs/certificates.md).
+"""The extreme eigenvalues of the inertia matrix over all poses, from what poses cannot change (docs/certificates.md).
 
 The kinetic energy is a constant quadratic form of the bodies' twists, each in its own frame. A joint that turns about z
 takes its parent's twist (v, ω), placed at the joint, to the body's: v_z is kept, ω_z gains q̇, and the turn of the other
-two components keeps ‖v_⊥‖², ‖ω_⊥‖², v_⊥·ω_⊥ and z·(v_⊥×ω_⊥). A joint that slides by s keeps ω, adds q̇ to v_z and
-s ω×z to v_⊥. These are linear and quadratic conditions without q, so energy + Σ h·(what is zero) ⪰ a‖q̇‖² on all twists
-proves a ⪯ M(q) everywhere, for any multipliers h; a descent finds good ones.
+components keeps ‖v_⊥‖², ‖ω_⊥‖², v_⊥·ω_⊥ and z·(v_⊥×ω_⊥). A joint that slides by s keeps ω, adds q̇ to v_z and s ω×z to
+v_⊥. These are linear and quadratic conditions without q. So energy − a q̇ᵀWq̇ + Σ h·(what is zero) ⪰ 0 on all twists
+proves aW ⪯ M(q) everywhere, whatever the multipliers h, and so from above; a semidefinite program finds good ones.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize
 
 from nbs_pin.certificates.rigid_tree import RigidTree, cross
-from nbs_pin.certificates.rounding import largest_eigenvalue, least_eigenvalue
+from nbs_pin.certificates.rounding import least_eigenvalue
+from nbs_pin.certificates.semidefinite import Inequality, maximise
 
-KEPT = 0.999
-"""Share of the multipliers found that is used, so that the form stays clear of 0: at least 1 − KEPT of the energy."""
-SHARPNESS = (4.0, 16.0, 64.0, 256.0)
-"""Powers p by which λ_max is replaced by (Σ λᵖ)^(1/p) for the descent, one after the other."""
+REACH = 1e4
+"""Multipliers are kept below this, for forms and energy of size 1: larger ones gain nothing and cost digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """A quadratic form of all motions, and a bound on the sums of absolute values behind each of its entries."""
+
+    matrix: Float[np.ndarray, "m m"]
+    size: Float[np.ndarray, "m m"]
+    positive: bool = False
+    """Whether the form is ≤ 0 and not 0 on the arm's motions, so that its multiplier must be ≥ 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """All twists that the linear conditions allow, as coordinates x, and what is known of them."""
+    """Twists that the linear conditions allow, in coordinates x, and what is known of them in every pose."""
 
-    energy: Float[np.ndarray, "m m"]
-    """xᵀ energy x = 2T, rotors included."""
-    rates: Float[np.ndarray, "n m"]
-    """q̇ = rates x."""
-    forms: Float[np.ndarray, "k m m"]
-    """Quadratic conditions xᵀ form x = 0, or ≤ 0 where `signed`."""
-    signed: Float[np.ndarray, " k"]
-    """1 for a condition ≤ 0, whose multiplier must be ≥ 0; else 0."""
+    energy: Form
+    """2T, rotors included."""
+    moving: list[int]
+    """Where q̇ is in x."""
+    conditions: list[Form]
 
     @classmethod
     def of(cls, tree: RigidTree) -> "Motions":
         """The motions of a tree in any pose."""
-        n = tree.nv
-        own = np.eye(6 * n).reshape(n, 6, 6 * n)
-        seen = np.array([_placed(tree, i) @ own[tree.parents[i]] for i in range(n)])
-        gained = own - seen
-        rates = gained[np.arange(n), np.where(tree.prismatic, 2, 5)]
-        zero = np.vstack([gained[i][_kept(tree, i)] for i in range(n)])
-        free = np.linalg.svd(zero)[2][len(zero) :].T
-        forms = [form for i in range(n) for form in _forms(tree, i, own[i], seen[i])]
-        energy = (rates.T * tree.armature) @ rates
-        for i in range(n):
-            energy += own[i].T @ tree.spatial_inertia(i) @ own[i]
-        matrices = np.array([free.T @ form @ free for form, _ in forms]).reshape(len(forms), *[free.shape[1]] * 2)
-        return cls(free.T @ energy @ free, rates @ free, matrices, np.array([signed for _, signed in forms]))
+        free = [_free(tree, i) for i in range(tree.nv)]
+        starts = np.cumsum([0, *(len(rows) for rows in free)])
+        moving = [int(start) - 1 for start in starts[1:]]
+        own, sums, conditions = np.zeros((2, tree.nv, 6, starts[-1])), np.zeros((starts[-1],) * 2), []
+        energy = np.zeros_like(sums)
+        for i, p in enumerate(tree.parents.tolist()):
+            placed = _placed(tree, i)
+            # own[0] are the twists and own[1] the sums of absolute values behind them.
+            seen = np.stack([placed @ own[0, p], np.abs(placed) @ own[1, p]])
+            own[:, i] = seen
+            for row, column in zip(free[i], range(starts[i], starts[i + 1]), strict=True):
+                if column != moving[i]:
+                    own[:, i, row] = 0.0
+                own[:, i, row, column] = 1.0
+            inertia = tree.spatial_inertia(i)
+            energy += own[0, i].T @ inertia @ own[0, i]
+            sums += own[1, i].T @ np.abs(inertia) @ own[1, i]
+            energy[moving[i], moving[i]] += tree.armature[i]
+            conditions += _conditions(tree, i, own[:, i], seen)
+        return cls(Form(energy, sums), moving, conditions)
 
 
-def least_by_multipliers(tree: RigidTree) -> float:
-    """At most min_q λ_min(M(q)), at least 0; 0 where a motion without energy is not excluded by linear conditions."""
+def least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"] | None = None) -> float:
+    """At most min_q λ_min(W^-½ M(q) W^-½), nearly that, W = I if not given; 0 where no multipliers are found."""
+    return max(0.0, _extreme(tree, np.eye(tree.nv) if weight is None else weight, 1.0))
+
+
+def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> float:
+    """At least max_q λ_max(W^-½ M(q) W^-½), nearly that; inf where no multipliers are found."""
+    least = -_extreme(tree, weight, -1.0)
+    return least if least > 0.0 else np.inf
+
+
+def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> float:
+    """The greatest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf where none is."""
     motions = Motions.of(tree)
-    if least_eigenvalue(motions.energy) <= 0.0:
-        return 0.0
-    factor = np.linalg.inv(np.linalg.cholesky(motions.energy))
-    forms, rates = factor @ motions.forms @ factor.T, motions.rates @ factor.T
-    forms = forms / np.maximum(np.linalg.norm(forms, axis=(1, 2)), 1e-300)[:, None, None]
-    multipliers = KEPT * _multipliers(forms, rates, motions.signed > 0.0)
-    energy = np.eye(len(factor)) + np.tensordot(multipliers, forms, 1)
-    # What the rounding of the congruence can change, with the energy scaled to 1.
-    size = 1.0 + np.abs(multipliers).sum() + largest_eigenvalue(rates @ rates.T) / _greatest(energy, rates)
-    condition = np.linalg.norm(motions.energy, 2) * np.linalg.norm(factor, 2) ** 2
-    slack = 64.0 * len(factor) * np.finfo(float).eps * condition * size
-    bound = 1.0 / _greatest(energy, rates)
-    for share in 2.0 ** -np.arange(30.0, 0.0, -1.0):
-        least = bound * (1.0 - share)
-        if least_eigenvalue(energy - least * rates.T @ rates) > slack:
-            return least
-    return 0.0
+    m = len(motions.energy.matrix)
+    diagonal = np.diag(motions.energy.matrix)
+    scale = 1.0 / np.sqrt(diagonal + 1e-3 * diagonal.mean())
+    scales = scale * scale[:, None]
+    rated = np.zeros((m, m))
+    rated[np.ix_(motions.moving, motions.moving)] = -weight
+    rated *= scales
+    unit = 1.0 / float(np.linalg.norm(rated, 2))
+    forms = [form.matrix * scales for form in motions.conditions]
+    norms = np.array([max(float(np.linalg.norm(form)), 1e-300) for form in forms])
+    terms = np.array([unit * rated, *(form / norm for form, norm in zip(forms, norms, strict=True))])
+    positive = np.array([False, *(form.positive for form in motions.conditions)])
+    reach = np.full(len(terms), REACH)
+    reach[0] = 1e12
+    inequality = Inequality(sign * motions.energy.matrix * scales, terms, positive, reach)
+    y = _inside(inequality)
+    if y is None:
+        return -np.inf
+    y = maximise(inequality, y, 0)
+    sums = motions.energy.size + np.abs(y[0]) * unit * np.abs(rated) / scales
+    for h, norm, form in zip(y[1:], norms, motions.conditions, strict=True):
+        sums = sums + abs(h) / norm * form.size
+    slack = 16.0 * (m + tree.nv) * np.finfo(float).eps * float(np.linalg.norm(sums * scales, 2))
+    return float(y[0]) * unit if least_eigenvalue(inequality.matrix(y)) > slack else -np.inf
 
 
-def _multipliers(
-    forms: Float[np.ndarray, "k m m"], rates: Float[np.ndarray, "n m"], signed: np.ndarray
-) -> Float[np.ndarray, " k"]:
-    """Multipliers h for which λ_max(rates (1 + Σ h form)⁻¹ ratesᵀ) is small, by descent from h = 0."""
-    first = _greatest(np.eye(rates.shape[1]), rates)
-
-    def cost(x: np.ndarray, power: float) -> tuple[float, np.ndarray]:
-        h = np.where(signed, x * x, x)
-        energy = np.eye(rates.shape[1]) + np.tensordot(h, forms, 1)
-        if np.linalg.eigvalsh(energy)[0] <= 0.0:
-            return 1e6, np.zeros_like(x)
-        solved = np.linalg.solve(energy, rates.T)
-        values, vectors = np.linalg.eigh(rates @ solved)
-        shares = np.maximum(values / values[-1], 1e-300) ** power
-        total = shares.sum()
-        directions = solved @ vectors
-        slopes = -np.einsum("ak,jab,bk,k->j", directions, forms, directions, shares / total / values, optimize=True)
-        value = float(np.log(values[-1] / first) + np.log(total) / power)
-        return value, np.where(signed, 2.0 * x, 1.0) * slopes
-
-    x = np.where(signed, 1e-2, 0.0)
-    for power in SHARPNESS if len(forms) else ():
-        x = minimize(cost, x, args=(power,), jac=True, method="BFGS", options={"maxiter": 100}).x
-    return np.where(signed, x * x, x)
-
-
-def _greatest(energy: Float[np.ndarray, "m m"], rates: Float[np.ndarray, "n m"]) -> float:
-    """λ_max(rates energy⁻¹ ratesᵀ): the most ‖q̇‖² per energy."""
-    return float(np.linalg.eigvalsh(rates @ np.linalg.solve(energy, rates.T))[-1])
+def _inside(inequality: Inequality) -> Float[np.ndarray, " k"] | None:
+    """Some y that satisfies the inequality, or None where none is found: the greatest s with A₀ + Σ y_i A_i ⪰ s 1."""
+    y = np.where(inequality.positive, 1.0, 0.0)
+    y[0] = -10.0 * float(np.linalg.norm(inequality.constant, 2))
+    worst = float(np.linalg.eigvalsh(inequality.matrix(y))[0])
+    if worst > 0.0:
+        return y
+    m = len(inequality.constant)
+    wider = Inequality(
+        inequality.constant,
+        np.concatenate([inequality.terms, -np.eye(m)[None]]),
+        np.append(inequality.positive, False),
+        np.append(inequality.reach, 1e12),
+    )
+    y = maximise(wider, np.append(y, worst - 1.0), len(y), enough=1e-5)
+    return y[:-1] if y[-1] > 0.0 else None
 
 
 def _placed(tree: RigidTree, i: int) -> Float[np.ndarray, "6 6"]:
@@ -116,34 +133,48 @@ def _placed(tree: RigidTree, i: int) -> Float[np.ndarray, "6 6"]:
     return placed
 
 
-def _kept(tree: RigidTree, i: int) -> list[int]:
-    """Components of the twist that joint i passes on as they are; behind a base at rest, all that it does not move."""
+def _free(tree: RigidTree, i: int) -> list[int]:
+    """Components of the twist (v, ω) that the parent's twist does not fix linearly, the one that q̇ moves last."""
     if tree.prismatic[i]:
-        return [0, 1, 3, 4, 5] if tree.absent[i] else [3, 4, 5]
-    return [0, 1, 2, 3, 4] if tree.parents[i] < 0 else [2]
+        return [2] if tree.absent[i] else [0, 1, 2]
+    return [5] if tree.parents[i] < 0 else [0, 1, 3, 4, 5]
 
 
-def _forms(
-    tree: RigidTree, i: int, own: Float[np.ndarray, "6 m"], seen: Float[np.ndarray, "6 m"]
-) -> list[tuple[Float[np.ndarray, "m m"], float]]:
-    """Quadratic conditions at joint i: forms that are 0, and one that is ≤ 0, marked 1, for a joint that slides."""
-    if tree.parents[i] < 0 or (tree.prismatic[i] and tree.absent[i]):
+def _conditions(
+    tree: RigidTree, i: int, own: Float[np.ndarray, "2 6 m"], seen: Float[np.ndarray, "2 6 m"]
+) -> list[Form]:
+    """Quadratic conditions at joint i between its twist and its parent's; [0] are the twists, [1] the sums behind."""
+    if tree.absent[i]:
         return []
     if not tree.prismatic[i]:
-        pairs = [(0, 0, 1, 1), (3, 3, 4, 4), (0, 3, 1, 4), (0, 4, 1, 3)]
-        signs = (1.0, 1.0, 1.0, -1.0)
-        return [(_pair(own, *p, s) - _pair(seen, *p, s), 0.0) for p, s in zip(pairs, signs, strict=True)]
-    # v_⊥ gains s g, g = ω×z: it is parallel to g, and (s − lower)(s − upper)‖g‖² ≤ 0.
-    gain, g = (own - seen)[:2], np.array([seen[4], -seen[3]])
-    forms = [(_pair(np.vstack([gain, g]), 0, 3, 1, 2, -1.0), 0.0)]
-    ends = np.array([tree.lower[i], tree.upper[i]])
-    if np.isfinite(ends).all():
-        within = (gain - ends[0] * g).T @ (gain - ends[1] * g)
-        forms.append((0.5 * (within + within.T), 1.0))
+        pairs = [(0, 0, 1, 1, 1.0), (3, 3, 4, 4, 1.0), (0, 3, 1, 4, 1.0), (0, 4, 1, 3, -1.0)]
+        return [
+            Form(
+                _pair(own[0], *pair) - _pair(seen[0], *pair),
+                _pair(own[1], *pair[:4], 1.0) + _pair(seen[1], *pair[:4], 1.0),
+            )
+            for pair in pairs
+        ]
+    return _sliding_conditions(tree, i, own, seen)
+
+
+def _sliding_conditions(
+    tree: RigidTree, i: int, own: Float[np.ndarray, "2 6 m"], seen: Float[np.ndarray, "2 6 m"]
+) -> list[Form]:
+    """v_⊥ gains s g with g = ω×z: it is parallel to g, and (s − lower)(s − upper)‖g‖² ≤ 0 where travel has ends."""
+    gain, sums = own[0, :2] - seen[0, :2], own[1, :2] + seen[1, :2]
+    g, size = np.array([seen[0, 4], -seen[0, 3]]), seen[1, [4, 3]]
+    rows, totals = np.vstack([gain, g]), np.vstack([sums, size])
+    forms = [Form(_pair(rows, 0, 3, 1, 2, -1.0), _pair(totals, 0, 3, 1, 2, 1.0))]
+    low, high = float(tree.lower[i]), float(tree.upper[i])
+    if np.isfinite([low, high]).all():
+        within = (gain - low * g).T @ (gain - high * g)
+        most = (sums + abs(low) * size).T @ (sums + abs(high) * size)
+        forms.append(Form(0.5 * (within + within.T), 0.5 * (most + most.T), positive=True))
     return forms
 
 
-def _pair(twist: Float[np.ndarray, "c m"], a: int, b: int, c: int, d: int, sign: float) -> Float[np.ndarray, "m m"]:
-    """The quadratic form x_a x_b + sign·x_c x_d of the twist's components."""
-    form = np.outer(twist[a], twist[b]) + sign * np.outer(twist[c], twist[d])
+def _pair(rows: Float[np.ndarray, "c m"], a: int, b: int, c: int, d: int, sign: float) -> Float[np.ndarray, "m m"]:
+    """The quadratic form x_a x_b + sign·x_c x_d of rows of x."""
+    form = np.outer(rows[a], rows[b]) + sign * np.outer(rows[c], rows[d])
     return 0.5 * (form + form.T)

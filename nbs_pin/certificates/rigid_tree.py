@@ -92,13 +92,22 @@ class RigidTree:
         """The ends of a prismatic joint's travel [m], between which every energy is convex; 0 where M is the same."""
         return (0.0,) if self.absent[i] else (float(self.lower[i]), float(self.upper[i]))
 
-    def least_inertia(self) -> Float[np.ndarray, " n"]:
-        """At most λ_min of each body's inertia about its centre of mass [kg·m²], and at least 0.
+    @property
+    def physical(self) -> bool:
+        """Whether every body has mass ≥ 0 and inertia ⪰ 0, to rounding; learned ones need not."""
+        least = least_eigenvalues(self.inertia) + 2.0 * self._rounding
+        return bool((self.mass >= 0.0).all() and (least >= 0.0).all())
 
-        The allowance is for m c cᵀ, which was added and taken away again.
-        """
+    @property
+    def least_inertia(self) -> Float[np.ndarray, " n"]:
+        """At most λ_min of each body's inertia about its centre of mass [kg·m²], and at least 0."""
+        return np.maximum(least_eigenvalues(self.inertia) - self._rounding, 0.0)
+
+    @property
+    def _rounding(self) -> Float[np.ndarray, " n"]:
+        """An allowance for the inertias' digits: m c cᵀ was added and taken away again."""
         size = np.linalg.norm(self.inertia, axis=(1, 2)) + self.mass * (self.centre**2).sum(1)
-        return np.maximum(least_eigenvalues(self.inertia) - 64.0 * np.finfo(float).eps * size, 0.0)
+        return 64.0 * np.finfo(float).eps * size
 
     def placed(self, i: int, q: Float[np.ndarray, " samples"]) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (samples, 3, 3) and position (samples, 3) [m] of frame i in its parent's, at each q_i."""
