@@ -232,6 +232,17 @@ def another_arms_parts(seed):
     return broken
 
 
+def another_kind_of_part(seed):
+    broken = law(seed=seed)
+    if seed == 0:
+        broken.potential = torch.nn.Linear(3, 1).double()
+    elif seed == 1:
+        broken.rate = torch.nn.Identity()
+    else:
+        broken.inertial_rate = np.array([1.0, 2.0, 3.0])
+    return broken
+
+
 def another_law(seed):
     model, one = PinocchioDynamics(ROBOT), np.ones(3)
     return (
@@ -469,6 +480,7 @@ BROKEN = {
     bad_omega: "ω is",
     bad_share: "least share",
     another_arms_parts: "joints and|is for",
+    another_kind_of_part: "of the controller is a|ω is",
     another_law: "no Lyapunov function",
     another_torque: "not the NBS law|is not the package's",
     patched_torque: "not the NBS law|'torque' of this",

@@ -1,7 +1,6 @@
 """What is known of a model without trusting whoever built it: M̂ ≻ 0, Ṁ − 2C skew, its fit and its box."""
 
 from collections.abc import Callable, Iterable
-from types import FunctionType, MethodType
 from typing import Any, NoReturn
 
 import numpy as np
@@ -120,7 +119,7 @@ def strange(part: Any, *known: type) -> str:
     if kind not in known:
         return f"{kind.__name__} is not the package's {' or '.join(k.__name__ for k in known)}"
     own = getattr(part, "__dict__", {})
-    replaced = sorted(n for n in own if isinstance(own[n], FunctionType | MethodType) and n in dir(kind))
+    replaced = sorted(n for n in own if callable(own[n]) and callable(getattr(kind, n, None)))
     hooks = [name.strip("_") for name in _HOOKS if own.get(name)]
     return f"'{(replaced + hooks)[0]}' of this {kind.__name__} is not the package's" if replaced + hooks else ""
 

@@ -5,16 +5,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, is_torch_array, matvec
+from nbs_pin.arrays import Array, is_torch_array
 from nbs_pin.certificates.claims import Claim, Label
-from nbs_pin.certificates.model_structure import (
-    check_finite,
-    check_model,
-    first_strange,
-    refuse,
-    sample_states,
-    strange,
+from nbs_pin.certificates.falsification import (
+    SAMPLES,
+    falsify_activation,
+    falsify_damping,
+    falsify_law,
+    falsify_potential,
 )
+from nbs_pin.certificates.model_structure import check_finite, check_model, first_strange, refuse, strange
 from nbs_pin.certificates.rounding import least_eigenvalue
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.friction import JointFriction
@@ -27,9 +27,6 @@ from nbs_pin.robot import Robot
 
 DAMPING = "D ⪰ D₀, least eigenvalue"
 """Name of the claim whose value is the largest known d with D ⪰ dI."""
-_STATES = 48
-_SIZES = (0.03, 0.3, 3.0)
-_TOLERANCE = 1e-6
 
 
 class _Known(NamedTuple):
@@ -77,18 +74,23 @@ def scaled_least_eigenvalue(matrix: Float[np.ndarray, "n n"]) -> float:
 
 def _check_sizes(controller: NeuralBackstepping) -> None:
     """Raises CertificateRefused when the parts are for different numbers of joints, or are no such parts."""
-    for name, part, kind in (
-        ("Φ", controller.potential, Potential),
-        ("D", controller.damping, Damping),
-        ("Λ", controller.rate, Gain),
-    ):
-        if not isinstance(part, kind):
-            refuse(f"{name} of the controller is a {type(part).__name__}", f"give a {kind.__name__}")
+    _check_kind("Φ", controller.potential, Potential)
+    _check_kind("D", controller.damping, Damping)
+    _check_kind("Λ", controller.rate, Gain)
+    _check_kind("S", controller.potential.stiffness, Gain)
+    _check_kind("D₀", controller.damping.floor, Gain | None)
     n = controller.dynamics.nv
     sizes = {"Φ": controller.potential.nv, "D": controller.damping.nv, "Λ": len(controller.rate.nominal)}
+    if controller.friction is not None:
+        sizes["friction"] = controller.friction.viscous.size
     wrong = [f"{name} is for {size}" for name, size in sizes.items() if size != n]
     if wrong:
         refuse(f"the model has {n} joints and {wrong[0]}", "build the controller for one arm")
+
+
+def _check_kind(name: str, part: Any, kind: Any) -> None:
+    if not isinstance(part, kind):
+        refuse(f"{name} of the controller is a {type(part).__name__}", "give what its constructor makes of it")
 
 
 def _gain(name: str, gain: Gain, n: int, axes: int) -> tuple[Float[np.ndarray, "..."], str]:
@@ -125,7 +127,7 @@ def _potential_claims(controller: NeuralBackstepping) -> tuple[Claim, ...]:
     rate, odd_rate = _gain("the rate Λ", controller.rate, n, 1)
     convex, least = _convexity(phi, odd_gain)
     zero = _zero(phi, convex)
-    _falsify_potential(phi, s, exact=convex.label is Label.PROVED)
+    falsify_potential(phi, s, exact=convex.label is Label.PROVED)
     root = np.sqrt(rate)
     mu, rho = 2.0 * scaled_least_eigenvalue(s), scaled_least_eigenvalue(2.0 * s * root * root[:, None])
     contraction = _Known(convex.label, "λ_min(2Λ^½SΛ^½), as ψ is convex")
@@ -169,47 +171,8 @@ def _activation(activation: Activation) -> str:
         if not 0.0 < width < np.inf:
             refuse(f"the activation is {activation}", "its width must be positive and finite, or its slope jumps")
         return ""
-    _falsify_activation(activation)
+    falsify_activation(activation)
     return f"{type(activation).__name__} is an activation that is not the package's"
-
-
-def _falsify_activation(activation: Activation) -> None:
-    """Raises CertificateRefused with a witness unless σ, σ', σ'' look like those of a convex, non-decreasing σ."""
-    name, tail = type(activation).__name__, np.geomspace(1e-9, 1e2, 400)
-    x = np.unique(np.concatenate([-tail, np.linspace(-4.0, 4.0, 1601), tail]))
-    value, slope, bend = (np.asarray(part, dtype=float) for part in activation.derivatives(x))
-    if not (np.isfinite(value).all() and np.isfinite(slope).all() and np.isfinite(bend).all()):
-        refuse(f"the activation {name} is not finite within ±100", "give a finite σ, σ' and σ''")
-    along = slope * (x[:, None] - x)
-    gap = value[:, None] - value - along  # of σ(y), row y, over its tangent at x, column x
-    rounding = 1e-9 * (np.abs(value[:, None]) + np.abs(value) + np.abs(along))
-    falls = slope < -1e-12 * np.abs(slope).max()
-    bent = (gap < -rounding).any(axis=0) | (bend < -1e-12 * np.abs(bend).max())
-    for bad, fault in ((falls, "decreases"), (bent, "is not convex, or σ' not its slope,")):
-        if bad.any():
-            at = x[int(bad.argmax())]
-            refuse(f"the activation {name} {fault} at x = {at:.3g}", "give a convex, non-decreasing σ")
-    _falsify_bend(activation, x)
-
-
-def _falsify_bend(activation: Activation, x: Float[np.ndarray, " m"]) -> None:
-    """Raises CertificateRefused where σ'' is not the derivative of σ', looking ever closer at steps that disagree."""
-    a, b = x[:-1], x[1:]
-    least = 1e-13 * float(np.abs(activation.derivatives(x[np.abs(x) < 4.0])[1]).max())
-    for _ in range(20):
-        (_, s_a, c_a), (_, s_b, c_b) = activation.derivatives(a), activation.derivatives(b)
-        allowed = np.abs(c_b - c_a) + 1e-3 * (np.abs(c_a) + np.abs(c_b))
-        rounding = 1e-12 * (np.abs(s_a) + np.abs(s_b)) + least
-        bad = np.abs((s_b - s_a) - 0.5 * (c_a + c_b) * (b - a)) > allowed * (b - a) + rounding
-        if not bad.any():
-            return
-        a, b = a[bad], b[bad]
-        middle = 0.5 * (a + b)
-        a, b = np.concatenate([a, middle]), np.concatenate([middle, b])
-    refuse(
-        f"σ'' of the activation {type(activation).__name__} is not the derivative of σ' near x = {a[0]:.3g}",
-        "give a σ whose slope does not jump, with its derivatives",
-    )
 
 
 def _zero(phi: Potential, convex: _Known) -> _Known:
@@ -229,32 +192,6 @@ def _zero(phi: Potential, convex: _Known) -> _Known:
     return _Known(Label.PROVED, "evaluated at 0" if phi.form == "paper" else "ψ = f(Rz) − f(0) − ∇f(0)ᵀRz")
 
 
-def _falsify_potential(phi: Potential, s: Float[np.ndarray, "n n"], *, exact: bool) -> None:
-    """Raises CertificateRefused with a pair of errors at which Φ is not as convex as S says, or ∇Φ not its gradient.
-
-    Φ(y) ≥ Φ(x) + ∇Φ(x)ᵀ(y − x) + (y − x)ᵀS(y − x). exact: False asks of ∇²Φ dz too whether it is the derivative.
-    """
-    rng = np.random.default_rng(0)
-    x, y = (np.concatenate([size * rng.normal(size=(_STATES, phi.nv)) for size in _SIZES]) for _ in range(2))
-    step = y - x
-    (at_x, gradient, product), (at_y, _, _) = phi.terms(x, step), phi.terms(y, step)
-    if not all(np.isfinite(part).all() for part in (at_x, at_y, gradient, product)):
-        refuse("Φ is not finite within a few radians", "load the last sound checkpoint")
-    along, least = (gradient * step).sum(-1), (step * matvec(s, step)).sum(-1)
-    lack = at_x + along + least - at_y
-    bad = lack > _TOLERANCE * (np.abs(at_x) + np.abs(at_y) + np.abs(along) + least)
-    if bad.any():
-        at = np.round(x[int(bad.argmax())], 3).tolist()
-        refuse(f"Φ is not as convex as its S says, or ∇Φ is not its gradient, at z = {at}", "correct its terms")
-    if exact:
-        return
-    h = 1e-6
-    rate = (phi.terms(x + h * step, step)[1] - phi.terms(x - h * step, step)[1]) / (2.0 * h)
-    off = np.linalg.norm(rate - product, axis=-1) / (np.linalg.norm(rate, axis=-1) + np.linalg.norm(product, axis=-1))
-    if np.median(off) > 1e-4:
-        refuse("∇²Φ dz of the potential is not the derivative of ∇Φ", "correct its terms")
-
-
 def _damping_claims(damping: Damping) -> tuple[Claim, ...]:
     if damping.form not in DAMPINGS:
         refuse(f"the damping has the form {damping.form!r}", f"choose one of {', '.join(DAMPINGS)}")
@@ -264,40 +201,20 @@ def _damping_claims(damping: Damping) -> tuple[Claim, ...]:
     why = strange(damping, Damping) or first_strange(networks, own)
     if damping.floor is not None:
         floor, odd = _gain("the floor D₀", damping.floor, n, 2)
-        _falsify_damping(damping, floor)
+        falsify_damping(damping, floor)
         least = scaled_least_eigenvalue(floor)
         return (Claim(DAMPING, least, "N·m·s/rad", *_known(why or odd, "D = D₀ + TᵀT ⪰ D₀ for every weight of T")),)
     if damping.form != "paper" or not 0.0 < damping.m < np.inf:
         refuse(f"D = TᵀT has no floor D₀, and m is {damping.m}", "it may be singular: take damping 'bounded'")
-    measured = _falsify_damping(damping, np.zeros((n, n)))
+    measured = falsify_damping(damping, np.zeros((n, n)))
     if not measured > 0.0:
         refuse("D = TᵀT is singular at a sampled velocity", "take damping 'bounded', which has a floor")
-    said = f"D = TᵀT has no floor, and m² is none: least on {len(_SIZES) * _STATES} sampled velocities"
+    said = f"D = TᵀT has no floor, and m² is none: least on {SAMPLES} sampled velocities"
     claims = [Claim(DAMPING, measured, "N·m·s/rad", Label.EMPIRICAL, said)]
     if not why:
         because = "true for every z2 as tanh is bounded, and too small to be of use (docs/theory.md §5)"
         claims.append(Claim("TᵀT, least eigenvalue", _product_floor(damping), "N·m·s/rad", Label.PROVED, because))
     return tuple(claims)
-
-
-def _falsify_damping(damping: Damping, floor: Float[np.ndarray, "n n"]) -> float:
-    """λ_min(D) on sampled z2, small and large; raises CertificateRefused where D ⪰ D₀ fails or its force is no D z2."""
-    rng = np.random.default_rng(1)
-    z = np.concatenate([size * rng.normal(size=(_STATES, damping.nv)) for size in _SIZES])
-    d, force = damping.matrix(z), damping.force(z)
-    if not (np.isfinite(d).all() and np.isfinite(force).all()):
-        refuse("D is not finite at velocities of a few rad/s", "load the last sound checkpoint")
-    size = np.abs(d).max(axis=(-2, -1))
-    least = np.linalg.eigvalsh(d - floor)[:, 0]
-    off = np.abs(matvec(d, z) - force).max(axis=-1) > 1e-9 * size * np.abs(z).sum(axis=-1)
-    bad = (least < -1e-10 * size) | off | (np.abs(d - d.mT).max(axis=(-2, -1)) > 1e-10 * size)
-    if bad.any():
-        at = np.round(z[int(bad.argmax())], 3).tolist()
-        refuse(f"D is not symmetric with D ⪰ D₀, or its force is not D z2, at z2 = {at}", "correct the damping")
-    if strange(damping, Damping) or damping.floor is not None:
-        return float(np.linalg.eigvalsh(d)[:, 0].min())
-    r = damping.scale.numpy(force=True)  # of TᵀT by T itself, which knows twice as many digits of small eigenvalues
-    return float(np.linalg.svd(damping.factor(r * z) * r, compute_uv=False)[:, -1].min()) ** 2
 
 
 def _product_floor(damping: Damping) -> float:
@@ -330,7 +247,7 @@ def _range(network: Any) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m
 def _rate_claims(controller: NeuralBackstepping) -> tuple[Claim, ...]:
     rate, odd = _gain("the rate Λ", controller.rate, controller.nv, 1)
     omega = controller.inertial_rate
-    if not 0.0 <= omega < np.inf:
+    if not isinstance(omega, float | int) or not 0.0 <= omega < np.inf:
         refuse(f"the inertial rate ω is {omega}", "give a finite number ≥ 0")
     return (
         Claim("Λ, least", float(rate.min()), "rad/s per N·m", *_known(odd, "constant and diagonal")),
@@ -354,36 +271,8 @@ def _friction_claims(friction: JointFriction | None) -> tuple[Claim, ...]:
 
 
 def _law_claim(controller: NeuralBackstepping, model: Claim) -> Claim:
-    """V̇ along the law on its own model, term by term; raises CertificateRefused where V falls more slowly than it says.
-
-    V̇ = ∇Φᵀ(v − v_d) + z2ᵀ(τ − f(v) − (M a_r + C φ + G)), from the ingredients and not from the law's own signals.
-    """
-    excess, at = _excess(controller)
-    if excess > _TOLERANCE:
-        refuse(f"V falls more slowly than its dissipation at q = {at}, so τ is not the NBS law", "correct the torque")
+    """How V̇ of the undisturbed loop is known; raises CertificateRefused where V falls more slowly than it says."""
+    falsify_law(controller)
     why = strange(controller, NeuralBackstepping) or ("" if model.label is Label.PROVED else model.because)
     known = _known(why, "the law of docs/theory.md §2")
     return Claim("V̇ + ∇ΦᵀΛ∇Φ + z2ᵀ(ωM + D)z2 without disturbance, largest", 0.0, "W", *known)
-
-
-def _excess(controller: NeuralBackstepping) -> tuple[float, list[float]]:
-    """Largest V̇ above minus the dissipation, as a share of its terms, and where."""
-    model, phi = controller.dynamics, controller.potential
-    q, z, v, v_ref = sample_states(model, _STATES, seed=2)
-    z, v, v_ref = 0.2 * z, 0.5 * v, 0.5 * v_ref
-    q_ref, a_ref = q - z, v_ref[::-1]
-    z1 = model.difference(q, q_ref)
-    _, gradient, product = phi.terms(z1, v - v_ref)
-    rate, omega = controller.rate.numpy(), controller.inertial_rate
-    v_r, a_r = v_ref - rate * gradient, a_ref - rate * product
-    z2, mass = v - v_r, model.mass_matrix(q)
-    tau = controller.torque(q, v, q_ref, v_ref, a_ref)
-    terms = [matvec(mass, a_r), matvec(model.coriolis_matrix(q, v), v_r), model.gravity(q)]
-    taken = 0.0 * v if controller.friction is None else controller.friction.torque(v)
-    loss = [rate * gradient * gradient, z2 * omega * matvec(mass, z2), z2 * controller.damping.force(z2)]
-    gain = [gradient * (v - v_ref), z2 * tau, -z2 * taken, *(-z2 * term for term in terms)]
-    balance = sum(part.sum(-1) for part in (*gain, *loss))
-    size = sum(np.abs(part).sum(-1) for part in (*gain, *loss))
-    share = np.where(np.isfinite(balance), balance / size, np.inf)
-    worst = int(share.argmax())
-    return float(share[worst]), np.round(q[worst], 3).tolist()

@@ -1,0 +1,129 @@
+"""Attempts to catch a controller's parts in a breach of what their structure promises, on seeded samples."""
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.arrays import matvec
+from nbs_pin.certificates.model_structure import refuse, sample_states, strange
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.networks.activations import Activation
+from nbs_pin.networks.damping import Damping
+from nbs_pin.networks.potential import Potential
+
+_STATES = 48
+_SIZES = (0.03, 0.3, 3.0)
+_TOLERANCE = 1e-6
+SAMPLES = _STATES * len(_SIZES)
+"""Errors or velocities that a potential or a damping is tried at."""
+
+
+def falsify_activation(activation: Activation) -> None:
+    """Raises CertificateRefused with a witness unless σ, σ', σ'' look like those of a convex, non-decreasing σ."""
+    name, tail = type(activation).__name__, np.geomspace(1e-9, 1e2, 400)
+    x = np.unique(np.concatenate([-tail, np.linspace(-4.0, 4.0, 1601), tail]))
+    value, slope, bend = (np.asarray(part, dtype=float) for part in activation.derivatives(x))
+    if not (np.isfinite(value).all() and np.isfinite(slope).all() and np.isfinite(bend).all()):
+        refuse(f"the activation {name} is not finite within ±100", "give a finite σ, σ' and σ''")
+    along = slope * (x[:, None] - x)
+    gap = value[:, None] - value - along  # of σ(y), row y, over its tangent at x, column x
+    rounding = 1e-9 * (np.abs(value[:, None]) + np.abs(value) + np.abs(along))
+    falls = slope < -1e-12 * np.abs(slope).max()
+    bent = (gap < -rounding).any(axis=0) | (bend < -1e-12 * np.abs(bend).max())
+    for bad, fault in ((falls, "decreases"), (bent, "is not convex, or σ' not its slope,")):
+        if bad.any():
+            at = x[int(bad.argmax())]
+            refuse(f"the activation {name} {fault} at x = {at:.3g}", "give a convex, non-decreasing σ")
+    _falsify_bend(activation, x)
+
+
+def _falsify_bend(activation: Activation, x: Float[np.ndarray, " m"]) -> None:
+    """Raises CertificateRefused where σ'' is not the derivative of σ', looking ever closer at steps that disagree."""
+    a, b = x[:-1], x[1:]
+    least = 1e-13 * float(np.abs(activation.derivatives(x[np.abs(x) < 4.0])[1]).max())
+    for _ in range(20):
+        (_, s_a, c_a), (_, s_b, c_b) = activation.derivatives(a), activation.derivatives(b)
+        allowed = np.abs(c_b - c_a) + 1e-3 * (np.abs(c_a) + np.abs(c_b))
+        rounding = 1e-12 * (np.abs(s_a) + np.abs(s_b)) + least
+        bad = np.abs((s_b - s_a) - 0.5 * (c_a + c_b) * (b - a)) > allowed * (b - a) + rounding
+        if not bad.any():
+            return
+        a, b = a[bad], b[bad]
+        middle = 0.5 * (a + b)
+        a, b = np.concatenate([a, middle]), np.concatenate([middle, b])
+    refuse(
+        f"σ'' of the activation {type(activation).__name__} is not the derivative of σ' near x = {a[0]:.3g}",
+        "give a σ whose slope does not jump, with its derivatives",
+    )
+
+
+def falsify_potential(phi: Potential, s: Float[np.ndarray, "n n"], *, exact: bool) -> None:
+    """Raises CertificateRefused with a pair of errors at which Φ is not as convex as S says, or ∇Φ not its gradient.
+
+    Φ(y) ≥ Φ(x) + ∇Φ(x)ᵀ(y − x) + (y − x)ᵀS(y − x). exact: False asks of ∇²Φ dz too whether it is the derivative.
+    """
+    rng = np.random.default_rng(0)
+    x, y = (np.concatenate([size * rng.normal(size=(_STATES, phi.nv)) for size in _SIZES]) for _ in range(2))
+    step = y - x
+    (at_x, gradient, product), (at_y, _, _) = phi.terms(x, step), phi.terms(y, step)
+    if not all(np.isfinite(part).all() for part in (at_x, at_y, gradient, product)):
+        refuse("Φ is not finite within a few radians", "load the last sound checkpoint")
+    along, least = (gradient * step).sum(-1), (step * matvec(s, step)).sum(-1)
+    lack = at_x + along + least - at_y
+    bad = lack > _TOLERANCE * (np.abs(at_x) + np.abs(at_y) + np.abs(along) + least)
+    if bad.any():
+        at = np.round(x[int(bad.argmax())], 3).tolist()
+        refuse(f"Φ is not as convex as its S says, or ∇Φ is not its gradient, at z = {at}", "correct its terms")
+    if exact:
+        return
+    h = 1e-6
+    rate = (phi.terms(x + h * step, step)[1] - phi.terms(x - h * step, step)[1]) / (2.0 * h)
+    off = np.linalg.norm(rate - product, axis=-1) / (np.linalg.norm(rate, axis=-1) + np.linalg.norm(product, axis=-1))
+    if np.median(off) > 1e-4:
+        refuse("∇²Φ dz of the potential is not the derivative of ∇Φ", "correct its terms")
+
+
+def falsify_damping(damping: Damping, floor: Float[np.ndarray, "n n"]) -> float:
+    """λ_min(D) on sampled z2, small and large; raises CertificateRefused where D ⪰ D₀ fails or its force is no D z2."""
+    rng = np.random.default_rng(1)
+    z = np.concatenate([size * rng.normal(size=(_STATES, damping.nv)) for size in _SIZES])
+    d, force = damping.matrix(z), damping.force(z)
+    if not (np.isfinite(d).all() and np.isfinite(force).all()):
+        refuse("D is not finite at velocities of a few rad/s", "load the last sound checkpoint")
+    size = np.abs(d).max(axis=(-2, -1))
+    least = np.linalg.eigvalsh(d - floor)[:, 0]
+    off = np.abs(matvec(d, z) - force).max(axis=-1) > 1e-9 * size * np.abs(z).sum(axis=-1)
+    bad = (least < -1e-10 * size) | off | (np.abs(d - d.mT).max(axis=(-2, -1)) > 1e-10 * size)
+    if bad.any():
+        at = np.round(z[int(bad.argmax())], 3).tolist()
+        refuse(f"D is not symmetric with D ⪰ D₀, or its force is not D z2, at z2 = {at}", "correct the damping")
+    if strange(damping, Damping) or damping.floor is not None:
+        return float(np.linalg.eigvalsh(d)[:, 0].min())
+    r = damping.scale.numpy(force=True)  # of TᵀT by T itself, which knows twice as many digits of small eigenvalues
+    return float(np.linalg.svd(damping.factor(r * z) * r, compute_uv=False)[:, -1].min()) ** 2
+
+
+def falsify_law(controller: NeuralBackstepping) -> None:
+    """Raises CertificateRefused with a state at which V falls more slowly than ∇ΦᵀΛ∇Φ + z2ᵀ(ωM + D)z2, undisturbed.
+
+    V̇ = ∇Φᵀ(v − v_d) + z2ᵀ(τ − f(v) − (M a_r + C φ + G)), from the ingredients and not from the law's own signals.
+    """
+    model, phi = controller.dynamics, controller.potential
+    q, z, v, v_ref = sample_states(model, _STATES, seed=2)
+    z, v, v_ref = 0.2 * z, 0.5 * v, 0.5 * v_ref
+    q_ref, a_ref = q - z, v_ref[::-1]
+    z1 = model.difference(q, q_ref)
+    _, gradient, product = phi.terms(z1, v - v_ref)
+    rate, omega = controller.rate.numpy(), controller.inertial_rate
+    v_r, a_r = v_ref - rate * gradient, a_ref - rate * product
+    z2, mass = v - v_r, model.mass_matrix(q)
+    tau = controller.torque(q, v, q_ref, v_ref, a_ref)
+    terms = [matvec(mass, a_r), matvec(model.coriolis_matrix(q, v), v_r), model.gravity(q)]
+    taken = 0.0 * v if controller.friction is None else controller.friction.torque(v)
+    loss = [rate * gradient * gradient, z2 * omega * matvec(mass, z2), z2 * controller.damping.force(z2)]
+    gain = [gradient * (v - v_ref), z2 * tau, -z2 * taken, *(-z2 * term for term in terms)]
+    balance = sum(part.sum(-1) for part in (*gain, *loss))
+    size = sum(np.abs(part).sum(-1) for part in (*gain, *loss))
+    bad = ~(balance <= _TOLERANCE * size)
+    if bad.any():
+        at = np.round(q[int(bad.argmax())], 3).tolist()
+        refuse(f"V falls more slowly than its dissipation at q = {at}, so τ is not the NBS law", "correct the torque")
