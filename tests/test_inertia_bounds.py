@@ -232,7 +232,7 @@ def test_travel_that_changes_nothing_may_be_endless():
 
 
 def test_point_masses():
-    """Two point masses on crossed axes: inertia is the second's lever alone, and 0 where that may vanish."""
+    """Three point masses on axes through one point: some poses let a joint move nothing, so a₁ = 0 is all there is."""
     model = pin.Model()
     for i in range(3):
         kind = pin.JointModelRZ() if i % 2 else pin.JointModelRX()

@@ -60,7 +60,8 @@ class Motions:
             inertia = tree.spatial_inertia(i)
             energy += own[0, i].T @ inertia @ own[0, i]
             sums += own[1, i].T @ np.abs(inertia) @ own[1, i]
-            energy[moving[i], moving[i]] += tree.armature[i]
+            for matrix in (energy, sums):
+                matrix[moving[i], moving[i]] += tree.armature[i]
             conditions += _conditions(tree, i, own[:, i], seen)
         return cls(Form(energy, sums), moving, conditions)
 
