@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.certificates.adversary import Attack
+from nbs_pin.certificates.assumptions import SATURATION
 from nbs_pin.certificates.certificate import Certificate
-from nbs_pin.certificates.monitor import SATURATION, Monitored
+from nbs_pin.certificates.monitor import Monitored
 from nbs_pin.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture, stretches, thin
 from nbs_pin.robot import configuration_difference
 

@@ -9,18 +9,11 @@ import nbs_pin as nbs
 from nbs_pin.certificate_charts import plot_certificate, plot_monitor
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.adversary import attack, random_disturbances
+from nbs_pin.certificates.assumptions import DISTURBANCE, MODEL, SAMPLING, SATURATION, UNEXPLAINED, WRAP
 from nbs_pin.certificates.certificate import certify
 from nbs_pin.certificates.energy_balance import Instants, balance, beyond, storage_of
-from nbs_pin.certificates.monitor import (
-    DISTURBANCE,
-    MODEL,
-    SAMPLING,
-    SATURATION,
-    UNEXPLAINED,
-    WRAP,
-    Watch,
-    monitor,
-)
+from nbs_pin.certificates.monitor import monitor
+from nbs_pin.certificates.watch import Watch
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave
 from nbs_pin.dynamics.friction import JointFriction
