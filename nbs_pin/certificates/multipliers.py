@@ -18,6 +18,8 @@ from nbs_pin.certificates.semidefinite import Inequality, maximise
 
 REACH = 1e4
 """Multipliers are kept below this, for forms and energy of size 1: larger ones gain nothing and cost digits."""
+GAPS = (1e-1, 1e-2, 1e-3, 1e-4)
+"""How near the optimum multipliers are taken, one after the other, while they prove more than rounding can undo."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> 
     """The greatest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf where none is."""
     motions = Motions.of(tree)
     m = len(motions.energy.matrix)
-    diagonal = np.diag(motions.energy.matrix)
+    diagonal = np.abs(np.diag(motions.energy.matrix))
     scale = 1.0 / np.sqrt(diagonal + 1e-3 * diagonal.mean())
     scales = scale * scale[:, None]
     rated = np.zeros((m, m))
@@ -92,18 +94,20 @@ def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> 
     norms = np.array([max(float(np.linalg.norm(form)), 1e-300) for form in forms])
     terms = np.array([unit * rated, *(form / norm for form, norm in zip(forms, norms, strict=True))])
     positive = np.array([False, *(form.positive for form in motions.conditions)])
-    reach = np.full(len(terms), REACH)
-    reach[0] = 1e12
+    reach = np.array([1e12, *np.full(len(forms), REACH)])
     inequality = Inequality(sign * motions.energy.matrix * scales, terms, positive, reach)
-    y = _inside(inequality)
+    y, best = _inside(inequality), -np.inf
     if y is None:
-        return -np.inf
-    y = maximise(inequality, y, 0)
-    sums = motions.energy.size + np.abs(y[0]) * unit * np.abs(rated) / scales
-    for h, norm, form in zip(y[1:], norms, motions.conditions, strict=True):
-        sums = sums + abs(h) / norm * form.size
-    slack = 16.0 * (m + tree.nv) * np.finfo(float).eps * float(np.linalg.norm(sums * scales, 2))
-    return float(y[0]) * unit if least_eigenvalue(inequality.matrix(y)) > slack else -np.inf
+        return best
+    for gap in GAPS:
+        y = maximise(inequality, y, 0, gap=gap)
+        sums = motions.energy.size + np.abs(y[0]) * unit * np.abs(rated) / scales
+        for h, norm, form in zip(y[1:], norms, motions.conditions, strict=True):
+            sums = sums + abs(h) / norm * form.size
+        slack = 16.0 * (m + tree.nv) * np.finfo(float).eps * float(np.linalg.norm(sums * scales, 2))
+        if least_eigenvalue(inequality.matrix(y)) > slack:
+            best = float(y[0]) * unit
+    return best
 
 
 def _inside(inequality: Inequality) -> Float[np.ndarray, " k"] | None:

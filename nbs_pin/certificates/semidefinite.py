@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-GAP = 1e-4
-"""Where the barrier's weight stops: how far below the optimum, relative to it."""
 STEPS = 25
 """Newton steps for each weight of the barrier, at most."""
 
@@ -52,8 +50,19 @@ class Inequality:
         return step, float(-gradient @ step)
 
 
-def maximise(inequality: Inequality, y: Float[np.ndarray, " k"], target: int, enough: float = np.inf) -> np.ndarray:
-    """From a y that satisfies the inequality to one that does with y[target] near its greatest, or beyond `enough`."""
+def maximise(
+    inequality: Inequality,
+    y: Float[np.ndarray, " k"],
+    target: int,
+    *,
+    gap: float = 1e-4,
+    enough: float = np.inf,
+) -> Float[np.ndarray, " k"]:
+    """From a y that satisfies the inequality to one that does with y[target] near its greatest, or beyond `enough`.
+
+    gap: how far below the greatest the barrier leaves y[target], relative to it; a wider one leaves the matrix more
+    positive.
+    """
     slope = np.zeros(len(y))
     weight = max(abs(float(y[target])), 1e-6)
     size = len(inequality.constant) + 2.0 * len(y)
@@ -64,7 +73,7 @@ def maximise(inequality: Inequality, y: Float[np.ndarray, " k"], target: int, en
             if promise < 1e-2 or y[target] > enough:
                 break
             y = _along(inequality, y, step, promise, slope)
-        if weight * size < GAP * abs(float(y[target])) or weight < 1e-12:
+        if weight * size < gap * abs(float(y[target])) or weight < 1e-12:
             break
         weight *= 0.2
     return y
