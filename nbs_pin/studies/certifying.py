@@ -1,7 +1,7 @@
 """One law certified, attacked and watched: the study behind `nbs-pin certify`."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,10 @@ from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.adversary import Attack, attack, random_disturbances
 from nbs_pin.certificates.arena import motions_of
 from nbs_pin.certificates.certificate import Certificate, certify
+from nbs_pin.certificates.claims import Condition, Label, weakest
 from nbs_pin.certificates.design import PERIODS, Proposal, propose
 from nbs_pin.certificates.loads import MARGIN, Load, friction, gravity_error, label_of, payload, total
+from nbs_pin.certificates.model_structure import check_box
 from nbs_pin.certificates.monitor import Monitored, monitor
 from nbs_pin.certificates.structure import check_structure
 from nbs_pin.checkpoints import load, save
@@ -39,6 +41,7 @@ MONITOR, DESIGNED = "monitor.png", "controller.nbs"
 """What it writes beside them when a run was watched or a law designed."""
 TRAJECTORIES = 374
 """Closed-loop motions that a learned model is judged on (`mismatch.py`)."""
+_INSTANTS = 2001
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +107,15 @@ class Task:
 def controller_of(text: str, *, bandwidth: float = 8.0, period: float = 0.001, seed: int = 0) -> Any:
     """The controller that a .nbs file holds, or the one that `NeuralBackstepping.for_robot` makes for an arm.
 
-    Raises ArgumentError for a file without a controller; errors of `load` and `load_robot` else.
+    Raises ArgumentError for a file without a controller, CertificateRefused for one of which nothing can be promised;
+    errors of `load` and `load_robot` else.
     """
     if not text.endswith(".nbs"):
         return NeuralBackstepping.for_robot(load_robot(text), bandwidth=bandwidth, period=period, seed=seed)
     stored = load(text)
     if isinstance(stored, DynamicsProvider):
         raise ArgumentError(f"{text} holds a model; a certificate is about a controller: save one that believes in it.")
+    check_structure(stored)
     return stored
 
 
@@ -146,6 +151,7 @@ def certify_controller(
             mismatch=error,
             period=task.period,
         )
+    certificate = replace(certificate, conditions=(*certificate.conditions, *_room(certificate, robot, task)))
     found = None if admissible.is_zero else _attacked(controller, robot, task, admissible, thorough, progress)
     watched = None if run is None else monitor(run, controller, certificate, mismatch=error)
     return Certified(certificate, loads, found, thorough, watched, proposal)
@@ -233,6 +239,23 @@ def _attacked(
         progress=progress,
         **(waves | task.extras),
     )
+
+
+def _room(certificate: Certificate, robot: Robot, task: Task) -> tuple[Condition, ...]:
+    """Whether the reference with the error around it stays inside the position limits, for the joint with least room.
+
+    Raises CertificateRefused where the reference alone leaves them.
+    """
+    positions = np.asarray(task.reference(np.linspace(0.0, task.duration, _INSTANTS)).q)
+    check_box(positions, robot.lower, robot.upper)
+    room = np.minimum(positions - robot.lower, robot.upper - positions).min(axis=0)
+    joint = int(np.argmin(room - certificate.joint_errors))
+    if not np.isfinite(room[joint]):
+        return ()
+    name = f"position limits of {robot.joint_names[joint]} − reference > |z1_i|"
+    because = f"reference over {task.duration:g} s"
+    sides = float(room[joint]), float(certificate.joint_errors[joint])
+    return (Condition(name, *sides, "rad", weakest(certificate.label, Label.EMPIRICAL), because),)
 
 
 def _is_exact(dynamics: DynamicsProvider, robot: Robot) -> bool:

@@ -1,0 +1,240 @@
+"""`nbs-pin certify` and `reproduce --part certificates`: what they write, print and refuse."""
+
+import contextlib
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+import nbs_pin as nbs
+from nbs_pin import cli
+from nbs_pin.catalogue import find
+from nbs_pin.certificates.certificate import certify
+from nbs_pin.certificates.loads import friction, gravity_error, payload, total
+from nbs_pin.state import Run
+from nbs_pin.studies import certificate_poses, certificate_study, certifying
+from nbs_pin.versions import versions
+
+LOADS = ("--payload", "0.5", "--friction", "0.1,0.2", "--gravity-error", "0.2")
+PNG = b"\x89PNG"
+
+
+def run(folder, controller, *options):
+    return cli.main(["certify", controller, "--out", str(folder), *options])
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def certified(tmp_path_factory):
+    """Where two_link was certified under 5 N·m and loads, and what was printed."""
+    folder, printed = tmp_path_factory.mktemp("certified") / "two_link", io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert run(folder, "two_link", "--disturbance", "5,4", *LOADS, "--start-error", "0.1") == 0
+    return folder, printed.getvalue()
+
+
+def test_the_summary_is_what_certify_says(certified):
+    said, robot = summary(certified[0]), nbs.load_robot("two_link")
+    assert sorted(path.name for path in certified[0].iterdir()) == sorted(certifying.FILES)
+    assert said["versions"] == versions()
+    assert said["robot_sha256"] == robot.sha256
+    assert said["settings"]["disturbance"] == "5,4"
+    controller, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    loads = (
+        payload(robot, 0.5, reference),
+        friction(robot, reference, viscous=0.1, coulomb=0.2),
+        gravity_error(robot, 0.2, reference),
+    )
+    admissible = total(certifying.box_or_ball([5.0, 4.0], 2, norm=False), *loads)
+    start = reference(0.0).q + np.array([0.1, -0.1])
+    expected = certify(controller, admissible, reference=reference, q0=start, period=0.001)
+    figures = said["figures"]
+    own, room = figures["certificate"], figures["certificate"]["conditions"].pop()
+    assert own == expected.summary()
+    assert room["name"].startswith("position limits")
+    assert room["right"] in own["joint_errors_rad"]
+    assert [load["box_Nm"] for load in figures["loads"]] == [load.admissible.box.tolist() for load in loads]
+    assert figures["disturbance_label"] == "EMPIRICAL"
+    assert figures["joints"] == ["joint1", "joint2"]
+
+
+def test_the_worst_motion_is_written_and_below_the_bound(certified):
+    folder, found = certified[0], summary(certified[0])["figures"]["attack"]
+    motion = Run.load(folder / "run.npz")
+    assert np.linalg.norm(motion.q - motion.q_ref, axis=-1).max() == pytest.approx(found["error_rad"], rel=1e-12)
+    assert 0.0 < found["error_rad"] < summary(folder)["figures"]["certificate"]["error_rad"]
+    assert found["certified_over_found"] > 1.0
+    assert not found["thorough"]
+    assert (folder / "certificate.png").read_bytes().startswith(PNG)
+
+
+def test_the_table_says_everything_once(certified):
+    folder, printed = certified
+    figures, words = summary(folder)["figures"], " ".join(printed.split())
+    certificate, found = figures["certificate"], figures["attack"]
+    for heading in ("disturbance", "constants", "bounds", "sampled control", "conditions", "errors"):
+        assert any(line.strip() == heading for line in printed.splitlines())
+    for line in (*certificate["lines"], *figures["loads"]):
+        assert "none" in printed if line["value"] is None else f"{line['value']:.3g}" in printed
+        assert line["label"] in printed
+    for condition in certificate["conditions"]:
+        assert f"{condition['left']:.3g}" in printed
+    for name in ("error_rad", "printed_error_rad"):
+        assert f"{certificate[name]:.3g}" in printed
+    assert f"{found['certified_over_found']:.2f}" in printed
+    assert f"PROVED, assuming: {'; '.join(certificate['assumptions'])}" in words
+    assert "waves alone, --attack searches further" in words
+    assert "the bound on the disturbance itself is EMPIRICAL" in words
+    assert printed.splitlines()[-3:] == [str(folder / name) for name in certifying.FILES]
+
+
+def test_an_attack_finds_more_and_a_run_is_held_against_the_bound(certified, tmp_path, capsys):
+    options = ("--disturbance", "5,4", "--attack", "--monitor", str(certified[0] / "run.npz"))
+    assert run(tmp_path / "a", "two_link", *options) == 0
+    figures = summary(tmp_path / "a")["figures"]
+    assert figures["attack"]["thorough"]
+    assert figures["attack"]["found_by"] == "bang-bang ascent"
+    assert figures["certificate"]["error_rad"] > figures["attack"]["error_rad"]
+    assert (tmp_path / "a" / "monitor.png").read_bytes().startswith(PNG)
+    # The run's disturbance, 5 N·m and loads, is beyond what was certified.
+    assert "disturbance within its bound" in figures["monitor"]["broken"]
+    assert figures["monitor"]["verdict"] in " ".join(capsys.readouterr().out.split())
+    assert not figures["monitor"]["is_wrong"]
+
+
+def test_a_norm_is_a_ball_and_nothing_to_fear_needs_no_adversary(tmp_path):
+    assert run(tmp_path / "a", "two_link", "--disturbance", "5", "--norm") == 0
+    assert summary(tmp_path / "a")["figures"]["certificate"]["disturbance"] == "‖τ_d‖ ≤ 5 N·m"
+    assert run(tmp_path / "b", "two_link", "--disturbance", "0") == 0
+    figures = summary(tmp_path / "b")["figures"]
+    assert figures["attack"] is None
+    assert figures["certificate"]["error_rad"] == 0.0
+    assert not (tmp_path / "b" / "run.npz").exists()
+
+
+def test_a_wish_becomes_a_controller_that_certifies_it(tmp_path, capsys):
+    wish = ("--disturbance", "5", "--wanted", "0.02")
+    assert run(tmp_path / "a", "two_link", *wish) == 0
+    figures = summary(tmp_path / "a")["figures"]
+    assert figures["certificate"]["error_rad"] <= 0.02
+    printed = capsys.readouterr().out
+    assert f"control period {1e3 * figures['design']['period_s']:g} ms" in " ".join(printed.split())
+    saved = tmp_path / "a" / "controller.nbs"
+    assert run(tmp_path / "b", str(saved), "--disturbance", "5", "--period", str(figures["design"]["period_s"])) == 0
+    assert summary(tmp_path / "b")["figures"]["certificate"] == figures["certificate"]
+
+
+def test_a_model_that_is_not_the_arm_is_judged_on_closed_loops_with_it(tmp_path):
+    path = tmp_path / "heavy.urdf"
+    path.write_text(find("two_link").path.read_text().replace('mass value="1', 'mass value="1.01'))
+    options = ("--disturbance", "1", "--trajectories", "40", "--against", str(path))
+    assert run(tmp_path / "a", "two_link", *options) == 0
+    figures = summary(tmp_path / "a")["figures"]
+    assert figures["certificate"]["label"] == "PROBABILISTIC"
+    assert {"a", "b", "c"} <= {line["name"] for line in figures["certificate"]["lines"]}
+    assert "40 closed-loop trajectories" in figures["certificate"]["assumptions"][0]
+    exact = certify(nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link")), [1.0, 1.0])
+    assert figures["certificate"]["error_rad"] > exact.error
+    assert figures["attack"]["error_rad"] < figures["certificate"]["error_rad"]
+
+
+def test_results_of_another_certificate_are_kept(certified, capsys):
+    assert run(certified[0], "two_link", "--disturbance", "6") == 2
+    assert "of another certificate" in capsys.readouterr().err
+    assert run(certified[0], "two_link", "--disturbance", "5,4", *LOADS, "--start-error", "0.1") == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["two_link"], "no disturbance was given; give --disturbance"),
+        (["two_link", "--disturbance", "-1"], "--disturbance is '-1'"),
+        (["two_link", "--disturbance", "1,2,3"], "3 torques were given for 2 joints"),
+        (["two_link", "--disturbance", "1,2", "--norm"], "a norm is one number"),
+        (["two_link", "--norm", "--payload", "1"], "--norm is about --disturbance"),
+        (["two_link", "--payload", "0"], "--payload is '0'"),
+        (["two_link", "--payload", "1", "--link", "moon"], "no moving link 'moon'"),
+        (["two_link", "--friction", "urdf"], "states no joint friction"),
+        (["two_link", "--friction", "1"], "--friction is '1'"),
+        (["two_link", "--disturbance", "5", "--wanted", "1e-6"], "a control period of 0.25 ms forbids it"),
+        (["two_link", "--disturbance", "99", "--wanted", "0.1"], "no gains can help"),
+        (["law.nbs", "--disturbance", "5", "--wanted", "0.1"], "give an arm"),
+        (["two_link", "--disturbance", "5", "--reference", "moon"], "no reference 'moon'"),
+        (["panda", "--disturbance", "5", "--reference", "paper"], "the joint limits is too small for the reference"),
+        (["no_arm", "--disturbance", "5"], "no robot 'no_arm'"),
+        (["two_link", "--disturbance", "5", "--against", "panda"], "the controller has 2 joints and panda 7"),
+        (["two_link", "--disturbance", "5", "--monitor", "none.npz"], "none.npz"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_in_one_sentence(words, expected, tmp_path, capsys):
+    assert cli.main(["certify", *words, "--out", str(tmp_path / "a")]) == 2
+    said = capsys.readouterr().err.strip()
+    assert expected in said
+    assert len([line for line in said.splitlines() if "error" in line]) == 1
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_law_without_a_proof_is_refused(tmp_path, capsys):
+    robot = nbs.load_robot("two_link")
+    nbs.save(nbs.PID.for_robot(robot), tmp_path / "pid.nbs")
+    nbs.save(nbs.PinocchioDynamics(robot), tmp_path / "model.nbs")
+    for name in ("pid", "model"):
+        assert run(tmp_path / "a", str(tmp_path / f"{name}.nbs"), "--disturbance", "5") == 2
+        assert "error" in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+def test_the_papers_damping_is_labelled_down_and_not_refused(tmp_path):
+    robot = nbs.load_robot("two_link")
+    nbs.save(nbs.paper_controller(nbs.PinocchioDynamics(robot)), tmp_path / "paper.nbs")
+    assert run(tmp_path / "a", str(tmp_path / "paper.nbs"), "--disturbance", "0") == 0
+    assert summary(tmp_path / "a")["figures"]["certificate"]["label"] == "EMPIRICAL"
+
+
+@pytest.fixture(scope="module")
+def reproduced(tmp_path_factory):
+    """The study, much reduced."""
+    folder = tmp_path_factory.mktemp("study")
+    scale = certificate_study.Scale(
+        arms=("two_link",),
+        moduli=(0.5,),
+        dampings=(1.0,),
+        random=8,
+        family=8,
+        longest=100,
+        rounds=1,
+        duration=0.5,
+        fine=(14.0, 0.005),
+        poses=certificate_poses.Scale(arms=("two_link",), samples=500, climbs=4, sweeps=3),
+    )
+    return folder, certificate_study.reproduce_certificates(folder, scale=scale)
+
+
+def test_no_bound_of_the_study_is_broken_and_the_papers_is(reproduced):
+    folder, sections = reproduced
+    figures = {name: value for section in sections for name, value in section.figures.items()}
+    rows = figures["certificates"]
+    assert [row["violations"] for row in rows] == [0] * len(rows)
+    assert {row["label"] for row in rows} == {"PROVED"}
+    assert all(row["ratio"] >= 1.0 for row in rows)
+    assert figures["inertia_bounds"][0]["outside"] == 0
+    assert figures["counterexample"]["gradient_squared_over_d"] == pytest.approx(0.687, abs=0.004)
+    assert figures["counterexample"]["error_squared_over_d"] <= figures["counterexample"]["certified_over_d"]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(certificate_study.FILES)
+    table = list(csv.DictReader((folder / "certificates.csv").read_text(encoding="utf-8").splitlines()))
+    assert [float(row["certified_rad"]) for row in table] == [row["certified_rad"] for row in rows]
+    assert all(f"{row['ratio']:.2f}" in sections[0].markdown for row in rows)
+
+
+def test_climbing_poses_reach_beyond_sampled_ones():
+    few = certificate_poses.Scale(samples=100, climbs=4, sweeps=4)
+    still = certificate_poses.Scale(samples=100, climbs=4, sweeps=0)
+    climbed, sampled = (certificate_poses.on_arm("two_link", scale) for scale in (few, still))
+    assert climbed.largest_found_kgm2 > sampled.largest_found_kgm2
+    assert climbed.least_found_kgm2 < sampled.least_found_kgm2
+    assert climbed.outside == sampled.outside == 0
