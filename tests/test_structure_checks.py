@@ -38,6 +38,7 @@ from nbs_pin.networks.unconstrained import UnconstrainedLagrangian
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.references import Sinusoid
 from nbs_pin.robot import load_robot
+from nbs_pin.studies.chains import serial_chain
 from tests.test_networks import randomise
 
 ROBOT, OTHER = load_robot("three_link"), load_robot("two_link")
@@ -698,3 +699,25 @@ def test_a_box_too_small_for_the_reference_is_refused():
     for low, high, error in ((-side, side, 0.3), (-side, 0.9 * side / 1.2, 0.0), (-side, np.nan * side, 0.0)):
         with pytest.raises(CertificateRefused, match=r"box|limits"):
             check_box(positions, low, high, error=error)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_proved_floor_of_the_papers_damping_holds_for_every_factor_in_its_range(seed):
+    """Triangular factors with the least diagonal and entries at the ends of their range, where it is tight."""
+    rng = np.random.default_rng(seed)
+    n = 2 + seed % 3
+    damping = Damping(n, form="paper", m=0.3, seed=seed)
+    for network in (damping.diagonal, damping.lower):
+        with_tensor(network, "w2", lambda w: 0.05 * w)
+    claims = check_structure(
+        NeuralBackstepping(PinocchioDynamics(serial_chain(n)), Potential(np.eye(n)), damping, rate=np.ones(n))
+    )
+    proved = next(claim.value for claim in claims if claim.name == "TᵀT, least eigenvalue")
+    weight, bias = damping.lower.layers(numpy=True)[-1]
+    entries = np.abs(weight).sum(axis=1) + np.abs(bias)
+    factors = np.zeros((2000, n, n))
+    factors[:, *np.tril_indices(n, -1)] = rng.choice([-1.0, 1.0], (2000, len(entries))) * entries
+    factors += 0.3 * np.eye(n)
+    least = np.linalg.svd(factors, compute_uv=False)[:, -1].min() ** 2
+    assert proved <= least
+    assert proved == pytest.approx(least, rel=1e-6)

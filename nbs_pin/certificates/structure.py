@@ -37,7 +37,7 @@ class _Known(NamedTuple):
 
 
 def check_structure(controller: Any, robot: Robot | None = None) -> tuple[Claim, ...]:
-    """μ, ρ, Λ, D₀, ψ, ω, friction, M̂ and the law of a `NeuralBackstepping`, each with the way it is known.
+    """μ, ρ, Λ, D₀, ψ, ω, friction and the law of a `NeuralBackstepping`, each with the way it is known.
 
     Constructors are not trusted: effective weights, gains and constants are read as they now stand. What is the
     package's own code is PROVED by structure; a part of another class, or with a method replaced, is EMPIRICAL, on
@@ -212,7 +212,7 @@ def _damping_claims(damping: Damping) -> tuple[Claim, ...]:
     said = f"D = TᵀT has no floor, and m² is none: least on {SAMPLES} sampled velocities"
     claims = [Claim(DAMPING, measured, "N·m·s/rad", Label.EMPIRICAL, said)]
     if not why:
-        because = "true for every z2 as tanh is bounded, and too small to be of use (docs/theory.md §5)"
+        because = "true for every z2 as tanh is bounded, seldom large enough to be of use (docs/theory.md §5)"
         claims.append(Claim("TᵀT, least eigenvalue", _product_floor(damping), "N·m·s/rad", Label.PROVED, because))
     return tuple(claims)
 
@@ -231,8 +231,11 @@ def _product_floor(damping: Damping) -> float:
     if not np.isfinite(square):
         return 0.0
     product = m**n * ((n - 1) / square) ** ((n - 1) / 2) if n > 1 else m
-    inverse = np.linalg.norm(np.linalg.inv(m * np.eye(n) - below))
-    sigma = max(product, 1.0 / float(inverse) if np.isfinite(inverse) else 0.0)
+    inverse = np.eye(n) / m
+    for i in range(1, n):  # (mI − C)⁻¹ row by row: sums of positive numbers, of which none loses digits
+        inverse[i] += below[i, :i] @ inverse[:i] / m
+    norm = float(np.linalg.norm(inverse, 2))
+    sigma = max(product, 1.0 / norm if np.isfinite(norm) else 0.0)
     return float((1.0 - 1e-9) * sigma**2 * damping.scale.min() ** 2)
 
 
