@@ -107,6 +107,14 @@ def test_an_attack_finds_more_and_a_run_is_held_against_the_bound(certified, tmp
     assert not figures["monitor"]["is_wrong"]
 
 
+def test_a_run_of_another_arm_is_refused(certified, tmp_path, capsys):
+    other = tmp_path / "other.urdf"
+    other.write_text(find("two_link").path.read_text().replace('mass value="1', 'mass value="1.01'))
+    words = ("--disturbance", "5", "--monitor", str(certified[0] / "run.npz"))
+    assert run(tmp_path / "a", str(other), *words) == 2
+    assert "the run is of the arm 'two_link'" in capsys.readouterr().err
+
+
 def test_a_norm_is_a_ball_and_nothing_to_fear_needs_no_adversary(tmp_path):
     assert run(tmp_path / "a", "two_link", "--disturbance", "5", "--norm") == 0
     assert summary(tmp_path / "a")["figures"]["certificate"]["disturbance"] == "‖τ_d‖ ≤ 5 N·m"

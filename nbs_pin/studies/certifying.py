@@ -134,11 +134,12 @@ def certify_controller(
     """
     check_structure(controller)
     robot = arm_of(controller, task)
+    if run is not None and run.robot_sha256 not in ("", robot.sha256):
+        raise ArgumentError(f"the run is of the arm '{run.robot}', not of {robot.name}; give one of that arm.")
     loads, admissible = disturbance_of(robot, task)
-    error = (
-        None if _is_exact(controller.dynamics, robot) else model_error(controller, robot, task, admissible, progress)
-    )
-    start = None
+    error, start = None, None
+    if not _is_exact(controller.dynamics, robot):
+        error = model_error(controller, robot, task, admissible, progress)
     if task.start_error:
         start = task.reference(np.zeros(1)).q[0] + task.start_error * (-1.0) ** np.arange(robot.nv)
     with waiting("certifying", progress):
