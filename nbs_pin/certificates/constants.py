@@ -11,7 +11,7 @@ from nbs_pin.certificates.claims import Claim, Label, weakest
 from nbs_pin.certificates.inertia import largest_inertia_bound, least_inertia_bound
 from nbs_pin.certificates.model_structure import check_model
 from nbs_pin.certificates.rounding import largest_eigenvalue, least_eigenvalue
-from nbs_pin.certificates.structure import check_structure
+from nbs_pin.certificates.structure import DAMPING, check_structure
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -83,20 +83,20 @@ def constants_of(law: Controller) -> Constants:
 
 
 _LARGEST, _LEAST = "max λ(D₀^-½MD₀^-½)", "a₁ ≤ λ_min(M)"
-_DAMPING = "D ⪰ D₀"
 
 
 def _floor(controller: NeuralBackstepping, structure: tuple[Claim, ...]) -> Float[np.ndarray, "n n"]:
     """D₀: that of the damping, or as large a multiple of I as the check of its structure found."""
     if controller.damping.floor is not None:
         return np.asarray(controller.damping.floor.numpy())
-    return next(line.value for line in structure if line.name.startswith(_DAMPING)) * np.eye(controller.nv)
+    return next(line.value for line in structure if line.name == DAMPING) * np.eye(controller.nv)
 
 
 def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tuple[Claim, ...]:
-    """Bounds of the inertia: rigorous for an arm that Pinocchio models, sampled for other models."""
-    if type(dynamics) is PinocchioDynamics:
-        largest, least = largest_inertia_bound(dynamics.robot, floor), least_inertia_bound(dynamics.robot)
+    """Bounds of the inertia: rigorous for a rigid tree, learned or given, sampled for other models."""
+    arm = dynamics.robot if type(dynamics) is PinocchioDynamics else dynamics.packed_tree()
+    if arm is not None:
+        largest, least = largest_inertia_bound(arm, floor), least_inertia_bound(arm)
     else:
         largest, least = _sampled(dynamics, floor)
     named = ((_LARGEST, largest), (_LEAST, least))

@@ -24,8 +24,16 @@ def largest_eigenvalues(matrices: Float[np.ndarray, "*batch n n"]) -> Float[np.n
 
 
 def least_eigenvalue(matrix: Float[np.ndarray, "n n"]) -> float:
-    """At most λ_min of a symmetric matrix."""
-    return float(least_eigenvalues(matrix))
+    """At most λ_min of a symmetric matrix, and > 0 for positive definite ones with grams beside tonnes.
+
+    The better of A itself and of A = EBE with diag(B) = 1: λ_min(A) ≥ λ_min(B) min A_ii for B ≻ 0.
+    """
+    direct, diagonal = float(least_eigenvalues(matrix)), np.diag(matrix)
+    if not (diagonal > 0.0).all():
+        return direct
+    root = np.sqrt(diagonal)
+    inner = float(least_eigenvalues(matrix / root / root[:, None]))
+    return max(direct, inner * float(diagonal.min()) * (1.0 - 1e-12)) if inner > 0.0 else direct
 
 
 def largest_eigenvalue(matrix: Float[np.ndarray, "n n"]) -> float:

@@ -59,19 +59,6 @@ def check_structure(controller: Any, robot: Robot | None = None) -> tuple[Claim,
     return (*potential, *gains, *_friction_claims(controller.friction), _law_claim(controller, model[0]))
 
 
-def scaled_least_eigenvalue(matrix: Float[np.ndarray, "n n"]) -> float:
-    """At most λ_min of a symmetric matrix, and > 0 for positive definite ones with grams beside tonnes.
-
-    The better of A itself and of A = EBE with diag(B) = 1: λ_min(A) ≥ λ_min(B) min A_ii.
-    """
-    direct, diagonal = float(least_eigenvalue(matrix)), np.diag(matrix)
-    if not (diagonal > 0.0).all():
-        return direct
-    root = np.sqrt(diagonal)
-    inner = float(least_eigenvalue(matrix / root / root[:, None]))
-    return max(direct, inner * float(diagonal.min()) * (1.0 - 1e-12)) if inner > 0.0 else direct
-
-
 def _check_sizes(controller: NeuralBackstepping) -> None:
     """Raises CertificateRefused when the parts are for different numbers of joints, or are no such parts."""
     _check_kind("Φ", controller.potential, Potential)
@@ -102,7 +89,7 @@ def _gain(name: str, gain: Gain, n: int, axes: int) -> tuple[Float[np.ndarray, "
         refuse(f"{name} has shape {value.shape} or is not finite", f"give {n} finite numbers per axis")
     if axes == 2 and not np.array_equal(value, value.T):
         refuse(f"{name} is not symmetric", "give a symmetric positive definite matrix")
-    least = scaled_least_eigenvalue(value) if axes == 2 else float(value.min())
+    least = least_eigenvalue(value) if axes == 2 else float(value.min())
     if not least > 0.0:
         refuse(f"{name} has the eigenvalue {least:.3g} or less", "it must be positive definite")
     return value, strange(gain, Gain)
@@ -129,7 +116,7 @@ def _potential_claims(controller: NeuralBackstepping) -> tuple[Claim, ...]:
     zero = _zero(phi, convex)
     falsify_potential(phi, s, exact=convex.label is Label.PROVED)
     root = np.sqrt(rate)
-    mu, rho = 2.0 * scaled_least_eigenvalue(s), scaled_least_eigenvalue(2.0 * s * root * root[:, None])
+    mu, rho = 2.0 * least_eigenvalue(s), least_eigenvalue(2.0 * s * root * root[:, None])
     contraction = _Known(convex.label, "λ_min(2Λ^½SΛ^½), as ψ is convex")
     contraction = _Known(Label.EMPIRICAL, f"{odd_rate}: held on samples") if odd_rate else contraction
     return (
@@ -202,7 +189,7 @@ def _damping_claims(damping: Damping) -> tuple[Claim, ...]:
     if damping.floor is not None:
         floor, odd = _gain("the floor D₀", damping.floor, n, 2)
         falsify_damping(damping, floor)
-        least = scaled_least_eigenvalue(floor)
+        least = least_eigenvalue(floor)
         return (Claim(DAMPING, least, "N·m·s/rad", *_known(why or odd, "D = D₀ + TᵀT ⪰ D₀ for every weight of T")),)
     if damping.form != "paper" or not 0.0 < damping.m < np.inf:
         refuse(f"D = TᵀT has no floor D₀, and m is {damping.m}", "it may be singular: take damping 'bounded'")
