@@ -259,7 +259,8 @@ def _draw(rows: Sequence[Row], path: Path) -> None:
             axes.barh(y, row.ratio, height=0.62, color="#d5d9de")
             axes.plot(row.printed_rad / row.found_rad, y, "|", color=ERROR, markersize=9, markeredgewidth=1.8)
             axes.plot(row.random_rad / row.found_rad, y, "o", color=ACTUAL, markersize=4)
-            axes.annotate(f"{row.ratio:.2f}", (max(row.ratio, row.printed_rad / row.found_rad), y), xytext=(4, 0), textcoords="offset points", va="center",
+            beside = (max(row.ratio, row.printed_rad / row.found_rad), y)
+            axes.annotate(f"{row.ratio:.2f}", beside, xytext=(4, 0), textcoords="offset points", va="center",
                           fontsize=7.5, color="#4a5562")  # fmt: skip
         axes.axvline(1.0, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
         axes.set_yticks(range(len(rows)), [f"{row.arm}, {row.law}" for row in rows])
