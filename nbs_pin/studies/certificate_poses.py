@@ -133,10 +133,10 @@ def section(rows: Sequence[Row], scale: Scale) -> Section:
             f"{row.arm}, {row.joints} joints",
             short(row.least_bound_kgm2),
             short(row.least_found_kgm2),
-            f"{row.least_looseness:.2f}",
+            f"{row.least_looseness:.3f}",
             short(row.largest_bound_kgm2),
             short(row.largest_found_kgm2),
-            f"{row.largest_looseness:.2f}",
+            f"{row.largest_looseness:.3f}",
             f"{row.outside} of {row.poses}",
         ]
         for row in rows
