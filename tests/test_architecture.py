@@ -42,7 +42,9 @@ HOMES = {
         "learning.measuring",
         "learning.tree_guess",
         "learning.physical_tree",
+        "certificates.multipliers",
     },
+    "clarabel": {"certificates.multipliers"},
     "threadpoolctl": {"learning.chain_fit"},
     "xacrodoc": {"urdf_source"},
     "numba": {"studies.bench", "runtime.jit", "runtime.laws", "runtime.tree_laws", "runtime.threads"},
@@ -115,7 +117,7 @@ def test_a_library_stays_in_its_rooms(library):
 def test_importing_the_package_is_light():
     code = "import nbs_pin, sys; nbs_pin.load_robot; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    heavy = {"torch", "matplotlib", "mujoco", "meshcat", "yourdfpy", "trimesh", "scipy", "numba"}
+    heavy = {"torch", "matplotlib", "mujoco", "meshcat", "yourdfpy", "trimesh", "scipy", "numba", "clarabel"}
     assert not heavy & set(loaded)
 
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from nbs_pin import load_robot
+from nbs_pin.certificates import multipliers
 from nbs_pin.certificates.claims import Label
 from nbs_pin.certificates.inertia import (
     determinant_bound,
@@ -19,7 +20,7 @@ from nbs_pin.certificates.inertia import (
     trigonometric_bound,
 )
 from nbs_pin.certificates.lever_arms import lever_arms
-from nbs_pin.certificates.multipliers import Motions
+from nbs_pin.certificates.multipliers import Motions, least_by_multipliers, maximise
 from nbs_pin.certificates.pose_grid import Plan
 from nbs_pin.certificates.rigid_tree import RigidTree
 from nbs_pin.certificates.rounding import down, largest_eigenvalue, least_eigenvalue, up
@@ -212,6 +213,35 @@ def coordinates(tree, motions, q, v):
         else:
             x += [v[i]] if p < 0 else [both[0], both[1], both[3], both[4], v[i]]
     return np.array(x)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_the_solver_finds_what_is_known(size):
+    """The greatest y with A ⪰ y1 is λ_min(A), and beside B ⪰ y1 with a multiplier h ≥ 0 of −1 it stays so."""
+    rng = np.random.default_rng(size)
+    matrix = rng.normal(size=(size, size))
+    matrix = matrix + matrix.T
+    ones = np.eye(size)
+    y, solved = maximise(matrix, np.array([-ones, -ones]), np.array([False, True]))
+    assert solved
+    assert y[0] == pytest.approx(np.linalg.eigvalsh(matrix)[0], rel=1e-6)
+    assert 0.0 <= y[1] <= 1e-6
+    y, solved = maximise(matrix, np.array([-ones, ones]), np.array([False, False]))
+    assert y[0] == pytest.approx(np.linalg.eigvalsh(matrix)[0] + multipliers.REACH, rel=1e-6)
+
+
+def test_multipliers_that_prove_nothing_are_not_believed(monkeypatch):
+    """Whatever the solver says, no bound exceeds the truth: here its bound is raised and its multipliers are scaled."""
+    tree = RigidTree.of(load_robot("three_link"))
+    honest = least_by_multipliers(tree)
+    for raised, scaled in [(1.01, 1.0), (1.0, 0.9), (1e3, 0.0)]:
+
+        def lie(*problem, raised=raised, scaled=scaled):
+            y, _ = maximise(*problem)
+            return np.append(raised * y[0], scaled * y[1:]), True
+
+        monkeypatch.setattr(multipliers, "maximise", lie)
+        assert least_by_multipliers(tree) == 0.0 < honest
 
 
 def test_endless_travel_has_no_largest_inertia_but_a_least_one():

@@ -4,22 +4,26 @@ The kinetic energy is a constant quadratic form of the bodies' twists, each in i
 takes its parent's twist (v, ω), placed at the joint, to the body's: v_z is kept, ω_z gains q̇, and the turn of the other
 components keeps ‖v_⊥‖², ‖ω_⊥‖², v_⊥·ω_⊥ and z·(v_⊥×ω_⊥). A joint that slides by s keeps ω, adds q̇ to v_z and s ω×z to
 v_⊥. These are linear and quadratic conditions without q. So energy − a q̇ᵀWq̇ + Σ h·(what is zero) ⪰ 0 on all twists
-proves aW ⪯ M(q) everywhere, whatever the multipliers h, and so from above; a semidefinite program finds good ones.
+proves aW ⪯ M(q) everywhere, whatever the multipliers h, and so from above; a semidefinite program, solved by clarabel,
+finds good ones, and what it finds is checked here.
 """
 
 from dataclasses import dataclass
 
+import clarabel
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy import sparse
 
 from nbs_pin.certificates.rigid_tree import RigidTree, cross
 from nbs_pin.certificates.rounding import least_eigenvalue
-from nbs_pin.certificates.semidefinite import Inequality, maximise
 
 REACH = 1e4
 """Multipliers are kept below this, for forms and energy of size 1: larger ones gain nothing and cost digits."""
-GAPS = (1e-1, 1e-2, 1e-3, 1e-4)
-"""How near the optimum multipliers are taken, one after the other, while they prove more than rounding can undo."""
+MARGINS = (1e-7, 1e-6, 1e-5)
+"""How positive the matrix is asked to be, for energy of size 1, one after the other, until one solution is proved."""
+NOTHING = 1e-10
+"""Entries below this are zeros for the solver, which splits the matrix at them, though not for the proof."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,38 +98,47 @@ def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> 
     norms = np.array([max(float(np.linalg.norm(form)), 1e-300) for form in forms])
     terms = np.array([unit * rated, *(form / norm for form, norm in zip(forms, norms, strict=True))])
     positive = np.array([False, *(form.positive for form in motions.conditions)])
-    reach = np.array([1e12, *np.full(len(forms), REACH)])
-    inequality = Inequality(sign * motions.energy.matrix * scales, terms, positive, reach)
-    y, best = _inside(inequality), -np.inf
-    if y is None:
-        return best
-    for gap in GAPS:
-        y = maximise(inequality, y, 0, gap=gap)
+    constant, best = sign * motions.energy.matrix * scales, -np.inf
+    for margin in MARGINS:
+        y, solved = maximise(constant - margin * np.eye(m), terms, positive)
         sums = motions.energy.size + np.abs(y[0]) * unit * np.abs(rated) / scales
         for h, norm, form in zip(y[1:], norms, motions.conditions, strict=True):
             sums = sums + abs(h) / norm * form.size
         slack = 16.0 * (m + tree.nv) * np.finfo(float).eps * float(np.linalg.norm(sums * scales, 2))
-        if least_eigenvalue(inequality.matrix(y)) > slack:
-            best = float(y[0]) * unit
+        if least_eigenvalue(constant + np.tensordot(y, terms, 1)) > slack:
+            best = max(best, float(y[0]) * unit)
+            if solved:
+                break
     return best
 
 
-def _inside(inequality: Inequality) -> Float[np.ndarray, " k"] | None:
-    """Some y that satisfies the inequality, or None where none is found: the greatest s with A₀ + Σ y_i A_i ⪰ s 1."""
-    y = np.where(inequality.positive, 1.0, 0.0)
-    y[0] = -10.0 * float(np.linalg.norm(inequality.constant, 2))
-    worst = float(np.linalg.eigvalsh(inequality.matrix(y))[0])
-    if worst > 0.0:
-        return y
-    m = len(inequality.constant)
-    wider = Inequality(
-        inequality.constant,
-        np.concatenate([inequality.terms, -np.eye(m)[None]]),
-        np.append(inequality.positive, False),
-        np.append(inequality.reach, 1e12),
-    )
-    y = maximise(wider, np.append(y, worst - 1.0), len(y), enough=1e-5)
-    return y[:-1] if y[-1] > 0.0 else None
+def maximise(
+    constant: Float[np.ndarray, "m m"], terms: Float[np.ndarray, "k m m"], positive: Bool[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " k"], bool]:
+    """Maximise y[0] subject to A₀ + Σ y_i A_i ⪰ 0, |y_i| ≤ REACH for i > 0: y, and whether the solver is content.
+
+    Of y only this is certain: its numbers are finite, and ≥ 0 where `positive`.
+    """
+    k, m = len(terms), len(constant)
+    column, row = np.tril_indices(m)  # The upper triangle, column by column.
+    flat = np.concatenate([constant[None], terms])[:, row, column] * np.where(row == column, 1.0, np.sqrt(2.0))
+    flat[np.abs(flat) < NOTHING] = 0.0
+    ones = np.eye(k)
+    sides = np.concatenate([-flat[1:].T, -ones[positive], ones[1:], -ones[1:]])
+    limits = np.concatenate([flat[0], np.zeros(positive.sum()), np.full(2 * k - 2, REACH)])
+    cones = [clarabel.PSDTriangleConeT(m), clarabel.NonnegativeConeT(len(limits) - len(row))]
+    nothing, matrix = sparse.csc_array((k, k)), sparse.csc_array(sides)
+    found = clarabel.DefaultSolver(nothing, -ones[0], matrix, limits, cones, _settings()).solve()
+    y = np.nan_to_num(np.array(found.x), posinf=0.0, neginf=0.0)
+    return np.where(positive, np.maximum(y, 0.0), y), found.status == clarabel.SolverStatus.Solved
+
+
+def _settings() -> clarabel.DefaultSettings:
+    """Silent, on one thread, and to more digits than clarabel asks for, since y[0] may be small."""
+    settings = clarabel.DefaultSettings()
+    settings.verbose, settings.max_threads = False, 1
+    settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = 1e-12, 1e-7, 1e-9
+    return settings
 
 
 def _placed(tree: RigidTree, i: int) -> Float[np.ndarray, "6 6"]:
