@@ -184,16 +184,16 @@ def test_one_joint_with_networks_stays_inside_its_bound(one_joint_arm, seed):
         for part in (law.potential.network, law.damping.diagonal):
             for p in part.parameters():
                 p.copy_(0.05 * torch.rand_like(p))
-    curvature = one_joint.largest_curvature(law.potential)
-    z = np.linspace(-20.0, 20.0, 2001)[:, None]
+    z = np.linspace(-2.0, 2.0, 2001)[:, None]
     second = law.potential.terms(z, np.ones_like(z))[2][:, 0] - 1.0
-    assert second.min() >= 0.0
-    assert second.max() <= curvature
-    extra = one_joint.largest_extra_damping(law.damping)
-    assert (law.damping.matrix(z)[:, 0, 0] - 1.0).max() <= extra
+    bounds = one_joint.curvature(law.potential, 2.0)
+    assert bounds.low <= second.min() <= second.max() <= bounds.high
+    assert bounds.high - bounds.low < 1.2 * (second.max() - second.min()) + 1e-3
+    extra, more = one_joint.extra_damping(law.damping, 2.0), law.damping.matrix(z)[:, 0, 0] - 1.0
+    assert extra.low <= more.min() <= more.max() <= extra.high
     certificate = nbs.certify(law, np.array([1.0]))
     found = nbs.attack(law, np.array([1.0]), reference=nbs.Hold(np.zeros(1)), period=0.01, rounds=3, starts=4)
-    assert 0.5 * certificate.error < found.error <= certificate.error
+    assert 0.8 * certificate.error < found.error <= certificate.error
 
 
 # Whole certificates

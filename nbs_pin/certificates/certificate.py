@@ -122,7 +122,7 @@ def certify(
     if not math.isfinite(least.storage):
         raise CertificateRefused(_why_not(comparison))
     potential = reach(comparison, least.storage)
-    size, joints, source = _errors(controller, comparison, admissible, potential)
+    size, joints, source = _errors(controller, comparison, least.storage, potential)
     known = (constants.label, *(line.label for line in error.lines), *_unproved(controller, joints, mismatch))
     rate, printed = 0.5 * decay(comparison), math.sqrt(constants.largest_rate) * comparison.t / (2.0 * constants.rho)
     margins, sampled = sampled_control(controller, period)
@@ -183,20 +183,21 @@ def _why_not(k: Comparison) -> str:
 
 
 def _errors(
-    controller: NeuralBackstepping, comparison: Comparison, admissible: Admissible, potential: float
+    controller: NeuralBackstepping, comparison: Comparison, storage: float, potential: float
 ) -> tuple[float, Float[np.ndarray, " n"], str]:
     """Bounds of ‖z1‖ and each |z1_i| [rad], and where they come from."""
     size, joints = _radians(controller, potential)
     exact = math.inf
     # Friction fed forward leaves a term that is not linear, a model's error another.
     if controller.nv == 1 and controller.friction is None and comparison.alpha == comparison.beta == 0.0:
-        exact = _of_one_joint(controller, comparison)
+        exact = _of_one_joint(controller, comparison, storage, size)
     if exact < size:
         return exact, np.array([exact]), "the loop of one joint is linear up to ψ and T, docs/certificates.md §4"
     return size, joints, "Φ ≥ z1ᵀSz1 and Φ∞, docs/certificates.md §3"
 
 
-def _of_one_joint(controller: NeuralBackstepping, comparison: Comparison) -> float:
+def _of_one_joint(controller: NeuralBackstepping, comparison: Comparison, storage: float, size: float) -> float:
+    """The bound of |z1| that linear theory gives, inf where it does not apply; `size` [rad] is one already."""
     if type(controller.dynamics) is not PinocchioDynamics or controller.damping.floor is None:
         return math.inf
     loop = one_joint.Loop(
@@ -206,9 +207,9 @@ def _of_one_joint(controller: NeuralBackstepping, comparison: Comparison) -> flo
         stiffness=2.0 * float(controller.potential.stiffness.numpy()[0, 0]),
         damping=float(controller.damping.floor.numpy()[0, 0]),
     )
-    curvature = one_joint.largest_curvature(controller.potential)
-    extra = one_joint.largest_extra_damping(controller.damping)
-    return one_joint.worst_error(loop, comparison.t * math.sqrt(loop.damping), curvature, extra)
+    within = one_joint.Worst(size, math.sqrt(2.0 * storage / loop.inertia) * (1.0 + 1e-12))
+    torque = comparison.t * math.sqrt(loop.damping)
+    return one_joint.worst_error(loop, torque, controller.potential, controller.damping, within)
 
 
 def _radians(controller: NeuralBackstepping, potential: float) -> tuple[float, Float[np.ndarray, " n"]]:

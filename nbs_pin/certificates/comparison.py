@@ -17,6 +17,8 @@ _SHARES = np.linspace(0.0, 1.0, 401)[1:-1]
 _STEEPNESS = np.concatenate([np.linspace(1.0, 4.0, 91)[:-1], np.geomspace(4.0, 1e4, 160)])
 _ROWS = 240
 _HALVINGS = 14
+_LEAST_A = 1e-12
+"""Added to a, which can only enlarge the maximum, so that nothing is divided by 0."""
 _OUTWARD = 1.0 + 1e-9
 """Each bound is made so much larger, far more than the rounding of the few thousand operations behind it."""
 
@@ -128,13 +130,12 @@ def _growth(k: Comparison, end: np.ndarray, low: float, high: float) -> np.ndarr
     its slope is 0.
     """
     m, g = _STEEPNESS, 1.0 - k.beta
-    a = (m - 1.0) / np.sqrt(k.delta) + k.alpha
+    a = (m - 1.0) / np.sqrt(k.delta) + k.alpha + _LEAST_A
     x0 = np.sqrt(2.0 * k.rho * np.maximum(end, 0.0))
     y0, y1 = np.sqrt(2.0 * k.kappa * low), np.sqrt(2.0 * k.nu * high)
     bend = g - a * a / (4.0 * m)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        switch = np.where(a > 0.0, 2.0 * m * x0 / a, y0)
-        free = np.where(bend > 0.0, k.t / (2.0 * bend), switch)
+    switch = 2.0 * m * x0 / a
+    free = k.t / (2.0 * np.where(bend > 0.0, bend, np.inf))
     ends = [np.full_like(m, y0), np.full_like(m, y1 if np.isfinite(y1) else y0)]
     candidates = np.clip(np.stack([*ends, switch, (a * x0 + k.t) / (2.0 * g), free]), y0, y1)
     x = np.maximum(x0, a * candidates / (2.0 * m))
