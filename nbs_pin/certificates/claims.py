@@ -21,6 +21,29 @@ class Label(StrEnum):
     """On samples; others may break it."""
 
 
+class Assumption(StrEnum):
+    """What bounds assume, in the words that a certificate prints and a monitor names."""
+
+    MODEL = "the arm is its model"
+    FRICTION = "joint friction is fed forward or counted as disturbance"
+    DISTURBANCE = "the disturbance is within its bound"
+    EFFORT = "torques stay inside the effort limits"
+    TIME = "continuous time, no delay"
+    WRAP = "errors of continuous joints stay within ±π"
+
+
+class Group(StrEnum):
+    """Where a claim stands in a certificate."""
+
+    BOUNDS = "bounds"
+    MODEL_ERROR = "model error"
+    STRUCTURE = "structure"
+    INERTIA = "inertia"
+    CONSTANTS = "constants"
+    SAMPLED = "sampled control"
+    LOADS = "disturbance"
+
+
 def weakest(*labels: Label) -> Label:
     """The label of what follows from claims with these labels; PROVED for none."""
     order = list(Label)
@@ -40,6 +63,7 @@ class Claim:
     label: Label
     because: str
     """Where it comes from, and what it assumes beyond the assumptions of the certificate."""
+    group: Group = Group.STRUCTURE
 
     def __post_init__(self) -> None:
         if math.isnan(self.value):
@@ -54,6 +78,7 @@ class Claim:
             "unit": self.unit,
             "label": str(self.label),
             "because": self.because,
+            "group": str(self.group),
         }
 
 
@@ -67,6 +92,8 @@ class Condition:
     unit: str
     label: Label
     because: str
+    assumed: bool = True
+    """Whether the bounds are void where it does not hold; False for what is printed for comparison."""
 
     @property
     def holds(self) -> bool:
