@@ -19,10 +19,12 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "nbs_pin.catalogue": ("ROBOT_NAMES",),
+    "nbs_pin.certificates.admissible": ("Admissible",),
     "nbs_pin.certificates.adversary": ("Attack", "attack"),
     "nbs_pin.certificates.certificate": ("Certificate", "certify"),
-    "nbs_pin.certificates.design": ("propose",),
+    "nbs_pin.certificates.design": ("Proposal", "propose"),
     "nbs_pin.certificates.monitor": ("Monitored", "monitor"),
+    "nbs_pin.certificates.watch": ("Watch",),
     "nbs_pin.checkpoints": ("load", "save"),
     "nbs_pin.controllers.computed_torque": ("ComputedTorque",),
     "nbs_pin.controllers.controller": ("Controller", "MemorylessController"),

@@ -305,6 +305,67 @@ def test_theorem_4_for_a_model_of_other_masses():
 PER_START = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
 
 
+def test_a_closed_form_of_other_masses_is_no_proof():
+    """Named after the arm or held against it, a model counts as exact only if it is."""
+    robot = nbs.load_robot("two_link")
+    same, other = nbs.AnalyticDynamics(robot=robot), nbs.AnalyticDynamics(masses=(5.0, 5.0), robot=robot)
+    assert nbs.certify(nbs.NeuralBackstepping.for_robot(robot, same), 1.0).label is Label.PROVED
+    wrong = nbs.certify(nbs.NeuralBackstepping.for_robot(robot, other), 1.0)
+    assert wrong.label is Label.EMPIRICAL
+    assert any("nothing bounds it" in line.because for line in wrong.lines)
+    nameless = nbs.NeuralBackstepping.for_robot(robot, nbs.AnalyticDynamics(masses=(5.0, 5.0)))
+    assert nbs.certify(nameless, 1.0, robot=robot).label is Label.EMPIRICAL
+
+
+def test_the_overshoot_grows_from_the_bound_at_rest():
+    robot = nbs.load_robot("ur5")
+    law = nbs.NeuralBackstepping.for_robot(robot, damping="bounded")
+    certificate = nbs.certify(law, np.full(6, 5.0))
+    assert certificate.potential < 0.9 * certificate.storage
+    assert certificate.from_start(1e-12)[0] == pytest.approx(certificate.error, rel=1e-6)
+    far = certificate.from_start(4.0 * certificate.potential)
+    assert far[0] == pytest.approx(2.0 * certificate.error, rel=1e-6)
+    with torch.no_grad():
+        law.potential.stiffness.change -= 1.0
+    assert certificate.from_start(4.0 * certificate.potential)[0] == far[0]
+
+
+def test_a_start_beyond_what_the_joints_can_do_proves_nothing():
+    """Errors that wrap, and joints that meet their stops."""
+    kinova, panda = nbs.load_robot("kinova"), nbs.load_robot("panda")
+    for robot, away in ((kinova, 2.5), (panda, 2.5)):
+        law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Hold(nbs.Sinusoid.for_robot(robot)(0.0).q)
+        near, far = (
+            nbs.certify(law, np.full(robot.nv, 0.01), reference=motion, q0=motion(0.0).q + x) for x in (1e-4, away)
+        )
+        assert near.label is Label.PROVED
+        assert near.overshoot[0] < far.overshoot[0]
+        assert far.label is Label.EMPIRICAL
+        assert far.void
+
+
+def test_a_reference_that_leaves_the_limits_is_refused():
+    robot = nbs.load_robot("panda")
+    law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid(np.full(7, 3.0), 1.0)
+    with pytest.raises(CertificateRefused, match="joint limits is too small"):
+        nbs.certify(law, 1.0, reference=motion)
+
+
+def test_limits_that_do_not_hold_take_the_proof_away():
+    robot = nbs.load_robot("two_link")
+    law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot, 1.0)
+    assert nbs.certify(law, 1.0, reference=motion).label is Label.PROVED
+    strong = nbs.certify(law, np.full(2, 1e4), reference=motion)
+    assert strong.label is Label.EMPIRICAL
+    assert any("effort limit" in name for name in strong.void)
+
+
+def test_a_disturbance_is_bounded_in_one_way():
+    for wrong in ({}, {"box": np.ones(2), "radius": 1.0}, {"box": np.array([5.0, -5.0])}, {"radius": -3.0}):
+        with pytest.raises(ArgumentError, match="expected one of the two"):
+            Admissible(**wrong)
+
+
 def test_a_model_too_wrong_for_theorem_4_is_refused_with_both_sides():
     robot = nbs.load_robot("two_link").with_effort_limit(np.inf)
     law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot, 1.0)
@@ -326,8 +387,8 @@ def test_errors_beyond_half_a_turn_of_a_continuous_joint_prove_nothing():
 def test_arguments_that_do_not_fit_are_refused():
     robot = nbs.load_robot("two_link")
     law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot, 1.0)
-    for wrong in (-1.0, np.nan, np.array([1.0]), np.ones(3), np.array([1.0, np.inf]), "five"):
-        with pytest.raises(ArgumentError, match="disturbance is"):
+    for wrong in (-1.0, np.nan, np.array([1.0]), np.ones(3), np.array([1.0, np.inf]), "five", 1e200, 1e-200):
+        with pytest.raises(ArgumentError, match="disturbance"):
             nbs.certify(law, wrong)
     with pytest.raises(ArgumentError, match="give the reference too"):
         nbs.certify(law, 1.0, q0=np.zeros(2))
@@ -335,6 +396,11 @@ def test_arguments_that_do_not_fit_are_refused():
         nbs.certify(law, 1.0, reference=reference, v0=np.zeros(2))
     with pytest.raises(ArgumentError, match="period"):
         nbs.certify(law, 1.0, period=0.0)
+    for q0 in (np.zeros(3), np.zeros((4, 2)), np.array([0.0, np.nan])):
+        with pytest.raises(ArgumentError, match="q0 is"):
+            nbs.certify(law, 1.0, reference=reference, q0=q0)
+    with pytest.raises(ArgumentError, match="give its own arm"):
+        nbs.certify(law, 1.0, robot=nbs.load_robot("ur5"))
     with pytest.raises(CertificateRefused):
         nbs.certify(nbs.PD.for_robot(robot), 1.0)
 

@@ -62,15 +62,17 @@ def extremes(model, weight, poses, starts=2):
 
 def random_model(rng, kinds, branched=False, rotors=False):
     """A tree of random bodies: 'r' turns, 'p' slides, along random axes."""
-    model = pin.Model()
+    model, branch = pin.Model(), [0]
     for i, kind in enumerate(kinds):
         axis = rng.normal(size=3)
         axis /= np.linalg.norm(axis)
         joint = pin.JointModelRevoluteUnaligned(axis) if kind == "r" else pin.JointModelPrismaticUnaligned(axis)
         place = pin.SE3(np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.uniform(-0.5, 0.5, 3))
         place.rotation = place.rotation * np.linalg.det(place.rotation)
-        parent = int(rng.integers(0, i + 1)) if branched else i
+        # A branch may grow from the current one alone: Pinocchio's CRBA takes joints depth first, as URDFs give them.
+        parent = branch[int(rng.integers(0, len(branch)))] if branched else i
         index = model.addJoint(parent, joint, place, f"joint{i}")
+        branch = [*branch[: branch.index(parent) + 1], index]
         size = rng.uniform(0.05, 0.3, 3)
         body = pin.Inertia.FromBox(float(rng.uniform(0.2, 3.0)), *size)
         model.appendBodyToJoint(index, body, pin.SE3(np.eye(3), rng.uniform(-0.3, 0.3, 3)))

@@ -9,6 +9,8 @@ from jaxtyping import Float
 from nbs_pin.checks import PerJoint, floats
 from nbs_pin.exceptions import ArgumentError
 
+_LEAST, _GREATEST = 1e-100, 1e100
+
 
 @dataclass(frozen=True, eq=False)
 class Admissible:
@@ -18,6 +20,15 @@ class Admissible:
     """Largest |τ_d,i| [N·m]."""
     radius: float | None = None
     """Largest ‖τ_d‖ [N·m]."""
+
+    def __post_init__(self) -> None:
+        given = np.asarray(self.radius if self.box is None else self.box, dtype=float)
+        usable = (given == 0.0) | ((given >= _LEAST) & (given <= _GREATEST))  # whose squares are numbers too
+        if (self.box is None) == (self.radius is None) or given.ndim > 1 or not usable.all():
+            raise ArgumentError(
+                f"disturbance has the box {self.box} and the radius {self.radius} N·m, expected one of the two, every "
+                f"number 0 or from {_LEAST:g} to {_GREATEST:g}; correct it."
+            )
 
     @classmethod
     def of(cls, disturbance: "PerJoint | Admissible", nv: int) -> "Admissible":
@@ -29,9 +40,9 @@ class Admissible:
                 )
             return disturbance
         given = floats("disturbance", disturbance)
-        if given.shape not in ((), (nv,)) or not np.isfinite(given).all() or not (given >= 0.0).all():
+        if given.shape not in ((), (nv,)):
             raise ArgumentError(
-                f"disturbance is {disturbance}, expected one bound ≥ 0 on ‖τ_d‖ or {nv}, one on each |τ_d,i| [N·m]."
+                f"disturbance is {disturbance}, expected one bound on ‖τ_d‖ or {nv}, one on each |τ_d,i| [N·m]."
             )
         return cls(radius=float(given)) if given.ndim == 0 else cls(box=given)
 

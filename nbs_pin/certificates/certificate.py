@@ -7,25 +7,40 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.certificates import one_joint
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.claims import Claim, Condition, Label, weakest
+from nbs_pin.certificates.claims import Assumption, Claim, Condition, Group, Label, weakest
 from nbs_pin.certificates.comparison import Comparison, Level, decay, level, reach
 from nbs_pin.certificates.constants import Constants, constants_of
 from nbs_pin.certificates.learned import ModelError, model_error
-from nbs_pin.certificates.margins import headroom, sampled_control
-from nbs_pin.certificates.rounding import least_eigenvalue
-from nbs_pin.checks import PerJoint, positive
+from nbs_pin.certificates.margins import headroom, room, sampled_control, units
+from nbs_pin.certificates.model_structure import is_exact
+from nbs_pin.certificates.radians import errors, radians
+from nbs_pin.checks import PerJoint, floats, positive
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
-from nbs_pin.dynamics.analytic import AnalyticDynamics
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.mismatch import Mismatch
 from nbs_pin.references import DesiredMotion
+from nbs_pin.robot import Robot
 
-_EXACT = (PinocchioDynamics, AnalyticDynamics)
 _NO_ERROR = ModelError(0.0, 0.0, 0.0, (), ())
+_UNKNOWN_ERROR = ModelError(
+    0.0,
+    0.0,
+    0.0,
+    (
+        Claim(
+            "error of the model",
+            math.inf,
+            "N·m",
+            Label.EMPIRICAL,
+            "taken for 0, and nothing bounds it: give mismatch=compare(…).mismatch, or --against ARM",
+            Group.MODEL_ERROR,
+        ),
+    ),
+    (),
+)
+_PRINTED = "printed ‖z1‖"
 _FALSE = "what Theorem 3 of the paper prints: true for constant torques, false for others (docs/theory.md §5)"
 _TRUE = "what Theorem 3 of the paper prints: here no tighter than what is proved"
 
@@ -44,9 +59,9 @@ class Certificate:
     level: Level
     """Under disturbances V(t) ≤ e^{−ct}V(0) + V∞."""
     potential: float
-    """Φ∞ [J]: Φ(z1) ≤ Φ∞ at all times from z1 = z2 = 0, and in the limit from anywhere."""
+    """Φ∞ [J]: Φ(z1) ≤ max(V(0), Φ∞) at all times, and ≤ Φ∞ in the limit."""
     error: float
-    """Bound of ‖z1‖ [rad], at all times from z1 = z2 = 0, and in the limit from anywhere."""
+    """Bound of ‖z1‖ [rad], at all times from z1 = z2 = 0, and in the limit from other starts."""
     joint_errors: Float[np.ndarray, " n"]
     """The same of each |z1_i| [rad]."""
     printed_error: float
@@ -58,7 +73,31 @@ class Certificate:
     conditions: tuple[Condition, ...]
     """What the theorems ask for, with both sides' numbers."""
     assumptions: tuple[str, ...]
-    """What the bounds assume beside the conditions."""
+    """What the bounds assume beside the conditions, in the words of `Assumption` first."""
+    stiffness: Float[np.ndarray, "n n"]
+    """S as it was certified [J/rad²]; training the controller changes its own."""
+    robot: Robot | None = None
+    """The true arm, None where none is known."""
+    mismatch: Mismatch | None = None
+    """The model's error that the bounds count in."""
+    overshoot: tuple[float, Float[np.ndarray, " n"]] | None = None
+    """Bounds of ‖z1‖ and each |z1_i| at all times from the start that was given [rad]."""
+
+    @property
+    def void(self) -> tuple[str, ...]:
+        """Conditions that the bounds assume and that do not hold here; `label` is then EMPIRICAL."""
+        return tuple(condition.name for condition in self.conditions if condition.assumed and not condition.holds)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        n = self.controller.nv
+        return tuple(f"joint {i + 1}" for i in range(n)) if self.robot is None else self.robot.joint_names
+
+    @property
+    def joint_units(self) -> tuple[str, ...]:
+        """What the error of each joint is measured in: rad, or m where it slides."""
+        return units(self.robot, self.controller.nv)
 
     @property
     def storage(self) -> float:
@@ -70,10 +109,13 @@ class Certificate:
         return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
 
     def from_start(self, initial: float) -> tuple[float, Float[np.ndarray, " n"]]:
-        """Bounds of ‖z1‖ and of each |z1_i| at all times from V(0) = `initial` [J]: the overshoot [rad]."""
+        """Bounds of ‖z1‖ and of each |z1_i| at all times from V(0) = `initial` [J]: the overshoot [rad].
+
+        Φ never exceeds max(V(0), Φ∞) (docs/certificates.md §3).
+        """
         if initial <= 0.0:
             return self.error, self.joint_errors
-        return _radians(self.controller, max(initial, self.storage))
+        return radians(self.stiffness, max(initial, self.potential))
 
     def summary(self) -> dict[str, Any]:
         """Everything that a reader is shown, as JSON can store it."""
@@ -83,7 +125,12 @@ class Certificate:
             "error_rad": self.error,
             "joint_errors_rad": self.joint_errors.tolist(),
             "printed_error_rad": self.printed_error,
+            "overshoot_rad": None if self.overshoot is None else self.overshoot[0],
+            "joint_overshoots_rad": None if self.overshoot is None else self.overshoot[1].tolist(),
+            "joints": list(self.joint_names),
+            "units": list(self.joint_units),
             "label": str(self.label),
+            "void": list(self.void),
             "lines": [line.plain() for line in self.lines],
             "conditions": [condition.plain() for condition in self.conditions],
             "assumptions": list(self.assumptions),
@@ -96,39 +143,43 @@ def certify(
     *,
     reference: DesiredMotion | None = None,
     duration: float = 10.0,
-    q0: Float[np.ndarray, " n"] | None = None,
-    v0: Float[np.ndarray, " n"] | None = None,
+    q0: Any = None,
+    v0: Any = None,
     mismatch: Mismatch | None = None,
     period: float | None = None,
+    robot: Robot | None = None,
 ) -> Certificate:
     """How far the arm can stray from its reference under a bounded disturbance, and why that is so.
 
     disturbance: one bound per joint on |τ_d,i|, or one number, the bound on ‖τ_d‖ [N·m]; or an `Admissible`.
-    reference: the motion over `duration` [s], for what depends on it: its torque, a start, the error of a model.
-    q0, v0: a start [rad], [rad/s] (at rest without v0), for the overshoot from there; needs the reference.
+    reference: the motion over `duration` [s], for what depends on it: limits of torque and position, a start, the error
+    of a model. q0, v0: a start [rad], [rad/s] (at rest without v0), for the overshoot from there; needs the reference.
     mismatch: δ of a learned model along closed loops (`compare(…).mismatch`), for Theorem 4; needs the reference.
-    period: control period [s], held against the rule of sampled control.
-    Raises CertificateRefused when law or model give no ground for a bound, ArgumentError for arguments that do not fit.
+    period: control period [s], held against the rule of sampled control. robot: the true arm; None takes the model's.
+    Raises CertificateRefused when law, model or reference give no ground for a bound, ArgumentError for arguments that
+    do not fit.
     """
     constants = constants_of(controller)
-    controller = cast(NeuralBackstepping, controller)  # any other law was refused
-    admissible = Admissible.of(disturbance, controller.nv)
-    _check_arguments(reference, duration, q0, v0, mismatch, period)
+    law = cast(NeuralBackstepping, controller)  # any other was refused
+    arm = law.dynamics.robot if robot is None else robot
+    admissible = Admissible.of(disturbance, law.nv)
+    start = _check_arguments(law, arm, reference, duration, q0, v0, mismatch, period)
     error = _NO_ERROR
     if mismatch is not None and reference is not None:
         error = model_error(constants, mismatch, reference, duration)
+    elif not is_exact(law.dynamics, arm):
+        error = _UNKNOWN_ERROR
     comparison = _comparison(constants, admissible, error)
     least = level(comparison)
     if not math.isfinite(least.storage):
         raise CertificateRefused(_why_not(comparison))
     potential = reach(comparison, least.storage)
-    size, joints, source = _errors(controller, comparison, least.storage, potential)
-    known = (constants.label, *(line.label for line in error.lines), *_unproved(controller, joints, mismatch))
+    size, joints, source = errors(law, comparison, least.storage, potential)
     rate, printed = 0.5 * decay(comparison), math.sqrt(constants.largest_rate) * comparison.t / (2.0 * constants.rho)
-    margins, sampled = sampled_control(controller, period)
+    margins, sampled = sampled_control(law, period)
     decays = Condition("Theorem 1: min(ρ, ω + κ) > 0", rate, 0.0, "1/s", constants.label, "docs/certificates.md §2")
     certificate = Certificate(
-        controller=controller,
+        controller=law,
         admissible=admissible,
         rate=rate,
         level=least,
@@ -136,25 +187,46 @@ def certify(
         error=size,
         joint_errors=joints,
         printed_error=printed,
-        label=weakest(*known),
+        label=weakest(constants.label, *(line.label for line in error.lines)),
         lines=(*constants.lines, *error.lines, *margins),
-        conditions=(decays, *error.conditions, *_no_wrap(controller, joints, weakest(*known)), *sampled),
-        assumptions=_assumptions(controller, mismatch),
+        conditions=(decays, *error.conditions, *sampled),
+        assumptions=_assumptions(arm, mismatch),
+        stiffness=np.asarray(law.potential.stiffness.numpy()),
+        robot=arm,
+        mismatch=mismatch,
     )
-    certificate = replace(certificate, lines=(*certificate.lines, *_bounds(certificate, source)))
-    return certificate if reference is None else _along(certificate, reference, duration, q0, v0)
+    return _with_bounds(_along(certificate, reference, duration, start), source)
 
 
 def _check_arguments(
-    reference: DesiredMotion | None, duration: float, q0: Any, v0: Any, mismatch: Mismatch | None, period: float | None
-) -> None:
+    law: NeuralBackstepping,
+    robot: Robot | None,
+    reference: DesiredMotion | None,
+    duration: float,
+    q0: Any,
+    v0: Any,
+    mismatch: Mismatch | None,
+    period: float | None,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]] | None:
+    """The start (q, v), None without one."""
     positive("duration", duration, "s")
     if period is not None:
         positive("period", period, "s")
+    if robot is not None and robot.nv != law.nv:
+        raise ArgumentError(f"the controller has {law.nv} joints and {robot.name} {robot.nv}; give its own arm.")
+    if reference is not None and not callable(reference):
+        raise ArgumentError(f"reference is {reference!s:.100}, expected a motion such as nbs.Sinusoid; correct it.")
     if reference is None and (mismatch is not None or q0 is not None or v0 is not None):
         raise ArgumentError("a start and a model's error are held against a motion; give the reference too.")
     if q0 is None and v0 is not None:
         raise ArgumentError("v0 was given without q0; give both, or q0 alone for a start at rest.")
+    if q0 is None:
+        return None
+    start = floats("q0", q0), np.zeros(law.nv) if v0 is None else floats("v0", v0)
+    for name, x in zip(("q0", "v0"), start, strict=True):
+        if x.shape != (law.nv,) or not np.isfinite(x).all():
+            raise ArgumentError(f"{name} is {x!s:.200}, expected {law.nv} finite numbers, one per joint; correct it.")
+    return start
 
 
 def _comparison(constants: Constants, admissible: Admissible, error: ModelError) -> Comparison:
@@ -182,94 +254,53 @@ def _why_not(k: Comparison) -> str:
     )
 
 
-def _errors(
-    controller: NeuralBackstepping, comparison: Comparison, storage: float, potential: float
-) -> tuple[float, Float[np.ndarray, " n"], str]:
-    """Bounds of ‖z1‖ and each |z1_i| [rad], and where they come from."""
-    size, joints = _radians(controller, potential)
-    exact = math.inf
-    # Friction fed forward leaves a term that is not linear, a model's error another.
-    if controller.nv == 1 and controller.friction is None and comparison.alpha == comparison.beta == 0.0:
-        exact = _of_one_joint(controller, comparison, storage, size)
-    if exact < size:
-        return exact, np.array([exact]), "the loop of one joint is linear up to ψ and T, docs/certificates.md §4"
-    return size, joints, "Φ ≥ z1ᵀSz1 and Φ∞, docs/certificates.md §3"
+def _along(
+    certificate: Certificate,
+    reference: DesiredMotion | None,
+    duration: float,
+    start: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]] | None,
+) -> Certificate:
+    """The certificate with the overshoot from a start and what the arm's limits say of it and of the reference."""
+    law, robot, joints = certificate.controller, certificate.robot, certificate.joint_errors
+    overshoot, lines = None, certificate.lines
+    if start is not None and reference is not None:
+        begin = reference(np.zeros(1))
+        initial = float(law.storage(*start, begin.q[0], begin.v[0]))
+        overshoot = certificate.from_start(initial)
+        joints = np.maximum(joints, overshoot[1])
+        because = "the storage function there"
+        lines = (*lines, Claim("V(0) of the start", initial, "J", certificate.label, because, Group.BOUNDS))
+    conditions = [*certificate.conditions, *_no_wrap(robot, joints, certificate.label)]
+    if reference is not None and robot is not None:
+        conditions += headroom(robot, law.dynamics, certificate.admissible, reference, duration)
+        conditions += room(robot, joints, reference, duration)
+    certificate = replace(certificate, conditions=tuple(conditions), lines=lines, overshoot=overshoot)
+    return replace(certificate, label=Label.EMPIRICAL) if certificate.void else certificate
 
 
-def _of_one_joint(controller: NeuralBackstepping, comparison: Comparison, storage: float, size: float) -> float:
-    """The bound of |z1| that linear theory gives, inf where it does not apply; `size` [rad] is one already."""
-    if type(controller.dynamics) is not PinocchioDynamics or controller.damping.floor is None:
-        return math.inf
-    loop = one_joint.Loop(
-        inertia=float(controller.dynamics.mass_matrix(np.zeros(1))[0, 0]),
-        rate=float(controller.rate.numpy()[0]),
-        omega=float(controller.inertial_rate),
-        stiffness=2.0 * float(controller.potential.stiffness.numpy()[0, 0]),
-        damping=float(controller.damping.floor.numpy()[0, 0]),
-    )
-    within = one_joint.Worst(size, math.sqrt(2.0 * storage / loop.inertia) * (1.0 + 1e-12))
-    torque = comparison.t * math.sqrt(loop.damping)
-    return one_joint.worst_error(loop, torque, controller.potential, controller.damping, within)
-
-
-def _radians(controller: NeuralBackstepping, potential: float) -> tuple[float, Float[np.ndarray, " n"]]:
-    """√(Φ/λ_min(S)) and √(Φ (S⁻¹)_ii), which bound ‖z1‖ and |z1_i| where Φ ≥ z1ᵀSz1 is at most `potential`."""
-    stiffness = np.asarray(controller.potential.stiffness.numpy())
-    slack = 1.0 + 16.0 * len(stiffness) * np.finfo(float).eps * float(np.linalg.cond(stiffness))
-    joints = np.sqrt(potential * np.diag(np.linalg.inv(stiffness)) * slack)
-    # The joints together are never further than the ellipsoid is long, nor than the corner of their own bounds.
-    total = min(math.sqrt(potential / least_eigenvalue(stiffness)), float(np.linalg.norm(joints)))
-    return total, np.minimum(joints, total)
-
-
-def _bounds(certificate: Certificate, source: str) -> tuple[Claim, ...]:
+def _with_bounds(certificate: Certificate, source: str) -> Certificate:
+    """The certificate with a line for each bound."""
     label, here = certificate.label, "docs/certificates.md §2"
     harmless = certificate.printed_error >= certificate.error * (1.0 - 1e-6)
-    joints = zip(_names(certificate.controller), certificate.joint_errors.tolist(), strict=True)
-    return (
-        Claim("rate of decay without disturbance", certificate.rate, "1/s", label, here),
-        Claim("c of V(t) ≤ e^{−ct}V(0) + V∞", certificate.level.c, "1/s", label, here),
-        Claim("V∞", certificate.storage, "J", label, here),
-        Claim("Φ∞", certificate.potential, "J", label, "docs/certificates.md §3"),
-        Claim("‖z1‖", certificate.error, "rad", label, source),
-        *(Claim(f"|z1| of {name}", x, "rad", label, source) for name, x in joints),
-        Claim("printed ‖z1‖", certificate.printed_error, "rad", Label.EMPIRICAL, _TRUE if harmless else _FALSE),
-    )
+    nothing = "disturbance" if certificate.mismatch is None else "disturbance and constant model error"
+    joints = zip(certificate.joint_names, certificate.joint_errors.tolist(), certificate.joint_units, strict=True)
+    whole = "rad" if set(certificate.joint_units) == {"rad"} else "rad, m"
+    lines = [
+        Claim("‖z1‖", certificate.error, whole, label, source, Group.BOUNDS),
+        *(Claim(f"|z1| of {name}", x, unit, label, source, Group.BOUNDS) for name, x, unit in joints),
+        Claim(_PRINTED, certificate.printed_error, whole, Label.EMPIRICAL, _TRUE if harmless else _FALSE, Group.BOUNDS),
+        Claim(f"rate of decay without {nothing}", certificate.rate, "1/s", label, here, Group.BOUNDS),
+        Claim("c of V(t) ≤ e^{−ct}V(0) + V∞", certificate.level.c, "1/s", label, here, Group.BOUNDS),
+        Claim("V∞", certificate.storage, "J", label, here, Group.BOUNDS),
+        Claim("Φ∞", certificate.potential, "J", label, "docs/certificates.md §3", Group.BOUNDS),
+    ]
+    if certificate.overshoot is not None:
+        because = "Φ never exceeds max(V(0), Φ∞), docs/certificates.md §3"
+        lines.insert(1, Claim("‖z1‖ from the start", certificate.overshoot[0], whole, label, because, Group.BOUNDS))
+    return replace(certificate, lines=(*lines, *certificate.lines))
 
 
-def _along(certificate: Certificate, reference: DesiredMotion, duration: float, q0: Any, v0: Any) -> Certificate:
-    """The certificate with what depends on the reference: effort limits, and the overshoot from a start."""
-    controller = certificate.controller
-    conditions = (*certificate.conditions, *headroom(controller, certificate.admissible, reference, duration))
-    if q0 is None:
-        return replace(certificate, conditions=conditions)
-    begin = reference(np.zeros(1))
-    q, v = np.asarray(q0, dtype=float), np.zeros(controller.nv) if v0 is None else np.asarray(v0, dtype=float)
-    initial = float(controller.storage(q, v, begin.q[0], begin.v[0]))
-    overshoot, _ = certificate.from_start(initial)
-    lines = (
-        Claim("V(0) of the start", initial, "J", certificate.label, "the storage function there"),
-        Claim("‖z1‖ from the start", overshoot, "rad", certificate.label, "V never exceeds max(V(0), V∞)"),
-    )
-    return replace(certificate, conditions=conditions, lines=(*certificate.lines, *lines))
-
-
-def _names(controller: NeuralBackstepping) -> tuple[str, ...]:
-    robot = controller.dynamics.robot
-    return tuple(f"joint {i + 1}" for i in range(controller.nv)) if robot is None else robot.joint_names
-
-
-def _unproved(
-    controller: NeuralBackstepping, joints: Float[np.ndarray, " n"], mismatch: Mismatch | None
-) -> list[Label]:
-    """EMPIRICAL for a learned model whose error nobody bounded, and for continuous joints that may pass ±π."""
-    learned = mismatch is None and type(controller.dynamics) not in _EXACT
-    wraps = any(not condition.holds for condition in _no_wrap(controller, joints, Label.EMPIRICAL))
-    return [Label.EMPIRICAL] if learned or wraps else []
-
-
-def _no_wrap(controller: NeuralBackstepping, joints: Float[np.ndarray, " n"], label: Label) -> tuple[Condition, ...]:
-    robot = controller.dynamics.robot
+def _no_wrap(robot: Robot | None, joints: Float[np.ndarray, " n"], label: Label) -> tuple[Condition, ...]:
     if robot is None or not robot.continuous.any():
         return ()
     largest = float(joints[robot.continuous].max())
@@ -277,14 +308,14 @@ def _no_wrap(controller: NeuralBackstepping, joints: Float[np.ndarray, " n"], la
     return (Condition(name, math.pi, largest, "rad", label, "its error jumps at ±π (docs/theory.md §1)"),)
 
 
-def _assumptions(controller: NeuralBackstepping, mismatch: Mismatch | None) -> tuple[str, ...]:
-    model = "the arm is the model"
+def _assumptions(robot: Robot | None, mismatch: Mismatch | None) -> tuple[str, ...]:
+    model = str(Assumption.MODEL)
     if mismatch is not None:
         model = (
-            f"the model errs as it did on {mismatch.trajectories} closed-loop trajectories, with a chance of at most "
-            f"{mismatch.violation:.2g} that a further one does not, at a confidence of 1 − {mismatch.doubt:g}"
+            f"the model errs as on {mismatch.trajectories} closed loops of {mismatch.t[-1]:.3g} s, with a chance of at "
+            f"most {mismatch.violation:.2g} that a further one, drawn alike, does not, at a confidence of "
+            f"1 − {mismatch.doubt:g}"
         )
-    friction = "joint friction counts as disturbance"
-    if controller.friction is not None:
-        friction = "the joints have the friction that is fed forward, or less; what differs counts as disturbance"
-    return (model, friction, "torques stay inside the effort limits", "continuous time, no delay")
+    wraps = [Assumption.WRAP] if robot is not None and robot.continuous.any() else []
+    others = (Assumption.REFERENCE, Assumption.FRICTION, Assumption.STOPS, Assumption.EFFORT, *wraps, Assumption.TIME)
+    return (model, *(str(assumption) for assumption in others))

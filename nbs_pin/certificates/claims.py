@@ -25,8 +25,10 @@ class Assumption(StrEnum):
     """What bounds assume, in the words that a certificate prints and a monitor names."""
 
     MODEL = "the arm is its model"
-    FRICTION = "joint friction is fed forward or counted as disturbance"
+    FRICTION = "joint friction is what is fed forward, or counted as disturbance"
     DISTURBANCE = "the disturbance is within its bound"
+    REFERENCE = "the reference is twice differentiable"
+    STOPS = "no joint meets its stop"
     EFFORT = "torques stay inside the effort limits"
     TIME = "continuous time, no delay"
     WRAP = "errors of continuous joints stay within ±π"

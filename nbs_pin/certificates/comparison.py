@@ -140,5 +140,7 @@ def _growth(k: Comparison, end: np.ndarray, low: float, high: float) -> np.ndarr
     candidates = np.clip(np.stack([*ends, switch, (a * x0 + k.t) / (2.0 * g), free]), y0, y1)
     x = np.maximum(x0, a * candidates / (2.0 * m))
     values = a * x * candidates - m * x * x - g * candidates**2 + k.t * candidates
+    sizes = a * x * candidates + m * x * x + g * candidates**2 + k.t * candidates
     worst = values.max(axis=0) - 2.0 * k.omega * low
-    return np.where((bend > 0.0) | np.isfinite(y1), worst, np.inf) + 1e-12 * k.t**2
+    rounding = 1e-14 * (sizes.max(axis=0) + 2.0 * k.omega * low) + 1e-12 * k.t**2
+    return np.where((bend > 0.0) | np.isfinite(y1), worst + rounding, np.inf)

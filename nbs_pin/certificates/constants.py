@@ -7,10 +7,9 @@ from typing import cast
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.certificates.claims import Claim, Label, weakest
-from nbs_pin.certificates.inertia import largest_inertia_bound, least_inertia_bound
-from nbs_pin.certificates.model_structure import check_model
-from nbs_pin.certificates.rounding import largest_eigenvalue, least_eigenvalue
+from nbs_pin.certificates.claims import Claim, Group, Label, weakest
+from nbs_pin.certificates.inertia import MULTIPLIERS, largest_inertia_bound, multiplier_bounds
+from nbs_pin.certificates.rounding import least_eigenvalue
 from nbs_pin.certificates.structure import DAMPING, check_structure
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
@@ -53,36 +52,27 @@ def constants_of(law: Controller) -> Constants:
     """
     structure = check_structure(law)
     controller = cast(NeuralBackstepping, law)  # any other law was refused
-    model = check_model(controller.dynamics)
     floor = _floor(controller, structure)
     stiffness, rate = (np.asarray(gain.numpy()) for gain in (controller.potential.stiffness, controller.rate))
     omega, root = float(controller.inertial_rate), np.sqrt(rate)
     rho = least_eigenvalue(2.0 * root[:, None] * stiffness * root)
     delta = least_eigenvalue(root[:, None] * floor * root)
-    inertia = _inertia(controller.dynamics, floor)
+    largest, least = _inertia(controller.dynamics, floor)
     # With ωM in the damping no bound of M is needed, so one that is not proved is not used.
-    used = [line for line in inertia if omega == 0.0 or line.label is Label.PROVED]
-    kappa = next((1.0 / line.value for line in used if line.name.startswith(_LARGEST) and line.value > 0.0), 0.0)
-    least = next((line.value for line in used if line.name.startswith(_LEAST)), 0.0)
-    own = (
-        Claim("δ = λ_min(Λ^½D₀Λ^½)", delta, "", Label.PROVED, "eigenvalue of the gains, rounded down"),
-        Claim("κ = 1/max λ(D₀^-½MD₀^-½)", kappa, "1/s", weakest(*(x.label for x in used)), "from the line above it"),
-    )
+    used = omega == 0.0 or largest.label is Label.PROVED
+    claim = Claim("δ = λ_min(Λ^½D₀Λ^½)", delta, "", Label.PROVED, "eigenvalue of the gains", Group.CONSTANTS)
     return Constants(
         rho=rho,
         delta=delta,
-        kappa=kappa,
-        nu=largest_eigenvalue(floor) / least if least > 0.0 else math.inf,
+        kappa=1.0 / largest.value if used and largest.value > 0.0 else 0.0,
+        nu=1.0 / least.value if used and least.value > 0.0 else math.inf,
         omega=omega,
         largest_rate=float(rate.max()),
         least_floor=least_eigenvalue(floor),
-        metric=_inverse(floor),
-        label=weakest(*(line.label for line in (*structure, *model, *used))),
-        lines=(*structure, *model, *inertia, *own),
+        metric=above_inverse(floor),
+        label=weakest(*(line.label for line in structure), *([largest.label, least.label] if used else [])),
+        lines=(*structure, largest, least, claim),
     )
-
-
-_LARGEST, _LEAST = "max λ(D₀^-½MD₀^-½)", "a₁ ≤ λ_min(M)"
 
 
 def _floor(controller: NeuralBackstepping, structure: tuple[Claim, ...]) -> Float[np.ndarray, "n n"]:
@@ -92,25 +82,22 @@ def _floor(controller: NeuralBackstepping, structure: tuple[Claim, ...]) -> Floa
     return next(line.value for line in structure if line.name == DAMPING) * np.eye(controller.nv)
 
 
-def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tuple[Claim, ...]:
-    """Bounds of the inertia: rigorous for a rigid tree, learned or given, sampled for other models."""
+def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tuple[Claim, Claim]:
+    """1/κ and 1/ν [s]: rigorous for a rigid tree, learned or given, sampled for other models."""
     arm = dynamics.robot if type(dynamics) is PinocchioDynamics else dynamics.packed_tree()
     if arm is not None:
-        largest, least = largest_inertia_bound(arm, floor), least_inertia_bound(arm)
+        largest, least = largest_inertia_bound(arm, floor), multiplier_bounds(arm, floor)[0]
+        label, because = (largest.label, Label.PROVED), (largest.because, MULTIPLIERS)
+        values = (largest.value, least)
     else:
-        largest, least = _sampled(dynamics, floor)
-    named = ((_LARGEST, largest), (_LEAST, least))
-    return tuple(Claim(name, x.value, x.unit, x.label, x.because) for name, x in named)
-
-
-def _sampled(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tuple[Claim, Claim]:
-    mass = dynamics.mass_matrix(configurations(dynamics))
-    root = np.linalg.inv(np.linalg.cholesky(floor))
-    largest = float(np.linalg.eigvalsh(root @ mass @ root.T)[:, -1].max())
-    because = f"the extreme of {_SAMPLES} configurations of the model"
+        mass = dynamics.mass_matrix(configurations(dynamics))
+        root = np.linalg.inv(np.linalg.cholesky(floor))
+        spectra = np.linalg.eigvalsh(root @ mass @ root.T)
+        label, because = (Label.EMPIRICAL,) * 2, (f"the extreme of {_SAMPLES} configurations of the model",) * 2
+        values = (float(spectra[:, -1].max()), float(spectra[:, 0].min()))
     return (
-        Claim(_LARGEST, largest, "s", Label.EMPIRICAL, because),
-        Claim(_LEAST, float(np.linalg.eigvalsh(mass)[:, 0].min()), "kg·m²", Label.EMPIRICAL, because),
+        Claim("1/κ ≥ λ_max(D₀^-½MD₀^-½) in every pose", values[0], "s", label[0], because[0], Group.INERTIA),
+        Claim("1/ν ≤ λ_min(D₀^-½MD₀^-½) in every pose", values[1], "s", label[1], because[1], Group.INERTIA),
     )
 
 
@@ -121,9 +108,11 @@ def configurations(dynamics: DynamicsProvider) -> Float[np.ndarray, "count n"]:
     return np.random.default_rng(0).uniform(-np.pi, np.pi, (_SAMPLES, dynamics.nv))
 
 
-def _inverse(floor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """D₀⁻¹, so much larger that no rounding makes a quadratic form with it too small."""
-    n = len(floor)
-    inverse = np.linalg.inv(floor)
-    slack = 16.0 * n * np.finfo(float).eps * float(np.linalg.cond(floor))
-    return np.asarray(0.5 * (inverse + inverse.T) * (1.0 + slack))
+def above_inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """A⁻¹, so much larger that no rounding makes a quadratic form with it too small; exact for a diagonal A."""
+    diagonal = np.diag(matrix)
+    if np.array_equal(matrix, np.diag(diagonal)):
+        return np.asarray(np.diag((1.0 + 4.0 * np.finfo(float).eps) / diagonal))
+    n, inverse = len(matrix), np.linalg.inv(matrix)
+    slack = 16.0 * n * np.finfo(float).eps * float(np.linalg.cond(matrix)) * float(np.linalg.norm(inverse, 2))
+    return np.asarray(0.5 * (inverse + inverse.T) + slack * np.eye(n))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nbs_pin.certificates.claims import Claim, Condition
+from nbs_pin.certificates.claims import Claim, Condition, Group
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.model_structure import check_fit
 from nbs_pin.mismatch import Mismatch
@@ -36,17 +36,18 @@ def model_error(constants: Constants, mismatch: Mismatch, reference: DesiredMoti
     k = c + float(np.max(a * next(norms) + b * next(norms)))
     d, root = constants.least_floor, math.sqrt(constants.largest_rate)
     alpha, beta, mu = root * (a / constants.rho + b) / math.sqrt(d), b / d, constants.rho / constants.largest_rate
-    fit = check_fit(mismatch)
+    fit, along = check_fit(mismatch), f"over {duration:g} s of the reference"
     lines = (
-        Claim("a", a, "N·m/rad", fit.label, fit.because),
-        Claim("b", b, "N·m·s/rad", fit.label, fit.because),
-        Claim("c", c, "N·m", fit.label, fit.because),
-        Claim("k = max c + a‖q_d‖ + b‖v_d‖", k, "N·m", fit.label, f"over {duration:g} s of the reference"),
+        Claim("a", a, "N·m/rad", fit.label, fit.because, Group.MODEL_ERROR),
+        Claim("b", b, "N·m·s/rad", fit.label, fit.because, Group.MODEL_ERROR),
+        Claim("c", c, "N·m", fit.label, fit.because, Group.MODEL_ERROR),
+        Claim("k = max c + a‖q_d‖ + b‖v_d‖", k, "N·m", fit.label, along, Group.MODEL_ERROR),
     )
     printed = "the paper's sufficient condition, for comparison; it is not what the bounds rest on"
+    needed = b + 0.5 * b * b + 0.5 * a + 1.0
     conditions = (
         Condition("Theorem 4: 1 − β > α²/4", 1.0 - beta, 0.25 * alpha**2, "", fit.label, "docs/certificates.md §5"),
-        Condition("printed: D > b + b²/2 + a/2 + 1", d, b + 0.5 * b * b + 0.5 * a + 1.0, "", fit.label, printed),
-        Condition("printed: α > √a", mu, math.sqrt(a), "", fit.label, printed),
+        Condition("printed: D > b + b²/2 + a/2 + 1", d, needed, "", fit.label, printed, assumed=False),
+        Condition("printed: α > √a", mu, math.sqrt(a), "", fit.label, printed, assumed=False),
     )
     return ModelError(k / math.sqrt(d), alpha, beta, lines, conditions)

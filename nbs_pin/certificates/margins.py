@@ -1,13 +1,17 @@
 """What a certificate in continuous time leaves out: the hold, delay, and limits of the motors."""
 
 import numpy as np
+from jaxtyping import Float
 
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.claims import Claim, Condition, Label
+from nbs_pin.certificates.claims import Claim, Condition, Group, Label
 from nbs_pin.certificates.constants import configurations
+from nbs_pin.certificates.model_structure import check_box
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.equations import inverse_dynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.references import DesiredMotion
+from nbs_pin.robot import Robot
 
 _INSTANTS = 2001
 _RULE = "a rule that told calm from chatter in 52 runs of a panda (docs/theory.md §5), over sampled configurations"
@@ -29,8 +33,8 @@ def sampled_control(
     error_speed = float(np.linalg.eigvals(controller.rate.numpy()[:, None] * curvature).real.max())
     hold, delay = 2.0 / (speed + error_speed), 0.5 * np.pi / speed
     lines = (
-        Claim("longest control period", hold, "s", Label.EMPIRICAL, _RULE),
-        Claim("longest delay", delay, "s", Label.EMPIRICAL, _RULE),
+        Claim("longest control period", hold, "s", Label.EMPIRICAL, _RULE, Group.SAMPLED),
+        Claim("longest delay", delay, "s", Label.EMPIRICAL, _RULE, Group.SAMPLED),
     )
     if period is None:
         return lines, ()
@@ -39,20 +43,42 @@ def sampled_control(
 
 
 def headroom(
-    controller: NeuralBackstepping, admissible: Admissible, reference: DesiredMotion, duration: float
+    robot: Robot, dynamics: DynamicsProvider, admissible: Admissible, reference: DesiredMotion, duration: float
 ) -> tuple[Condition, ...]:
     """Whether every joint's effort limit exceeds what reference and disturbance ask of it together [N·m].
 
     One condition, of the joint with the least left: what feedback asks for beyond that depends on the motion.
     """
-    robot = controller.dynamics.robot
-    if robot is None or not np.isfinite(robot.effort_limit).any():
+    if not np.isfinite(robot.effort_limit).any():
         return ()
     desired = reference(np.linspace(0.0, duration, _INSTANTS))
-    needed = np.abs(inverse_dynamics(controller.dynamics, *desired)).max(axis=0)
+    needed = np.abs(inverse_dynamics(dynamics, *desired)).max(axis=0)
     bound = admissible.box if admissible.box is not None else np.full(robot.nv, admissible.radius)
     total = needed + bound
     worst = int(np.argmin(robot.effort_limit - total))
-    name = f"effort limit of {robot.joint_names[worst]} > reference + disturbance"
-    because = f"torque of the reference over {duration:g} s; a condition that is necessary, not sufficient"
+    name = f"effort limit of {robot.joint_names[worst]} > torque of reference and disturbance"
+    because = f"reference over {duration:g} s; necessary, not sufficient: feedback comes on top"
     return (Condition(name, float(robot.effort_limit[worst]), float(total[worst]), "N·m", Label.EMPIRICAL, because),)
+
+
+def room(
+    robot: Robot, errors: Float[np.ndarray, " n"], reference: DesiredMotion, duration: float
+) -> tuple[Condition, ...]:
+    """Whether the reference with the errors around it stays inside the position limits, for the joint with least room.
+
+    Raises CertificateRefused where the reference alone leaves them: the box is too small for it.
+    """
+    positions = np.asarray(reference(np.linspace(0.0, duration, _INSTANTS)).q)
+    check_box(positions, robot.lower, robot.upper)
+    left = np.minimum(positions - robot.lower, robot.upper - positions).min(axis=0)
+    joint = int(np.argmin(left - errors))
+    if not np.isfinite(left[joint]):
+        return ()
+    name, because = f"room of {robot.joint_names[joint]} to its position limits > |z1_i|", f"over {duration:g} s"
+    sides, unit = (float(left[joint]), float(errors[joint])), units(robot)[joint]
+    return (Condition(name, *sides, unit, Label.EMPIRICAL, because),)
+
+
+def units(robot: Robot | None, nv: int = 0) -> tuple[str, ...]:
+    """What each joint's position is measured in."""
+    return ("rad",) * nv if robot is None else tuple("m" if joint.prismatic else "rad" for joint in robot.joints)

@@ -139,6 +139,25 @@ def check_finite(name: str, part: Any) -> None:
             refuse(f"'{key}' of {name} has {bad} numbers that are not finite", "load the last sound checkpoint")
 
 
+def is_exact(dynamics: DynamicsProvider, robot: Robot | None) -> bool:
+    """Whether a model is the arm: Pinocchio's of it, or a closed form that agrees with that to rounding.
+
+    Where no arm is known a closed form counts as exact: the certificate is then about the arm that it describes.
+    """
+    if type(dynamics) is PinocchioDynamics:
+        return robot is None or dynamics.robot.sha256 == robot.sha256
+    if type(dynamics) is not AnalyticDynamics:
+        return False
+    if robot is None:
+        return True
+    # Both are linear in ten inertial parameters per body, so generic states tell any difference.
+    q, v, v_r, a_r = sample_states(dynamics, 50), *np.random.default_rng(1).standard_normal((3, 50, dynamics.nv))
+    truth = PinocchioDynamics(robot).reference_torque(q[0], v, v_r, a_r)
+    return bool(
+        np.allclose(dynamics.reference_torque(q[0], v, v_r, a_r), truth, rtol=1e-9, atol=1e-9 * np.abs(truth).max())
+    )
+
+
 def sample_states(provider: DynamicsProvider, count: int, seed: int = 0) -> list[Float[np.ndarray, "count n"]]:
     """Seeded q within the arm's limits, a full turn where there are none, and three vectors of order one."""
     rng, n = np.random.default_rng(seed), provider.nv

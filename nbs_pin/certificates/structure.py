@@ -56,7 +56,7 @@ def check_structure(controller: Any, robot: Robot | None = None) -> tuple[Claim,
         refuse(f"no bound follows from this model: {model[1].because}", "take a 'homogenised' or 'cholesky' one")
     potential = _potential_claims(controller)
     gains = (*_damping_claims(controller.damping), *_rate_claims(controller))
-    return (*potential, *gains, *_friction_claims(controller.friction), _law_claim(controller, model[0]))
+    return (*potential, *gains, *_friction_claims(controller.friction), _law_claim(controller, model[0]), *model)
 
 
 def _check_sizes(controller: NeuralBackstepping) -> None:
