@@ -1,5 +1,7 @@
 """Gains from the bound: what is proposed is certified, calm, inside the limits; what cannot be is refused with why."""
 
+import inspect
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,9 @@ from nbs_pin.certificates.design import FAST, PERIODS, STIFF, propose
 from nbs_pin.certificates.margins import sampled_control
 from nbs_pin.exceptions import ArgumentError
 
-WISHES = [("two_link", 0.02, 5.0), ("panda", 0.2, 1.0), ("ur5", 0.05, 5.0)]
+unchecked = inspect.unwrap(propose)
+"""Without the annotations' own checks, as a user has it."""
+WISHES = [("two_link", 0.02, 5.0), ("panda", 0.2, 1.0)]
 
 
 @pytest.fixture(scope="module", params=WISHES, ids=lambda wish: wish[0])
@@ -95,10 +99,30 @@ def test_errors_can_be_wished_for_each_joint_and_disturbances_be_balls():
         (5.0, [0.1, 0.1, 0.1], {}, "one number > 0, or 2"),
         (5.0, 0.01, {"periods": ()}, "no control period"),
         (5.0, 0.01, {"periods": (-1.0,)}, "a period is -1"),
+        (5.0, 0.01, {"periods": 0.001}, "periods is '0.001', expected a list"),
+        (5.0, 0.01, {"periods": "fast"}, "periods is fast, expected numbers"),
+        (5.0, 0.01, {"reference": 3}, "the reference is '3', expected a motion"),
+        (5.0, 0.01, {"reference": nbs.Hold(np.zeros(3))}, "is not a finite motion of the 2 joints"),
+        (5.0, 0.01, {"duration": -1.0}, "duration is -1"),
+        (5.0, 0.01, {"dynamics": 3}, "dynamics is '3', expected a model of the 2 joints"),
         (0.0, 0.01, {}, "asks for no gains"),
     ],
 )
 def test_what_forbids_a_design_is_said(torque, error, options, words):
     robot = nbs.load_robot("two_link")
     with pytest.raises(ArgumentError, match=words):
-        propose(robot, np.full(2, torque), error, **options)
+        unchecked(robot, np.full(2, torque), error, **options)
+
+
+@pytest.mark.parametrize("arm", ["two_link", None, 3])
+def test_a_design_is_for_an_arm(arm):
+    with pytest.raises(ArgumentError, match=r"a design is made for an arm and was given .*load_robot"):
+        unchecked(arm, [1.0, 1.0], 0.1)
+
+
+def test_a_design_is_not_for_a_controller_or_the_model_of_another_arm():
+    robot = nbs.load_robot("two_link")
+    with pytest.raises(ArgumentError, match="was given a NeuralBackstepping; give load_robot"):
+        unchecked(nbs.NeuralBackstepping.for_robot(robot), [1.0, 1.0], 0.1)
+    with pytest.raises(ArgumentError, match="dynamics is a PinocchioDynamics, expected a model of the 2 joints"):
+        propose(robot, [1.0, 1.0], 0.1, dynamics=nbs.PinocchioDynamics(nbs.load_robot("panda")))

@@ -8,12 +8,14 @@ gives the slowest loop of that shape that certifies the wanted error (docs/certi
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.comparison import Comparison, level, reach
+from nbs_pin.certificates.loads import sampled
 from nbs_pin.checks import PerJoint, floats, positive
 from nbs_pin.controllers.gains import Gains, effective_inertia, largest_inertia
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -22,7 +24,6 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.references import DesiredMotion, Sinusoid
 from nbs_pin.robot import Robot
-from nbs_pin.state import Reference
 
 PERIODS = (0.01, 0.005, 0.002, 0.001, 0.0005, 0.00025)
 """Control periods to choose from unless told otherwise, the longest first [s]."""
@@ -82,24 +83,23 @@ def propose(
     disturbance: as in `certify`. error: of ‖z1‖, or one per joint on |z1_i| [rad]. reference: whose torque over
     `duration` [s] the limits must allow as well; None takes `Sinusoid.for_robot`. periods: to choose from [s].
     dynamics: the exact model of the arm; None takes Pinocchio's. seed: of the networks.
-    Raises ArgumentError that says what forbids it: the torque limit of a joint, or the control periods.
+    Raises ArgumentError that says what forbids it, the torque limit of a joint or the control periods, and for
+    arguments that are none.
     """
+    _check_kinds(robot, reference, dynamics)
     admissible = Admissible.of(disturbance, robot.nv)
-    wanted, joints = _wanted(error, robot.nv)
-    for period in periods:
-        positive("a period", period, "s")
-    if not periods:
-        raise ArgumentError("no control period was given to choose from; give at least one [s].")
+    wanted = _wanted(error, robot.nv)
+    choice = _periods(periods)
     arm = _Arm.of(robot, dynamics, admissible, reference, duration)
     _check_limits(robot, arm)
-    candidates = [c for shape in _shapes(arm, wanted) if (c := _scaled(arm, shape, admissible, wanted, joints))]
-    for period in sorted(periods, reverse=True):
+    candidates = [c for shape in _shapes(arm, wanted) if (c := _scaled(shape, admissible, wanted))]
+    for period in choice:
         calm = [c for c in candidates if c.fits(arm, period)]
         light = [c for c in calm if c.share(arm, robot) <= 1.0]
         if light:
             best = min(light, key=lambda c: c.answer(arm, robot))
             return _proposal(robot, arm, best, period, dynamics, seed)
-    raise ArgumentError(_forbidden(robot, arm, candidates, min(periods), admissible))
+    raise ArgumentError(_forbidden(robot, arm, candidates, choice[-1], admissible))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class _Arm:
     ) -> "_Arm":
         model = PinocchioDynamics(robot) if dynamics is None else dynamics
         motion = Sinusoid.for_robot(robot) if reference is None else reference
-        desired = Reference(*motion(np.linspace(0.0, duration, 501)))
+        desired = sampled(robot, motion, duration)
         tau = model.reference_torque(desired.q, desired.v, desired.v, desired.a)
         peak = np.full(robot.nv, admissible.radius) if admissible.box is None else admissible.box
         return cls(
@@ -174,14 +174,14 @@ def _shapes(arm: _Arm, wanted: np.ndarray) -> Iterator[Gains]:
         yield Gains(1.0, stiffness, 2.0 * damping * np.sqrt(stiffness * arm.effective))
 
 
-def _scaled(arm: _Arm, shape: Gains, admissible: Admissible, wanted: np.ndarray, joints: bool) -> "_Candidate | None":
+def _scaled(shape: Gains, admissible: Admissible, wanted: np.ndarray) -> "_Candidate | None":
     """The shape at the least speed that certifies the error; None for no disturbance at all."""
     unit = _potential(shape, admissible)
     errors = np.sqrt(2.0 * unit / shape.stiffness)
     missing = float((errors / wanted).max())
     s = np.sqrt(missing / _SPARE)
     gains = Gains(float(s), s**2 * shape.stiffness, s * shape.damping)
-    return _Candidate(gains, _potential(gains, admissible)) if s > 0.0 else None
+    return _Candidate(gains, unit / s**2) if s > 0.0 else None
 
 
 def _potential(gains: Gains, admissible: Admissible) -> float:
@@ -210,12 +210,45 @@ def _proposal(
     )
 
 
-def _wanted(error: PerJoint, nv: int) -> tuple[np.ndarray, bool]:
-    """The wanted error of every joint [rad], and whether it was given per joint."""
+def _check_kinds(robot: Any, reference: Any, dynamics: Any) -> None:
+    """Raises ArgumentError for what is no arm, no motion, no model, or a model of another number of joints."""
+    if not isinstance(robot, Robot):
+        raise ArgumentError(
+            f"a design is made for an arm and was given {_shown(robot)}; give load_robot(…), or of a controller its "
+            "dynamics.robot."
+        )
+    if reference is not None and not callable(reference):
+        raise ArgumentError(f"the reference is {_shown(reference)}, expected a motion like Sinusoid.for_robot(robot).")
+    if dynamics is not None and not (isinstance(dynamics, DynamicsProvider) and dynamics.nv == robot.nv):
+        raise ArgumentError(
+            f"dynamics is {_shown(dynamics)}, expected a model of the {robot.nv} joints of {robot.name}; leave it out "
+            "for Pinocchio's."
+        )
+
+
+def _shown(value: Any) -> str:
+    """A value in a sentence: itself where it is short, else its kind."""
+    return f"'{value}'" if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+
+
+def _periods(periods: Any) -> list[float]:
+    """The control periods to choose from [s], the longest first."""
+    choice = floats("periods", periods)
+    if choice.ndim != 1:
+        raise ArgumentError(f"periods is {_shown(periods)}, expected a list to choose from: periods=(0.001,) [s].")
+    if not choice.size:
+        raise ArgumentError("no control period was given to choose from; give at least one [s].")
+    for period in choice.tolist():
+        positive("a period", period, "s")
+    return sorted(choice.tolist(), reverse=True)
+
+
+def _wanted(error: PerJoint, nv: int) -> np.ndarray:
+    """The wanted error of every joint [rad]."""
     wanted = floats("the wanted error", error)
     if wanted.shape not in ((), (nv,)) or not (np.isfinite(wanted).all() and (wanted > 0.0).all()):
         raise ArgumentError(f"the wanted error is {error}; give one number > 0, or {nv}, one per joint [rad].")
-    return np.full(nv, wanted), wanted.ndim == 1
+    return np.full(nv, wanted)
 
 
 def _check_limits(robot: Robot, arm: _Arm) -> None:

@@ -1,8 +1,8 @@
 """Loads that the model leaves out, as disturbances: a payload, joint friction, gravity that is not what it seems.
 
 Each is a box |τ_d,i| ≤ b_i along a reference: the greatest torque that the load takes on the reference itself, times a
-margin for what the arm does beside it. That is EMPIRICAL: the margin is a choice. A load whose torque depends on the
-posture alone has a bound everywhere instead, by lever arms, which is PROVED.
+margin for what the arm does beside it. That is EMPIRICAL: the margin is a choice. Wrong gravity, whose torque depends
+on the posture alone, has a bound everywhere as well, by lever arms, which is PROVED.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.claims import Claim, Label, weakest
+from nbs_pin.certificates.claims import Claim, Group, Label, weakest
 from nbs_pin.checks import PerJoint, floats, positive
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.exceptions import ArgumentError
@@ -57,25 +57,10 @@ def payload(
     joint, at = _place(robot, frame, position)
     loaded = robot.model.copy()
     loaded.appendBodyToJoint(joint, pin.Inertia(mass, at, np.zeros((3, 3))), pin.SE3.Identity())
-    desired = _sampled(robot, reference, duration)
+    desired = sampled(robot, reference, duration)
     torques = [np.array(_rnea(loaded, desired)) - np.array(_rnea(robot.model, desired))]
     what = f"a payload of {mass:g} kg at {frame or tool_frame(robot)}"
     return _along(what, np.abs(torques[0]).max(axis=0), margin, duration)
-
-
-def weight(
-    robot: Robot, mass: float, *, frame: str | None = None, position: Float[np.ndarray, "3"] | None = None
-) -> Load:
-    """The torque that a point mass [kg] takes while the arm stands still, in any posture: m ‖g‖ × lever arm. PROVED.
-
-    frame, position: as in `payload`. The torque of its inertia, when it is moved, is not in it.
-    Raises ArgumentError for numbers out of range, a link that does not exist, and a sliding joint without end.
-    """
-    positive("the payload", mass, "kg")
-    joint, at = _place(robot, frame, position)
-    box = mass * float(np.linalg.norm(robot.gravity_vector)) * _levers(robot, joint, at) * _OUTWARD
-    because = "weight × the longest lever arm there is, a sum of link lengths; at rest only: inertia is not in it"
-    return _load(f"weight of a payload of {mass:g} kg", box, Label.PROVED, because)
 
 
 def friction(
@@ -102,7 +87,7 @@ def friction(
         return _load("joint friction", c.copy(), Label.PROVED, "Coulomb friction is never more than its coefficient")
     if reference is None:
         raise ArgumentError("viscous friction grows with speed; give the reference whose speeds count.")
-    peak = np.abs(_sampled(robot, reference, duration).v).max(axis=0)
+    peak = np.abs(sampled(robot, reference, duration).v).max(axis=0)
     return _along("joint friction", b * peak, margin, duration, constant=c)
 
 
@@ -126,7 +111,7 @@ def gravity_error(
     everywhere = error * sum((mass * _levers(robot, j, at) for j, mass, at in bodies), np.zeros(robot.nv)) * _OUTWARD
     if reference is None:
         return _load(what, everywhere, Label.PROVED, "‖Δg‖ × Σ mass × the longest lever arm, a sum of link lengths")
-    desired, columns = _sampled(robot, reference, duration), []
+    desired, columns = sampled(robot, reference, duration), []
     for axis in np.eye(3):
         model = robot.model.copy()
         model.gravity.linear = axis
@@ -188,8 +173,8 @@ def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> Float[np.nd
     return levers
 
 
-def _sampled(robot: Robot, reference: DesiredMotion, duration: float) -> Reference:
-    """The reference at evenly spaced times [s]."""
+def sampled(robot: Robot, reference: DesiredMotion, duration: float) -> Reference:
+    """The reference at evenly spaced times over `duration` [s]; raises ArgumentError for one that does not fit."""
     positive("duration", duration, "s")
     desired = Reference(*(np.asarray(x, dtype=float) for x in reference(np.linspace(0.0, duration, _SAMPLES))))
     if any(x.shape != (_SAMPLES, robot.nv) or not np.isfinite(x).all() for x in desired):
@@ -224,9 +209,8 @@ def _along(
 
 
 def _load(what: str, box: Float[np.ndarray, " n"], label: Label, because: str) -> Load:
-    return Load(
-        Admissible.of(box, len(box)), Claim(f"{what}, the largest |τ_d,i|", float(box.max()), "N·m", label, because)
-    )
+    largest = Claim(f"{what}, the largest |τ_d,i|", float(box.max()), "N·m", label, because, Group.LOADS)
+    return Load(Admissible.of(box, len(box)), largest)
 
 
 def _one_each(name: str, value: PerJoint, nv: int) -> Float[np.ndarray, " n"]:
