@@ -1,6 +1,5 @@
 """A certificate as tables for people."""
 
-import math
 from typing import Any
 
 from rich import box
@@ -8,36 +7,29 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-_BOUNDS = ("rate of decay", "c of V", "V∞", "Φ∞", "V(0) of", "‖z1‖ from")
-_SAMPLED = ("longest control period", "longest delay")
-_BESIDE = ("‖z1‖", "printed ‖z1‖", "|z1| of ")
-"""Bounds in radians, which have a table of their own."""
+_ERRORS = ("rad", "m", "rad, m")
+"""Units of the bounds that are errors, which have a table of their own."""
+_ORDER = ("bounds", "sampled control", "model error", "inertia", "constants", "structure")
+"""Groups of claims, what a reader asks first at the top."""
 
 
 def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Design, constants, conditions, bounds and assumptions; `figures` as `studies.certifying.figures` gives them."""
+    """Errors first, then what they rest on; `figures` as `studies.certifying.figures` gives them."""
     certificate = figures["certificate"]
     console.print(Text(f"{title}: {certificate['disturbance']}", style="bold"), soft_wrap=True)
     if figures["design"] is not None:
         console.print(_design(figures))
-    groups: dict[str, list[dict[str, Any]]] = {"disturbance": figures["loads"], "constants": [], "bounds": [],
-                                               "sampled control": []}  # fmt: skip
-    for line in certificate["lines"]:
-        if not line["name"].startswith(_BESIDE) or line["name"].startswith(_BOUNDS):
-            groups[_group(line["name"])].append(line)
-    for name, lines in groups.items():
+    bounds = [line for line in certificate["lines"] if line["group"] == "bounds" and line["unit"] in _ERRORS]
+    console.print(_errors(bounds, figures))
+    console.print(_conditions(certificate["conditions"]))
+    if figures["loads"]:
+        console.print(_claims("disturbance", figures["loads"]))
+    for name in _ORDER:
+        lines = [line for line in certificate["lines"] if line["group"] == name and line not in bounds]
         if lines:
             console.print(_claims(name, lines))
-    console.print(_conditions(certificate["conditions"]))
-    console.print(_errors(figures))
     for text in _closing(figures):
         console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def _group(name: str) -> str:
-    if name.startswith(_BOUNDS):
-        return "bounds"
-    return "sampled control" if name.startswith(_SAMPLED) else "constants"
 
 
 def _table(title: str, *headings: str) -> Table:
@@ -57,38 +49,41 @@ def _claims(title: str, lines: list[dict[str, Any]]) -> Table:
 
 
 def _conditions(conditions: list[dict[str, Any]]) -> Table:
+    """Each with its reason below it; what the bounds do not rest on cannot fail."""
     table = _table("conditions", "", "left", "right", "holds", "known")
     for line in conditions:
         holds = "yes" if line["holds"] else Text("NO", style="bold red")
-        unit = line["unit"]
-        table.add_row(Text(line["name"]), _number(line["left"]), _with_unit(line["right"], unit), holds, line["label"])
+        name = Text.assemble(line["name"], ("\n" + line["because"], "dim"))
+        table.add_row(name, _number(line["left"]), _with_unit(line["right"], line["unit"]), holds, line["label"])
     return table
 
 
-def _errors(figures: dict[str, Any]) -> Table:
-    """What is certified beside what the paper prints and the worst that was found."""
+def _errors(bounds: list[dict[str, Any]], figures: dict[str, Any]) -> Table:
+    """Every bound of an error, beside the worst that was found of it; the reason below the last it is the reason of."""
     certificate, found = figures["certificate"], figures["attack"]
-    headings = [
-        "certified\n[rad]",
-        "paper prints\n[rad]",
-        *(["worst found\n[rad]", "certified ÷\nworst found"] if found else []),
-    ]
-    table = _table("errors", "", *headings)
-    table.add_row("‖z1‖", *_row(certificate["error_rad"], certificate["printed_error_rad"],
-                                found and found["error_rad"], found is not None))  # fmt: skip
-    rows = zip(figures["joints"], certificate["joint_errors_rad"], strict=True)
-    for k, (joint, bound) in enumerate(rows):
-        worst = found["joint_errors_rad"][k] if found else None
-        table.add_row(Text(f"|z1| of {joint}"), *_row(bound, math.nan, worst, found is not None))
+    worst = {} if found is None else _worst(certificate["joints"], found)
+    searched = [] if found is None else ["worst\nfound", "bound ÷\nfound"]
+    table = _table("errors", "", "bound", *searched, "known")
+    for k, line in enumerate(bounds):
+        ends = k + 1 == len(bounds) or bounds[k + 1]["because"] != line["because"]
+        name = Text.assemble(line["name"], ("\n" + line["because"] if ends else "", "dim"))
+        beside = [] if found is None else _beside(line["value"], worst.get(line["name"]))
+        table.add_row(name, _with_unit(line["value"], line["unit"]), *beside, line["label"])
     return table
 
 
-def _row(bound: float | None, printed: float | None, worst: float | None, attacked: bool) -> list[str]:
-    cells = [_number(bound), "" if printed is not None and math.isnan(printed) else _number(printed)]
-    if attacked:
-        ratio = f"{bound / worst:.2f}" if bound is not None and worst else ""
-        cells += [_number(worst), ratio]
-    return cells
+def _worst(joints: list[str], found: dict[str, Any]) -> dict[str, float]:
+    """The worst found of each error, by the name of its bound."""
+    of_joints = zip(joints, found["joint_errors_rad"], strict=True)
+    return {"‖z1‖": found["error_rad"]} | {f"|z1| of {joint}": error for joint, error in of_joints}
+
+
+def _beside(bound: float | None, worst: float | None) -> list[Text]:
+    """What was found, and how much larger the bound is; red where it is smaller."""
+    if worst is None or bound is None:
+        return [Text(""), Text("")]
+    ratio = f"{bound / worst:.2f}" if worst > 0.0 else ""
+    return [Text(_number(worst)), Text(ratio, style="bold red" if worst > bound else "")]
 
 
 def _design(figures: dict[str, Any]) -> Table:
@@ -99,24 +94,35 @@ def _design(figures: dict[str, Any]) -> Table:
     )
     table = _table(title, "joint", "K\n[N·m/rad]", "Λ\n[rad/s per N·m]", "D₀\n[N·m·s/rad]", "torque\n[N·m]")
     columns = ("stiffness_Nm_per_rad", "rate_rad_per_s_per_Nm", "damping_Nms_per_rad", "torque_Nm")
-    for joint, *values in zip(figures["joints"], *(design[name] for name in columns), strict=True):
+    for joint, *values in zip(figures["certificate"]["joints"], *(design[name] for name in columns), strict=True):
         table.add_row(Text(joint), *(_number(value) for value in values))
     return table
 
 
 def _closing(figures: dict[str, Any]) -> list[str]:
     certificate, found, watched = figures["certificate"], figures["attack"], figures["monitor"]
-    label = certificate["label"]
-    lines = [f"{label}, assuming: {'; '.join(certificate['assumptions'])}"]
-    if figures["loads"]:
-        lines.append(f"the bound on the disturbance itself is {figures['disturbance_label']}")
+    lines = []
     if found is not None:
         how = f"{found['found_by']}, {found['duration_s']:.3g} s at {1e3 * found['period_s']:g} ms"
         search = how if found["thorough"] else f"{how}; waves alone, --attack searches further"
         lines.append(f"worst found by {search}")
+        if found["exceeds"]:
+            lines.append(f"WORSE THAN ITS BOUND; that motion held against the certificate: {found['verdict']}")
+    if figures["attack_diverged"] is not None:
+        lines.append(f"no worst motion to hold beside the bounds: {figures['attack_diverged']}")
     if watched is not None:
         lines.append(f"the run: {watched['verdict']}")
-    return lines
+    if figures["loads"]:
+        lines.append(f"the bound on the disturbance itself is {figures['disturbance_label']}")
+    return [*lines, standing(certificate)]
+
+
+def standing(certificate: dict[str, Any]) -> str:
+    """How the bounds are known and what they assume; or which conditions fail, so that they are not promised."""
+    if certificate["void"]:
+        failed = "; ".join(certificate["void"])
+        return f"{certificate['label']}: the bounds are not promised, as this does not hold here: {failed}"
+    return f"{certificate['label']}, assuming: {'; '.join(certificate['assumptions'])}"
 
 
 def _with_unit(value: float | None, unit: str) -> str:

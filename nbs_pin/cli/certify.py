@@ -84,7 +84,7 @@ class Certify:
         float | None, number("--gravity-error", above=0.0, most=100.0, unit="m/s²"), default("none")
     ] = None
     """How far gravity may differ from the model's, as a vector [m/s²]; a base tilted by α: 2·9.81·sin(α/2)."""
-    margin: Annotated[float, number("--margin", least=1.0, most=100.0, unit="")] = 1.5
+    margin: Annotated[float | None, number("--margin", least=1.0, most=100.0, unit=""), default("1.5")] = None
     """What the torques of payload, friction and gravity on the reference are multiplied with."""
     reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
     """sinusoid (fitted to the arm), paper, or a .csv or .npz file; the loads count along it."""
@@ -102,7 +102,7 @@ class Certify:
     """Design a controller for the arm that certifies this ‖z1‖, or one |z1_i| for each joint, split by commas [rad]."""
     against: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the model's own arm")] = None
     """The true arm; a model that is not exact is judged on closed loops with it (Theorem 4)."""
-    trajectories: Annotated[int, integer("--trajectories", least=1, most=100_000)] = 374
+    trajectories: Annotated[int | None, integer("--trajectories", least=1, most=100_000), default("374")] = None
     """Closed loops that such a model is judged on; 374 make the bound on its error hold for 95 % of further ones."""
     attack: bool = False
     """Search the worst disturbance by gradients through the closed loop, and not by waves alone."""
@@ -157,16 +157,22 @@ class Certify:
 
     def _task(self, controller: Any) -> Any:
         """Where and against what to certify; raises OptionError for options that do not fit each other."""
+        from nbs_pin.certificates.loads import MARGIN
+        from nbs_pin.certificates.model_structure import is_exact
         from nbs_pin.robot import load_robot
-        from nbs_pin.studies.certifying import Task, arm_of, box_or_ball
+        from nbs_pin.studies.certifying import TRAJECTORIES, Task, arm_of, box_or_ball
         from nbs_pin.studies.motions import motion_of
 
-        if self.norm and self.disturbance is None:
-            raise OptionError("--norm is about --disturbance; give that too.")
+        self._check_options()
         period = self.period or 0.001
         truth = None if self.against is None else load_robot(self.against)
         blank = Task(reference=_no_motion, truth=truth)
         robot = arm_of(controller, blank)
+        if self.trajectories is not None and is_exact(controller.dynamics, robot):
+            raise OptionError(
+                f"--trajectories is about a model that is not exact, and this one is that of {robot.name} itself; "
+                "leave it out, or give the true arm with --against."
+            )
         motion, duration = motion_of(self.reference, robot, frequency=self.frequency, period=period)
         coefficients = None if self.friction in (None, "urdf") else plain_numbers(str(self.friction)) or []
         numbers = None if self.disturbance is None else plain_numbers(self.disturbance) or []
@@ -180,11 +186,21 @@ class Certify:
             link=self.link,
             friction=self.friction if coefficients is None else (coefficients[0], coefficients[1]),
             gravity_error=self.gravity_error,
-            margin=self.margin,
+            margin=MARGIN if self.margin is None else self.margin,
             start_error=self.start_error,
-            trajectories=self.trajectories,
+            trajectories=self.trajectories or TRAJECTORIES,
             seed=self.seed,
         )
+
+    def _check_options(self) -> None:
+        """Raises OptionError for options about others that were not given."""
+        loads = {"--payload": self.payload, "--friction": self.friction, "--gravity-error": self.gravity_error}
+        if self.norm and self.disturbance is None:
+            raise OptionError("--norm is about --disturbance; give that too.")
+        if self.link is not None and self.payload is None:
+            raise OptionError("--link is about --payload; give that too.")
+        if self.margin is not None and all(load is None for load in loads.values()):
+            raise OptionError(f"--margin is about {', '.join(loads)}; give one of them too.")
 
     def _settings(self, robot: str) -> dict[str, Any]:
         """Everything that decides the figures, as JSON can store it."""

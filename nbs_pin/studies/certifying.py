@@ -1,7 +1,7 @@
 """One law certified, attacked and watched: the study behind `nbs-pin certify`."""
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +12,15 @@ from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.adversary import Attack, attack, random_disturbances
 from nbs_pin.certificates.arena import motions_of
 from nbs_pin.certificates.certificate import Certificate, certify
-from nbs_pin.certificates.claims import Condition, Label, weakest
 from nbs_pin.certificates.design import PERIODS, Proposal, propose
 from nbs_pin.certificates.loads import MARGIN, Load, friction, gravity_error, label_of, payload, total
-from nbs_pin.certificates.model_structure import check_box
+from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.certificates.monitor import Monitored, monitor
-from nbs_pin.certificates.structure import check_structure
 from nbs_pin.checkpoints import load, save
 from nbs_pin.checks import PerJoint
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
-from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
+from nbs_pin.exceptions import ArgumentError, CertificateRefused, SimulationDiverged
 from nbs_pin.files import write_whole
 from nbs_pin.mismatch import Mismatch, mismatch
 from nbs_pin.plants.dynamics_plant import DynamicsPlant
@@ -41,7 +37,6 @@ MONITOR, DESIGNED = "monitor.png", "controller.nbs"
 """What it writes beside them when a run was watched or a law designed."""
 TRAJECTORIES = 374
 """Closed-loop motions that a learned model is judged on (`mismatch.py`)."""
-_INSTANTS = 2001
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +47,15 @@ class Certified:
     loads: tuple[Load, ...]
     """What of the disturbance was worked out."""
     attack: Attack | None
-    """The worst motion found; None where nothing disturbs."""
+    """The worst motion found; None where nothing disturbs or no motion stayed finite."""
     thorough: bool
     """Whether the adversary climbed, or only waves were tried."""
+    diverged: str = ""
+    """Why no motion was found, where one left the finite numbers."""
+    beaten: Monitored | None = None
+    """The worst motion held against the certificate, where it or another one exceeded a bound."""
     watched: Monitored | None = None
+    """The run that was given, held against it."""
     proposal: Proposal | None = None
 
 
@@ -87,8 +87,6 @@ class Task:
     trajectories: int = TRAJECTORIES
     """Closed-loop motions that a model that is not exact is judged on."""
     seed: int = 0
-    extras: dict[str, Any] = field(default_factory=dict)
-    """Arguments of `attack` beside the usual."""
 
     def loads(self, robot: Robot) -> tuple[Load, ...]:
         """The loads worked out for the arm; raises ArgumentError for numbers that do not fit it."""
@@ -104,23 +102,24 @@ class Task:
         return tuple(found)
 
 
-def controller_of(text: str, *, bandwidth: float = 8.0, period: float = 0.001, seed: int = 0) -> Any:
+def controller_of(text: str, *, bandwidth: float = 8.0, period: float = 0.001, seed: int = 0) -> NeuralBackstepping:
     """The controller that a .nbs file holds, or the one that `NeuralBackstepping.for_robot` makes for an arm.
 
-    Raises ArgumentError for a file without a controller, CertificateRefused for one of which nothing can be promised;
-    errors of `load` and `load_robot` else.
+    Raises CertificateRefused for a file with anything but an NBS law, errors of `load` and `load_robot` else.
     """
     if not text.endswith(".nbs"):
         return NeuralBackstepping.for_robot(load_robot(text), bandwidth=bandwidth, period=period, seed=seed)
     stored = load(text)
-    if isinstance(stored, DynamicsProvider):
-        raise ArgumentError(f"{text} holds a model; a certificate is about a controller: save one that believes in it.")
-    check_structure(stored)
+    if not isinstance(stored, NeuralBackstepping):
+        raise CertificateRefused(
+            f"{text} holds a {type(stored).__name__}, of which no Lyapunov function is known here; give a file with an "
+            "NBS law."
+        )
     return stored
 
 
 def certify_controller(
-    controller: Any,
+    controller: NeuralBackstepping,
     task: Task,
     *,
     thorough: bool = False,
@@ -132,13 +131,10 @@ def certify_controller(
 
     Raises CertificateRefused for a controller of which nothing can be promised, ArgumentError for what does not fit.
     """
-    check_structure(controller)
     robot = arm_of(controller, task)
-    if run is not None and run.robot_sha256 not in ("", robot.sha256):
-        raise ArgumentError(f"the run is of the arm '{run.robot}', not of {robot.name}; give one of that arm.")
     loads, admissible = disturbance_of(robot, task)
     error, start = None, None
-    if not _is_exact(controller.dynamics, robot):
+    if not is_exact(controller.dynamics, robot):
         error = model_error(controller, robot, task, admissible, progress)
     if task.start_error:
         start = task.reference(np.zeros(1)).q[0] + task.start_error * (-1.0) ** np.arange(robot.nv)
@@ -151,11 +147,19 @@ def certify_controller(
             q0=start,
             mismatch=error,
             period=task.period,
+            robot=robot,
         )
-    certificate = replace(certificate, conditions=(*certificate.conditions, *_room(certificate, robot, task)))
-    found = None if admissible.is_zero else _attacked(controller, robot, task, admissible, thorough, progress)
-    watched = None if run is None else monitor(run, controller, certificate, mismatch=error)
-    return Certified(certificate, loads, found, thorough, watched, proposal)
+    watched = None if run is None else monitor(run, certificate)
+    found, diverged = _attacked(certificate, task, thorough, progress)
+    beaten = None
+    if found is not None and exceeds(found, certificate):
+        beaten = monitor(found.run, certificate)
+    return Certified(certificate, loads, found, thorough, diverged, beaten, watched, proposal)
+
+
+def exceeds(found: Attack, certificate: Certificate) -> bool:
+    """Whether the worst found is beyond a bound, of ‖z1‖ or of a joint."""
+    return found.error > certificate.error or bool((found.joint_errors > certificate.joint_errors).any())
 
 
 def design(robot: Robot, task: Task, error: PerJoint, *, period: float | None = None) -> Proposal:
@@ -173,7 +177,7 @@ def design(robot: Robot, task: Task, error: PerJoint, *, period: float | None = 
     )
 
 
-def arm_of(controller: Any, task: Task) -> Robot:
+def arm_of(controller: NeuralBackstepping, task: Task) -> Robot:
     """The true arm; raises ArgumentError where none is known or its joints are of another number."""
     robot = controller.dynamics.robot if task.truth is None else task.truth
     if robot is None:
@@ -222,61 +226,44 @@ def model_error(
     return mismatch(controller.dynamics, truth, run, friction=controller.friction)
 
 
-def _attacked(
-    controller: NeuralBackstepping, robot: Robot, task: Task, admissible: Admissible, thorough: bool, progress: bool
-) -> Attack:
-    """The worst motion: along the reference, and where nothing depends on it in other postures too."""
-    exact = _is_exact(controller.dynamics, robot)
+def _attacked(certificate: Certificate, task: Task, thorough: bool, progress: bool) -> tuple[Attack | None, str]:
+    """The worst motion, or why there is none.
+
+    Along the reference, and in other postures too where the disturbance does not depend on it.
+    """
+    if certificate.admissible.is_zero or certificate.robot is None:
+        return None, ""
+    controller, robot = certificate.controller, certificate.robot
+    exact = is_exact(controller.dynamics, robot)
     free = thorough and exact and task.payload is None and task.friction is None and task.gravity_error is None
     others = motions_of(controller.dynamics, None, task.seed)[1:] if free else []
-    waves = {} if thorough else {"rounds": 0, "starts": 1}
-    return attack(
-        controller,
-        admissible,
-        reference=[task.reference, *others],
-        plant_dynamics=None if exact else PinocchioDynamics(robot),
-        period=task.period,
-        seed=task.seed,
-        progress=progress,
-        **(waves | task.extras),
-    )
-
-
-def _room(certificate: Certificate, robot: Robot, task: Task) -> tuple[Condition, ...]:
-    """Whether the reference with the error around it stays inside the position limits, for the joint with least room.
-
-    Raises CertificateRefused where the reference alone leaves them.
-    """
-    positions = np.asarray(task.reference(np.linspace(0.0, task.duration, _INSTANTS)).q)
-    check_box(positions, robot.lower, robot.upper)
-    room = np.minimum(positions - robot.lower, robot.upper - positions).min(axis=0)
-    joint = int(np.argmin(room - certificate.joint_errors))
-    if not np.isfinite(room[joint]):
-        return ()
-    name = f"position limits of {robot.joint_names[joint]} − reference > |z1_i|"
-    because = f"reference over {task.duration:g} s"
-    sides = float(room[joint]), float(certificate.joint_errors[joint])
-    return (Condition(name, *sides, "rad", weakest(certificate.label, Label.EMPIRICAL), because),)
-
-
-def _is_exact(dynamics: DynamicsProvider, robot: Robot) -> bool:
-    """Whether the model is Pinocchio's of that very arm, or the closed form of it."""
-    known = dynamics.robot
-    same = known is None or known.sha256 == robot.sha256
-    return type(dynamics) in (PinocchioDynamics, AnalyticDynamics) and same
+    waves: dict[str, Any] = {} if thorough else {"rounds": 0, "starts": 1}
+    try:
+        found = attack(
+            controller,
+            certificate.admissible,
+            reference=[task.reference, *others],
+            plant_dynamics=None if exact else PinocchioDynamics(robot),
+            period=task.period,
+            seed=task.seed,
+            progress=progress,
+            **waves,
+        )
+    except SimulationDiverged as error:
+        return None, str(error)
+    return found, ""
 
 
 def figures(result: Certified) -> dict[str, Any]:
     """Everything found, units in the keys, as JSON can store it; None for what is not finite."""
     certificate, found, proposal = result.certificate, result.attack, result.proposal
-    robot = certificate.controller.dynamics.robot
     numbers: dict[str, Any] = {
-        "joints": list(_names(certificate)),
-        "arm": None if robot is None else robot.name,
+        "arm": None if certificate.robot is None else certificate.robot.name,
         "certificate": certificate.summary(),
         "loads": [load.claim.plain() | {"box_Nm": load.admissible.box} for load in result.loads],
         "disturbance_label": str(label_of(*result.loads)),
         "attack": None,
+        "attack_diverged": result.diverged or None,
         "monitor": None,
         "design": None,
     }
@@ -285,6 +272,8 @@ def figures(result: Certified) -> dict[str, Any]:
             "error_rad": found.error,
             "joint_errors_rad": found.joint_errors,
             "certified_over_found": certificate.error / found.error if found.error > 0.0 else None,
+            "exceeds": result.beaten is not None,
+            "verdict": None if result.beaten is None else result.beaten.verdict,
             "found_by": found.found_by,
             "thorough": result.thorough,
             "duration_s": found.duration,
@@ -299,7 +288,7 @@ def figures(result: Certified) -> dict[str, Any]:
             "broken": watched.broken,
             "largest_share": float((watched.storage / watched.promise).max()) if watched.promise.all() else None,
             "largest_error_rad": float(watched.error.max()),
-            "error_bound_rad": watched.error_bound,
+            "largest_error_bound_rad": float(watched.error_bound.max()),
         }
     if proposal is not None:
         numbers["design"] = {
@@ -338,11 +327,6 @@ def write_results(result: Certified, folder: Path, facts: dict[str, Any]) -> tup
     text = json.dumps(facts | {"figures": found}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     written.append(write_whole(folder / FILES[2], text.encode()))
     return found, written
-
-
-def _names(certificate: Certificate) -> tuple[str, ...]:
-    robot = certificate.controller.dynamics.robot
-    return tuple(f"joint {i + 1}" for i in range(certificate.controller.nv)) if robot is None else robot.joint_names
 
 
 def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
