@@ -7,6 +7,7 @@ lower bound of the worst error, never an upper one.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from numbers import Integral
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,8 +15,8 @@ from jaxtyping import Bool, Float, Int
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.arena import Arena, Peaks
 from nbs_pin.certificates.torque_waves import FASTEST, SLOWEST, constant, in_step, random_disturbances, square
-from nbs_pin.checks import PerJoint
-from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.checks import PerJoint, floats
+from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.exceptions import ArgumentError
 from nbs_pin.progress import tracked
@@ -48,7 +49,7 @@ class Attack:
 
 
 def attack(
-    controller: ModelLaw,
+    controller: Controller,
     disturbance: PerJoint | Admissible,
     *,
     reference: DesiredMotion | Sequence[DesiredMotion] | None = None,
@@ -75,12 +76,13 @@ def attack(
     periods. period: control period [s]. rounds: of ascent. starts: disturbances that climb, beside one per joint.
     effort_limit: [N·m], none, as certificates assume. progress: show a progress bar on a terminal.
 
-    Raises ArgumentError for arguments that do not fit, SimulationDiverged when a motion leaves the finite numbers.
+    Raises ArgumentError for arguments that do not fit, and for a law without a model, as gradients go through one;
+    SimulationDiverged when a motion leaves the finite numbers.
     """
-    if rounds < 0 or starts < 1:
-        raise ArgumentError(f"rounds is {rounds} and starts {starts}, expected rounds ≥ 0 and starts ≥ 1.")
-    admissible, rng = Admissible.of(disturbance, controller.nv), np.random.default_rng(seed)
+    for name, value, least in (("rounds", rounds, 0), ("starts", starts, 1), ("seed", seed, 0)):
+        _check_count(name, value, least)
     arena = Arena.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
+    admissible, rng = Admissible.of(disturbance, controller.nv), np.random.default_rng(seed)
     names, motion, waves = _waves(arena, admissible, rng)
     peaks = arena.peaks(motion, waves, progress)
     pack = _Pack.of(motion, waves, peaks, starts)
@@ -104,7 +106,7 @@ def attack(
 
 
 def worst_of(
-    controller: ModelLaw,
+    controller: Controller,
     disturbances: Float[np.ndarray, "count steps n"],
     reference: DesiredMotion | Sequence[DesiredMotion] | None = None,
     *,
@@ -116,15 +118,24 @@ def worst_of(
 ) -> Peaks:
     """Largest errors under each of the disturbances [N·m], held over each period; several motions take turns.
 
-    Arguments as in `attack`, errors too. Raises ArgumentError for disturbances of another number of joints.
+    Arguments as in `attack`, errors too. Raises ArgumentError for disturbances of another shape or not finite.
     """
-    if disturbances.shape[-1] != controller.nv or 0 in disturbances.shape:
+    _check_count("seed", seed, 0)
+    disturbances = floats("disturbances", disturbances)
+    if disturbances.ndim != 3 or disturbances.shape[-1] != controller.nv or 0 in disturbances.shape:
         raise ArgumentError(
             f"the disturbances have shape {disturbances.shape}, expected (count, steps, {controller.nv}); correct them."
         )
+    if not np.isfinite(disturbances).all():
+        raise ArgumentError("the disturbances hold numbers that are not finite; correct them.")
     duration = disturbances.shape[1] * period
     arena = Arena.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
     return arena.peaks(np.arange(len(disturbances)) % len(arena.scenes), disturbances, progress)
+
+
+def _check_count(name: str, value: int, least: int) -> None:
+    if not isinstance(value, Integral) or value < least:
+        raise ArgumentError(f"{name} is {value!s:.80}, expected a whole number ≥ {least}; correct it.")
 
 
 def _waves(

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 
 from nbs_pin.checks import PerJoint, positive
+from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -20,7 +21,7 @@ from nbs_pin.plants.dynamics_plant import DynamicsPlant
 from nbs_pin.progress import tracked
 from nbs_pin.references import DesiredMotion, Hold, Sinusoid
 from nbs_pin.robot import configuration_difference
-from nbs_pin.state import Run
+from nbs_pin.state import Reference, Run
 
 POSTURES = 7
 """Postures held still, beside the arm's own motion, where no reference is given."""
@@ -51,7 +52,7 @@ class Arena:
     @classmethod
     def of(
         cls,
-        controller: ModelLaw,
+        controller: Controller,
         reference: DesiredMotion | Sequence[DesiredMotion] | None,
         plant_dynamics: DynamicsProvider | None,
         duration: float | None,
@@ -60,6 +61,11 @@ class Arena:
         seed: int,
     ) -> "Arena":
         """The loop with the arguments of `attack`; raises ArgumentError when they do not fit."""
+        if not isinstance(controller, ModelLaw):
+            raise ArgumentError(
+                f"a {type(controller).__name__} is no law with a model, which gradients of a motion go through; give a "
+                "NeuralBackstepping, ComputedTorque or SlotineLi, and of a compiled law what it was compiled from."
+            )
         positive("period", period, "s")
         truth = controller.dynamics if plant_dynamics is None else plant_dynamics
         followed = motions_of(controller.dynamics, reference, seed)
@@ -138,18 +144,28 @@ def motions_of(
 ) -> list[DesiredMotion]:
     """The motions given, or without any, the arm's own (`Sinusoid.for_robot`) and postures held still.
 
-    Raises ArgumentError for an empty list.
+    Raises ArgumentError for an empty list, and for what is no motion.
     """
-    if isinstance(reference, Sequence):
-        if not reference:
-            raise ArgumentError("reference is an empty list, expected at least one motion; leave it out for the arm's.")
-        return list(reference)
     if reference is not None:
-        return [reference]
+        followed = list(reference) if isinstance(reference, Sequence) else [reference]
+        if not followed:
+            raise ArgumentError("reference is an empty list, expected at least one motion; leave it out for the arm's.")
+        for motion in followed:
+            _check_motion(motion)
+        return followed
     rng, robot, n = np.random.default_rng(seed), dynamics.robot, dynamics.nv
     low, high = (np.full(n, -np.pi), np.full(n, np.pi)) if robot is None else robot.sampling_range
     own: list[DesiredMotion] = [Hold(np.zeros(n)) if robot is None else Sinusoid.for_robot(robot, 1.0)]
     return own + [Hold(rng.uniform(low, high)) for _ in range(POSTURES)]
+
+
+def _check_motion(motion: Any) -> None:
+    sampled = motion(np.zeros(1)) if callable(motion) else None
+    if not isinstance(sampled, tuple) or len(sampled) != len(Reference._fields):
+        raise ArgumentError(
+            f"the reference {motion!s:.80} is no motion, expected a function of time that gives a Reference (q, v, a); "
+            "take Hold, Sinusoid or one from a file."
+        )
 
 
 def slowest_rate(controller: ModelLaw, reference: DesiredMotion) -> float:

@@ -1,46 +1,112 @@
-"""What a certificate assumes, and how a motion shows that it did not hold.
+"""What a certificate promises and assumes, and how a motion shows that it did not hold.
 
 Whatever the cause, a promise can only be broken by torques that are not admissible: with V̇ ≤ −c(V − V∞) for admissible
 ones, V exceeds what was promised by at most the energy that the rest of the torque has brought, less what has decayed.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.certificate import Certificate
+from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Balance, Instants, beyond
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
-from nbs_pin.mismatch import Mismatch
+from nbs_pin.exceptions import ArgumentError
 
-SATURATION = "no saturation"
-DISTURBANCE = "disturbance within its bound"
-MODEL = "exact model"
-UNEXPLAINED = "disturbance and model error within the bound"
-SAMPLING = "continuous time"
-WRAP = "no error beyond ±π on a continuous joint"
-ASSUMPTIONS = (SATURATION, DISTURBANCE, MODEL, UNEXPLAINED, SAMPLING, WRAP)
-"""Names of the assumptions that a monitor can see fail; UNEXPLAINED where no disturbance is on record."""
 WRONG = "the certificate is wrong"
-"""What is said when none of them accounts for what happened."""
-EPS = float(np.finfo(float).eps)
+"""What is said when none of the assumptions accounts for what happened."""
 ROUNDING, DIFFERENCES = 1e-9, 1e-3
 """Shares of a promise: the error of V itself, and of energies summed over periods."""
+NOTICEABLE = 0.01
+"""Share of what V may be that a held torque may bring before it is reported."""
+_EPS = float(np.finfo(float).eps)
 _OF_BOUND, _OF_TORQUE = 1e-2, 1e-3  # torques below these shares are not told from the error of differences
 
 
-def sentence(at: str, is_kept: bool, is_wrong: bool, broken: Sequence[str]) -> str:
-    """The verdict; at: when the promise was broken. broken: the assumptions that failed."""
-    named = ", ".join(broken)
+def check_certificate(certificate: Any) -> None:
+    """Raises ArgumentError unless it is a certificate."""
+    if not isinstance(certificate, Certificate):
+        raise ArgumentError(f"a {type(certificate).__name__} promises nothing; give the certificate that certify made.")
+
+
+def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption, str], *, is_recorded: bool) -> str:
+    """The verdict; at: what broke the promise and when. failed: the assumptions that failed, and when.
+
+    is_recorded: whether disturbance and model can be told apart.
+    """
+    said = {name: name + when for name, when in failed.items()}
+    if not is_recorded and Assumption.MODEL in said and Assumption.DISTURBANCE in said:
+        said[Assumption.MODEL] = f"{Assumption.MODEL}, or {said.pop(Assumption.DISTURBANCE)}"
+    named = "; ".join(said.values())
     if is_kept:
-        return "promise kept" + (f", though an assumption failed: {named}" if named else "")
+        return "promise kept" + (f", though this failed: {named}" if named else "")
     if not is_wrong:
-        return f"promise broken{at}; what failed of its assumptions: {named}"
-    why = f"{named} failed and does not account for it" if named else "none of its assumptions failed"
+        return f"promise broken{at}; of its assumptions this failed: {named}"
+    why = f"this failed and does not account for it: {named}" if named else "none of its assumptions failed"
     return f"promise broken{at}, {why}: {WRONG}"
+
+
+class Promise(NamedTuple):
+    """What a certificate promises of V, ‖z1‖ and each |z1_i|, the quantities (2 + n), from a start."""
+
+    certificate: Certificate
+    initial: float
+    """V(0) [J]."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the quantities."""
+        return ("V", "‖z1‖", *(f"|z1| of {name}" for name in self.certificate.joint_names))
+
+    def bounds(self, t: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "rows quantities"]:
+        """What they were not to exceed, t [s] after the start [J, rad].
+
+        Bounds of z1 go with √Φ, and Φ ≤ V ≤ its promise: from V(0) > V∞ they fall as the root of that promise does.
+        """
+        storage, first = self.certificate.storage_bound(t, self.initial), self._largest
+        fallen = np.sqrt(storage / first) if first > 0.0 else np.ones(len(t))
+        size, joints = self.certificate.from_start(self.initial)
+        return np.column_stack([storage, np.outer(fallen, [size, *joints])])
+
+    def exceeded(
+        self, values: Float[np.ndarray, "rows quantities"], bounds: Float[np.ndarray, "rows quantities"]
+    ) -> Bool[np.ndarray, "rows quantities"]:
+        """Where a bound is broken by more than rounding."""
+        return np.asarray(values > bounds * (1.0 + ROUNDING) + _EPS * (1.0 + self.initial))
+
+    def accounted(
+        self,
+        bounds: Float[np.ndarray, "rows quantities"],
+        energy: Float[np.ndarray, " rows"],
+        ratio: Float[np.ndarray, " rows"],
+    ) -> Float[np.ndarray, "rows quantities"]:
+        """What they can be at most when torques beyond the admissible ones brought that energy [J].
+
+        ratio: how many times the bound torques have been so far, ≥ 1 and inf where that says nothing. Bounds are
+        proportional to the disturbance, so those of z1 grow no more than `ratio` times; nor do they pass the root of V.
+        """
+        storage, top = bounds[:, 0] * (1.0 + DIFFERENCES) + energy, self._largest or 1.0
+        size, joints = self.certificate.from_start(top)
+        from_storage = np.outer(np.sqrt(storage / top), [size, *joints])
+        scaled = np.full_like(from_storage, np.inf)
+        np.multiply(ratio[:, None], bounds[:, 1:], out=scaled, where=np.isfinite(ratio)[:, None])
+        return np.column_stack([storage, np.minimum(from_storage, scaled) * (1.0 + DIFFERENCES)])
+
+    @property
+    def _largest(self) -> float:
+        """What V never exceeds [J]."""
+        return max(self.initial, self.certificate.storage)
+
+
+def quantities(
+    storage: Float[np.ndarray, " rows"], z1: Float[np.ndarray, "rows n"]
+) -> Float[np.ndarray, "rows quantities"]:
+    """V [J], ‖z1‖ and each |z1_i| [rad]."""
+    return np.column_stack([storage, np.linalg.norm(z1, axis=-1), np.abs(z1)])
 
 
 class Setting(NamedTuple):
@@ -53,9 +119,9 @@ class Setting(NamedTuple):
     """Torques below this are not told from the error of differences over a period [N·m]."""
 
     @classmethod
-    def of(cls, certificate: Certificate, mismatch: Mismatch | None, flow: Balance, at: Instants) -> "Setting":
+    def of(cls, certificate: Certificate, flow: Balance, at: Instants) -> "Setting":
         """Of the periods between those instants."""
-        admissible, step = certificate.admissible, np.diff(at.t)
+        admissible, mismatch, step = certificate.admissible, certificate.mismatch, np.diff(at.t)
         size = float(np.linalg.norm(admissible.box)) if admissible.box is not None else admissible.radius or 0.0
         q, v = flow.state_norms[:, 0], flow.state_norms[:, 1]
         speed = np.linalg.norm(at.v, axis=-1)
@@ -73,61 +139,74 @@ def failures(
     flow: Balance,
     setting: Setting,
     wrapped: Bool[np.ndarray, " periods"],
+    held: Bool[np.ndarray, " periods"],
+    is_broken: bool,
     recorded: Float[np.ndarray, "rows n"] | None,
-) -> dict[str, Bool[np.ndarray, " periods"]]:
-    """The assumptions that failed by more than can be told from the error of differences, and when."""
+) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
+    """The assumptions that failed by more than can be told from the error of differences, and when.
+
+    held: when what the held torque has brought is worth reporting; where a promise `is_broken`, any of it is.
+    recorded: the disturbance [N·m]; where it is None or zero, model and disturbance cannot be told apart, and what is
+    unexplained is said of both.
+    """
     told, admissible = setting.told, setting.admissible
     rest = beyond(admissible, flow.unexplained, setting.granted)
     unexplained = np.linalg.norm(rest, axis=-1) > told
-    found = {SATURATION: is_cut(flow), SAMPLING: setting.beyond(flow.unexplained - rest + flow.lag) > told}
-    found[WRAP] = wrapped
+    found = {Assumption.EFFORT: is_cut(flow), Assumption.WRAP: wrapped}
+    found[Assumption.TIME] = held | (is_broken & (setting.beyond(flow.unexplained - rest + flow.lag) > told))
     if recorded is None or not recorded.any():
-        found[UNEXPLAINED] = unexplained
+        found[Assumption.MODEL] = found[Assumption.DISTURBANCE] = unexplained
     else:
         low, high = np.minimum(recorded[:-1], recorded[1:]), np.maximum(recorded[:-1], recorded[1:])
         other = np.linalg.norm(flow.unexplained - np.clip(flow.unexplained, low, high), axis=-1)
-        found[MODEL] = unexplained & (other > told)
-        found[DISTURBANCE] = (beyond(admissible, recorded[:-1] / (1.0 + ROUNDING)) != 0.0).any(axis=-1)
-    return {name: found[name] for name in ASSUMPTIONS if name in found and found[name].any()}
+        found[Assumption.MODEL] = unexplained & (other > told)
+        found[Assumption.DISTURBANCE] = (beyond(admissible, recorded[:-1] / (1.0 + ROUNDING)) != 0.0).any(axis=-1)
+    return {name: found[name] for name in Assumption if name in found and found[name].any()}
 
 
 def excess_of(flow: Balance, setting: Setting) -> tuple[Float[np.ndarray, " periods"], Float[np.ndarray, " periods"]]:
     """What torques beyond the admissible ones can have done, whatever their cause: power [W], and times the bound.
 
-    Torques count as greater than they seem by what cannot be told.
+    Torques count as greater than they seem by what cannot be told. V̇ beyond the sum of its terms is the error of taking
+    those in the middle of a period, and counts as power too.
     """
     torque = flow.unexplained + flow.lag + flow.cut
     size = np.linalg.norm(torque, axis=-1)
     torque = torque * (1.0 + setting.told / np.where(size > 0.0, size, 1.0))[:, None]
-    power = np.linalg.norm(flow.z2, axis=-1) * setting.beyond(torque)
+    terms = flow.potential + flow.damping + flow.disturbance + flow.held + flow.saturation
+    power = np.linalg.norm(flow.z2, axis=-1) * setting.beyond(torque) + np.maximum(flow.change - terms, 0.0)
     box, radius = setting.admissible.box, setting.admissible.radius
     torque = torque - beyond(setting.admissible, torque) + beyond(setting.admissible, torque, setting.granted)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.linalg.norm(torque, axis=-1) / radius if box is None else (np.abs(torque) / box).max(axis=-1)
-    return power, np.maximum(np.where(np.isnan(ratio), np.inf, ratio), 1.0)
+        ratio = np.linalg.norm(torque, axis=-1, keepdims=True) / radius if box is None else np.abs(torque) / box
+    return power, np.maximum(np.where(np.isnan(ratio), 1.0, ratio).max(axis=-1), 1.0)  # 0 ÷ 0 is within the bound
 
 
-def unaccounted(
-    storage: np.ndarray, promise: np.ndarray, power: np.ndarray, steps: np.ndarray, decay: float
-) -> Bool[np.ndarray, " rows"]:
-    """Where V is further beyond the promise than that power accounts for: V̇ ≤ −c(V − V∞) + power."""
-    energy = np.zeros(len(storage))
+def summed(
+    power: Float[np.ndarray, " periods"], steps: Float[np.ndarray, " periods"], decay: float
+) -> Float[np.ndarray, " rows"]:
+    """What is left of the energy that a power has brought, and c = `decay` [1/s] took away, at every row [J]."""
+    energy = np.zeros(len(power) + 1)
     for k, (more, step) in enumerate(zip(power.tolist(), steps.tolist(), strict=True)):
         energy[k + 1] = decayed(float(energy[k]), more, step, decay)
-    return np.asarray(storage > promise * (1.0 + DIFFERENCES) + energy)
+    return energy
 
 
 def decayed(energy: float, power: float, step: float, decay: float) -> float:
-    """What is left of an energy after a step, with the power that came in."""
-    return energy * float(np.exp(-decay * step)) + power * step
+    """What is left of an energy after a step, with the power that came in; never less than nothing."""
+    return max(energy * float(np.exp(-decay * step)) + power * step, 0.0)
 
 
-def greatest(flow: Balance, admissible: Admissible, recorded: Float[np.ndarray, "rows n"] | None) -> str:
+def greatest(
+    flow: Balance, admissible: Admissible, recorded: Float[np.ndarray, "rows n"] | None
+) -> tuple[Assumption, ...]:
     """Which of the small excesses, none told apart by itself, was the greatest."""
     unexplained = np.linalg.norm(beyond(admissible, flow.unexplained), axis=-1).max()
     if np.linalg.norm(flow.lag, axis=-1).max() >= unexplained:
-        return SAMPLING
-    return UNEXPLAINED if recorded is None or not recorded.any() else MODEL
+        return (Assumption.TIME,)
+    if recorded is None or not recorded.any():
+        return Assumption.MODEL, Assumption.DISTURBANCE
+    return (Assumption.MODEL,)
 
 
 def is_cut(flow: Balance) -> Bool[np.ndarray, " periods"]:

@@ -1,29 +1,29 @@
 """A certificate held against what happens: V beside its promise along a run, and which assumption failed."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from nbs_pin.certificates.assumptions import (
-    DIFFERENCES,
-    EPS,
-    ROUNDING,
-    WRAP,
+    NOTICEABLE,
+    Promise,
     Setting,
+    check_certificate,
     excess_of,
     failures,
     greatest,
     is_cut,
+    quantities,
     sentence,
-    unaccounted,
+    summed,
     wraps,
 )
 from nbs_pin.certificates.certificate import Certificate
+from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Balance, Instants, balance, storage_of
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.exceptions import ArgumentError
-from nbs_pin.mismatch import Mismatch
 from nbs_pin.state import Run
 
 
@@ -40,89 +40,108 @@ class Monitored:
     error: Float[np.ndarray, " rows"]
     """‖z1‖ [rad]."""
     error_bound: Float[np.ndarray, " rows"]
-    """What ‖z1‖ was not to exceed [rad], from V(0); it falls as the promise does."""
+    """What ‖z1‖ was not to exceed [rad], from V(0); from V(0) > V∞ it falls as the promise does."""
+    joint_errors: Float[np.ndarray, "rows n"]
+    """|z1_i| [rad]."""
+    joint_bounds: Float[np.ndarray, "rows n"]
+    """What each was not to exceed [rad]."""
+    joint_names: tuple[str, ...]
     balance: Balance
     """V̇ and its terms between one row and the next, (rows − 1, …)."""
     saturated: Bool[np.ndarray, " periods"]
     """Whether the torque was cut between one row and the next."""
-    exceeded: Bool[np.ndarray, " rows"]
-    """Where V or ‖z1‖ is beyond what was promised."""
-    failures: dict[str, Bool[np.ndarray, " periods"]]
-    """The assumptions that failed, by name, and when."""
+    excesses: dict[str, Bool[np.ndarray, " rows"]]
+    """What went beyond its bound, "V", "‖z1‖" or "|z1| of" a joint by name, and when."""
+    failures: dict[Assumption, Bool[np.ndarray, " periods"]]
+    """The assumptions that failed, in the words of the certificate, and when."""
+    is_recorded: bool
+    """Whether the run has a disturbance on record; without one, MODEL and DISTURBANCE cannot be told apart."""
     is_wrong: bool
     """Whether a promise was broken that the failed assumptions do not account for."""
 
+    @cached_property
+    def exceeded(self) -> Bool[np.ndarray, " rows"]:
+        """Where V, ‖z1‖ or some |z1_i| is beyond what was promised."""
+        return np.logical_or.reduce(list(self.excesses.values()), axis=0) | np.zeros(len(self.t), dtype=bool)
+
     @property
-    def broken(self) -> tuple[str, ...]:
-        """Names of the assumptions that failed."""
+    def broken(self) -> tuple[Assumption, ...]:
+        """The assumptions that failed."""
         return tuple(self.failures)
 
     @property
     def is_kept(self) -> bool:
-        """Whether V and ‖z1‖ stayed within the promise."""
-        return not bool(self.exceeded.any())
+        """Whether V, ‖z1‖ and every |z1_i| stayed within the promise."""
+        return not self.excesses
 
     @property
     def verdict(self) -> str:
-        """One sentence: whether the promise was kept, and if not, which assumption failed or that none did."""
-        named = [f"{name} (t = {self.t[:-1][when][0]:.4g} s)" for name, when in self.failures.items()]
-        at = "" if self.is_kept else f" at t = {self.t[self.exceeded][0]:.4g} s"
-        return sentence(at, self.is_kept, self.is_wrong, named)
+        """One sentence: whether the promise was kept, and if not, by what, and which assumption failed or that none."""
+        failed = {name: f" (t = {self.t[:-1][when][0]:.4g} s)" for name, when in self.failures.items()}
+        at = "" if self.is_kept else f" at t = {self.t[self.exceeded][0]:.4g} s by {', '.join(self.excesses)}"
+        return sentence(at, self.is_kept, self.is_wrong, failed, is_recorded=self.is_recorded)
 
 
-def monitor(
-    run: Run,
-    controller: NeuralBackstepping,
-    certificate: Certificate,
-    *,
-    start: int = 0,
-    mismatch: Mismatch | None = None,
-) -> Monitored:
-    """Holds a certificate against a run of the controller, simulated or logged.
+def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
+    """Holds a certificate against a run of its controller, simulated or logged.
 
     What the model leaves unexplained comes from differences of v, so noise in a log counts as disturbance. A promise is
-    broken in earnest (`is_wrong`) when V exceeds it by more than the energy that torques beyond the admissible ones,
-    of whatever cause, can have brought since the start. V and the model may be learned: M̂ is in both.
+    broken in earnest (`is_wrong`) when V or an error exceeds it by more than the energy that torques beyond the
+    admissible ones, of whatever cause, can have brought since the start. V and the model may be learned: M̂ is in both,
+    and the error that the certificate counts is granted. That torques are held is reported once it has brought more
+    than 1 % of what V may be, or a promise is broken.
 
-    start: which start of a batched run. mismatch: that of a certificate for a learned model; its bound on ‖δ‖ is
-    granted beside the disturbance. Raises ArgumentError for a run of another number of joints, or of less than two
-    rows.
+    start: which start of a batched run. Raises ArgumentError for a run of another arm, or of less than two rows, and
+    for what is no certificate.
     """
-    starts = int(np.prod(run.q.shape[1:-1], dtype=int))
-    if run.nv != controller.nv or len(run.t) < 2 or not 0 <= start < starts:
-        raise ArgumentError(
-            f"the run has {run.nv} joints, {len(run.t)} rows and {starts} starts, expected {controller.nv} joints, two "
-            f"rows at least and the start {start}; give a run of this controller."
-        )
-    at = Instants.of(run).rows(start)
-    storage, recorded = storage_of(controller, at), run.disturbance.reshape(len(run.t), starts, run.nv)[:, start]
+    check_certificate(certificate)
+    _check_run(run, certificate, start)
+    controller, starts = certificate.controller, int(np.prod(run.q.shape[1:-1], dtype=int))
+    at, recorded = Instants.of(run).rows(start), run.disturbance.reshape(len(run.t), starts, run.nv)[:, start]
+    storage, z1 = storage_of(controller, at), controller.dynamics.difference(at.q, at.q_ref)
     flow = balance(controller, at.rows(slice(-1)), at.rows(slice(1, None)), np.diff(storage))
-    initial = float(storage[0])
-    promise = np.asarray(certificate.storage_bound(at.t - at.t[0], initial))
-    z1 = controller.dynamics.difference(at.q, at.q_ref)
-    # Bounds of ‖z1‖ go with √Φ, and Φ ≤ V ≤ the promise; from V(0) = 0 there is a better one, the same at all times.
-    fallen = np.sqrt(promise / promise[0]) if initial > 0.0 else np.ones(len(promise))
-    size, bound = np.linalg.norm(z1, axis=-1), certificate.from_start(initial)[0] * fallen
-    setting = Setting.of(certificate, mismatch, flow, at)
-    failed = failures(flow, setting, wraps(controller, z1), recorded)
-    over = storage > promise * (1.0 + ROUNDING) + EPS * (1.0 + initial)
-    outside = size > bound * (1.0 + ROUNDING)
+    promise, values = Promise(certificate, float(storage[0])), quantities(storage, z1)
+    bounds = promise.bounds(at.t - at.t[0])
+    over = promise.exceeded(values, bounds)
+    setting, steps, decay = Setting.of(certificate, flow, at), np.diff(at.t), certificate.level.c
+    held = (summed(flow.held, steps, decay) > NOTICEABLE * bounds[:, 0])[1:]
+    failed = failures(flow, setting, wraps(controller, z1), held, bool(over.any()), recorded)
     power, ratio = excess_of(flow, setting)
-    # Bounds are proportional to the disturbance: torques that are s times the admissible ones have s times the bound.
-    scale = np.maximum.accumulate(np.concatenate([[1.0], ratio])) * (1.0 + DIFFERENCES)
-    wrong = over & unaccounted(storage, promise, power, np.diff(at.t), certificate.level.c)
-    is_wrong = WRAP not in failed and bool((wrong | (outside & (size > scale * bound))).any())
-    if (over | outside).any() and not failed and not is_wrong:
-        failed = {greatest(flow, certificate.admissible, recorded): power > 0.0}
+    so_far = np.maximum.accumulate(np.concatenate([[1.0], ratio]))
+    accounted = promise.accounted(bounds, summed(power, steps, decay), so_far)
+    is_wrong = Assumption.WRAP not in failed and bool((over & (values > accounted)).any())
+    if over.any() and not failed and not is_wrong:
+        failed = dict.fromkeys(greatest(flow, certificate.admissible, recorded), power > 0.0)
     return Monitored(
         t=at.t,
         storage=storage,
-        promise=promise,
-        error=size,
-        error_bound=bound,
+        promise=bounds[:, 0],
+        error=values[:, 1],
+        error_bound=bounds[:, 1],
+        joint_errors=values[:, 2:],
+        joint_bounds=bounds[:, 2:],
+        joint_names=certificate.joint_names,
         balance=flow,
         saturated=is_cut(flow),
-        exceeded=over | outside,
+        excesses={name: over[:, k] for k, name in enumerate(promise.names) if over[:, k].any()},
         failures=failed,
+        is_recorded=bool(recorded.any()),
         is_wrong=is_wrong,
     )
+
+
+def _check_run(run: Run, certificate: Certificate, start: int) -> None:
+    if not isinstance(run, Run):
+        raise ArgumentError(f"a {type(run).__name__} is no run; give what simulate returned or Run.load read.")
+    robot, nv = certificate.robot, certificate.controller.nv
+    if robot is not None and run.robot_sha256 not in ("", robot.sha256):
+        raise ArgumentError(
+            f"the run is of the arm '{run.robot}' (sha256 {run.robot_sha256[:12]}…), the certificate of {robot.name} "
+            f"({robot.sha256[:12]}…); give a run of that arm."
+        )
+    starts = int(np.prod(run.q.shape[1:-1], dtype=int))
+    if run.nv != nv or len(run.t) < 2 or not 0 <= start < starts:
+        raise ArgumentError(
+            f"the run has {run.nv} joints, {len(run.t)} rows and {starts} starts, expected {nv} joints, two rows at "
+            f"least and the start {start}; give a run of the certificate's controller."
+        )
