@@ -159,15 +159,15 @@ def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) ->
     bounds, units = certificate.joint_errors, certificate.joint_units
     at, mixed = np.arange(len(bounds)), len(set(units)) > 1
     axes.barh(at, bounds, height=0.7, color=LIMIT, alpha=0.35, label="certified")
-    for y, bound, unit in zip(at.tolist(), bounds.tolist(), units, strict=True):
+    found = np.zeros(len(at)) if attack is None else attack.joint_errors
+    axes.barh(at, found, height=0.38, color=ERROR, label="worst found")
+    for y, bound, end, unit in zip(at.tolist(), bounds.tolist(), np.maximum(bounds, found), units, strict=True):
         text = f" {bound:.3g}{' ' + unit if mixed else ''}"
-        axes.annotate(text, (bound, y), va="center", fontsize=7.5, color=_NOTE)
-    found = np.zeros(0) if attack is None else attack.joint_errors
-    axes.barh(at[: len(found)], found, height=0.38, color=ERROR, label="worst found")
+        axes.annotate(text, (end, y), va="center", fontsize=7.5, color=_NOTE)
     axes.set_yticks(at, [_plain(name) for name in certificate.joint_names])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
-    axes.set_xlim(0.0, 1.18 * float(max(bounds.max(), found.max(initial=0.0))) or 1.0)
+    axes.set_xlim(0.0, 1.18 * float(max(bounds.max(), found.max())) or 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     title = f"|z1| of each joint [{', '.join(dict.fromkeys(units))}]"
     if attack is not None:
