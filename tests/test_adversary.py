@@ -1,8 +1,9 @@
 """The adversary: it finds the known worst cases, never leaves what is admissible, and never loses what it found."""
 
+import re
+
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,26 +13,13 @@ from nbs_pin.certificates.adversary import attack, random_disturbances, worst_of
 from nbs_pin.certificates.arena import Arena, motions_of, slowest_rate
 from nbs_pin.certificates.torque_waves import KINDS
 from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import Potential
 from nbs_pin.references import Hold
-
-_ONE_JOINT = """<robot name="one"><link name="base"/><link name="rotor"><inertial><mass value="1"/>
-<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j" type="revolute">
-<parent link="base"/><child link="rotor"/><axis xyz="0 0 1"/>
-<limit lower="-3" upper="3" effort="100" velocity="10"/></joint></robot>"""
+from nbs_pin.studies.certificate_study import constant_damping, one_joint
 
 
-def one_joint(folder, stiffness, damping):
+def linear_loop(stiffness, damping):
     """M = 1, G = 0, Φ = S z², D constant: a linear loop."""
-    (folder / "one.urdf").write_text(_ONE_JOINT)
-    dynamics = nbs.PinocchioDynamics(nbs.load_robot(folder / "one.urdf"))
-    law = nbs.NeuralBackstepping(dynamics, Potential(np.array([[stiffness]])), Damping(1, floor=np.array([[damping]])))
-    with torch.no_grad():
-        for part in (law.potential.network, law.damping.diagonal, law.damping.lower):
-            for parameter in part.parameters():
-                parameter.zero_()
-    return law
+    return constant_damping(one_joint(), 2.0 * stiffness, damping, quiet=True)
 
 
 def exact_worst(stiffness, damping):
@@ -44,20 +32,20 @@ def exact_worst(stiffness, damping):
     return np.abs(impulse).sum() * 1e-3
 
 
-def test_the_papers_theorem_3_is_broken_by_one_joint(tmp_path):
+def test_the_papers_theorem_3_is_broken_by_one_joint():
     """‖∇Φ‖² reaches 0.687 d where the paper's Theorem 3 prints d/2 (docs/theory.md §5)."""
     d = 0.01
-    law = one_joint(tmp_path, 0.25, 0.5)
-    found = attack(law, [np.sqrt(d)], reference=Hold([0.0]), duration=14.0, period=0.005, rounds=1)
+    law = linear_loop(0.25, 0.5)
+    found = attack(law, [np.sqrt(d)], reference=Hold([0.0]), duration=12.0, period=0.01, rounds=1, starts=1)
     gradient = 0.5 * found.error
-    assert gradient**2 / d == pytest.approx(0.687, abs=0.004)
+    assert gradient**2 / d == pytest.approx(0.687, abs=0.006)
     assert found.found_by == "bang-bang ascent"
 
 
-@pytest.mark.parametrize("stiffness", [0.125, 1.0])
+@pytest.mark.parametrize("stiffness", [0.25, 1.0])
 @pytest.mark.parametrize("damping", [0.5, 2.0])
-def test_a_linear_loop_is_solved_exactly_in_one_round(tmp_path, stiffness, damping):
-    law, exact = one_joint(tmp_path, stiffness, damping), exact_worst(stiffness, damping)
+def test_a_linear_loop_is_solved_exactly_in_one_round(stiffness, damping):
+    law, exact = linear_loop(stiffness, damping), exact_worst(stiffness, damping)
     found = attack(law, [0.1], reference=Hold([0.0]), period=0.005, rounds=1, starts=1)
     assert found.error == pytest.approx(0.1 * exact, rel=0.01)
     assert found.error <= 0.1 * exact * 1.003  # the held law differs a little from the one in continuous time
@@ -132,8 +120,9 @@ def test_effort_limits_are_taken(two_link):
 
 def test_another_truth_is_taken(tmp_path):
     """At rest (1 + D)·2S·z1 = τ_d, whatever M is; an arm four times as heavy as believed overshoots."""
-    law, heavy = one_joint(tmp_path, 1.0, 2.0), tmp_path / "heavy.urdf"
-    heavy.write_text(_ONE_JOINT.replace('ixx="1" iyy="1" izz="1"', 'ixx="4" iyy="4" izz="4"'))
+    law, heavy = linear_loop(1.0, 2.0), tmp_path / "heavy.urdf"
+    light = law.dynamics.robot.urdf.xml.decode()
+    heavy.write_text(re.sub(r'i(xx|yy|zz)="1(\.0)?"', r'i\1="4"', light))
     truth = nbs.PinocchioDynamics(nbs.load_robot(heavy))
     torque = np.full((1, 1000, 1), 0.1)
     believed, other = (worst_of(law, torque, Hold([0.0]), period=0.01, plant_dynamics=p) for p in (None, truth))
@@ -141,8 +130,8 @@ def test_another_truth_is_taken(tmp_path):
     assert other.error[0] > 1.1 * believed.error[0]
 
 
-def test_slowest_rate_is_that_of_the_linear_loop(tmp_path):
-    assert slowest_rate(one_joint(tmp_path, 0.25, 0.5), Hold([0.0])) == pytest.approx(0.5)
+def test_slowest_rate_is_that_of_the_linear_loop():
+    assert slowest_rate(linear_loop(0.25, 0.5), Hold([0.0])) == pytest.approx(0.5)
 
 
 @given(seed=st.integers(0, 10_000), radius=st.booleans(), steps=st.integers(1, 60), n=st.integers(1, 4))
@@ -181,15 +170,36 @@ def test_references_are_taken_in_turn_and_made_without_any(two_link):
     ("change", "told"),
     [
         ({"rounds": -1}, "rounds"),
+        ({"rounds": 1.5}, "rounds is 1.5, expected a whole number"),
+        ({"rounds": "many"}, "rounds is many"),
         ({"starts": 0}, "starts"),
+        ({"seed": -1}, "seed"),
+        ({"reference": 3.0}, "3.0 is no motion"),
+        ({"reference": [Hold([0.0, 0.0]), "fast"]}, "fast is no motion"),
+        ({"reference": lambda t: t}, "no motion"),
         ({"reference": []}, "empty list"),
         ({"period": 0.0}, "period"),
         ({"duration": 0.0015}, "whole number"),
     ],
 )
-def test_arguments_that_do_not_fit_are_refused(two_link, change, told):
+def test_arguments_that_do_not_fit_are_refused(two_link, change, told, without_type_checks):
     with pytest.raises(ArgumentError, match=told):
         attack(two_link, [1.0, 1.0], **change)
+
+
+def test_what_is_no_law_with_a_model_is_refused(two_link, without_type_checks):
+    """A PID, a compiled law, a certificate, an arm: each in one sentence."""
+    robot = two_link.dynamics.robot
+    for other in (nbs.PID.for_robot(robot), two_link.compile(), nbs.certify(two_link, [1.0, 1.0]), robot, None):
+        with pytest.raises(ArgumentError, match=f"a {type(other).__name__} is no law with a model"):
+            attack(other, [1.0, 1.0])
+        with pytest.raises(ArgumentError, match="is no law with a model"):
+            worst_of(other, np.zeros((2, 10, 2)))
+    with pytest.raises(ArgumentError, match="expected numbers"):
+        attack(two_link, nbs.certify(two_link, [1.0, 1.0]))
+    for wrong in (np.zeros((10, 2)), np.full((1, 10, 2), np.nan), "waves"):
+        with pytest.raises(ArgumentError, match="disturbances"):
+            worst_of(two_link, wrong)
 
 
 def test_disturbances_of_another_arm_are_refused(two_link):
@@ -202,4 +212,4 @@ def test_disturbances_of_another_arm_are_refused(two_link):
 def test_an_unstable_loop_is_named(two_link):
     """A period far too long for the gains."""
     with pytest.raises(nbs.exceptions.SimulationDiverged, match="shorter control period"):
-        attack(two_link, [5.0, 5.0], reference=Hold([0.3, -0.4]), period=0.1, duration=60.0, rounds=0)
+        attack(two_link, [5.0, 5.0], reference=Hold([0.3, -0.4]), period=0.5, duration=10.0, rounds=0)

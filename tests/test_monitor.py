@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jaxtyping import config
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
@@ -52,14 +51,6 @@ def run_of(law, *, truth=None, friction=None, period=0.001, duration=0.3, off=0.
     reference = Sinusoid.for_robot(robot, 2.0)
     start = {} if off == 0.0 else {"q0": reference(np.zeros(1)).q[0] + off}
     return nbs.simulate(plant, law, reference, duration, period, effort_limit=effort_limit, disturbance=torque, **start)
-
-
-@pytest.fixture
-def without_type_checks():
-    """What a user meets, whose arguments no test looks at first."""
-    config.update("jaxtyping_disable", True)
-    yield
-    config.update("jaxtyping_disable", False)
 
 
 def residual(law, run):
@@ -163,7 +154,7 @@ def test_a_calm_run_breaks_nothing(law, certificate):
 
 
 def test_the_worst_attack_keeps_the_promise_and_a_smaller_promise_is_called_wrong(law, certificate):
-    run = attack(law, BOUND, duration=0.3, rounds=3, starts=4).run
+    run = attack(law, BOUND, duration=0.2, rounds=1, starts=1).run
     assert monitor(run, certificate).is_kept
     level = certificate.level._replace(storage=0.05 * certificate.storage)
     seen = monitor(run, replace(certificate, level=level))
@@ -177,7 +168,7 @@ def test_the_worst_attack_keeps_the_promise_and_a_smaller_promise_is_called_wron
 
 def test_a_joint_beyond_its_own_bound_is_named(robot, law, certificate):
     """Each |z1_i| has a bound of its own, and it is broken though V and ‖z1‖ keep theirs."""
-    run = run_of(law, torque=SquareWave(BOUND, 9.0))
+    run = run_of(law, torque=SquareWave(BOUND, 9.0), duration=0.1)
     peak = np.abs(run.q - run.q_ref).max(axis=0)
     smaller = replace(certificate, joint_errors=np.array([certificate.joint_errors[0], 0.5 * peak[1]]))
     assert monitor(run, certificate).excesses == {}
@@ -194,7 +185,7 @@ def test_a_joint_beyond_its_own_bound_is_named(robot, law, certificate):
 @pytest.mark.parametrize("torque", [None, ConstantTorque([0.5, 0.0])], ids=["calm", "disturbed"])
 def test_without_any_disturbance_every_torque_is_beyond_the_bound(law, torque):
     """V∞ = 0, so times the bound means nothing: energies do."""
-    run, none = run_of(law, torque=torque, off=0.05), certify(law, np.zeros(2))
+    run, none = run_of(law, torque=torque, off=0.05, duration=0.06), certify(law, np.zeros(2))
     seen = monitor(run, none)
     assert np.isfinite(seen.error_bound).all()
     assert not seen.is_wrong
@@ -333,7 +324,7 @@ def watched(watch, run):
     "kept", [{}, {"off": 0.6, "effort_limit": 2.0}, {"torque": SquareWave(8.0 * BOUND, 9.0)}], ids=str
 )
 def test_a_watch_says_live_what_the_monitor_says_afterwards(law, certificate, kept):
-    run = run_of(law, duration=0.1, **kept)
+    run = run_of(law, duration=0.06, **kept)
     seen = monitor(replace(run, disturbance=0.0 * run.disturbance), certificate)
     said = watched(Watch(certificate), run)
     assert [s.error for s in said] == pytest.approx(seen.error, rel=1e-9)
@@ -347,7 +338,7 @@ def test_a_watch_says_live_what_the_monitor_says_afterwards(law, certificate, ke
 
 
 def test_a_watch_calls_a_wrong_certificate_wrong(law, certificate):
-    run = run_of(law, torque=SquareWave(BOUND, 9.0), duration=0.15)
+    run = run_of(law, torque=SquareWave(BOUND, 9.0), duration=0.06)
     level = certificate.level._replace(storage=0.05 * certificate.storage)
     said = watched(Watch(replace(certificate, level=level)), run)
     assert any("the certificate is wrong" in s.verdict for s in said)

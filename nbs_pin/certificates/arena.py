@@ -61,11 +61,7 @@ class Arena:
         seed: int,
     ) -> "Arena":
         """The loop with the arguments of `attack`; raises ArgumentError when they do not fit."""
-        if not isinstance(controller, ModelLaw):
-            raise ArgumentError(
-                f"a {type(controller).__name__} is no law with a model, which gradients of a motion go through; give a "
-                "NeuralBackstepping, ComputedTorque or SlotineLi, and of a compiled law what it was compiled from."
-            )
+        check_law(controller)
         positive("period", period, "s")
         truth = controller.dynamics if plant_dynamics is None else plant_dynamics
         followed = motions_of(controller.dynamics, reference, seed)
@@ -137,6 +133,15 @@ class Arena:
                 f" disturbance; take a shorter control period than {batch.loop.period:g} s."
             )
         return z1
+
+
+def check_law(controller: Any) -> None:
+    """Raises ArgumentError unless it is a law with a model, which gradients of a motion go through."""
+    if not isinstance(controller, ModelLaw):
+        raise ArgumentError(
+            f"a {type(controller).__name__} is no law with a model, which gradients of a motion go through; give a "
+            "NeuralBackstepping, ComputedTorque or SlotineLi, and of a compiled law what it was compiled from."
+        )
 
 
 def motions_of(
