@@ -176,7 +176,7 @@ def test_a_sliding_joint_is_certified_in_metres(tmp_path, capsys):
 
 
 def test_an_attack_finds_more_and_a_run_is_held_against_the_bound(certified, tmp_path, capsys):
-    options = ("--disturbance", "5,4", "--attack", "--period", "0.005", "--monitor", str(certified[0] / "run.npz"))
+    options = ("--disturbance", "5,4", "--attack", "--period", "0.01", "--monitor", str(certified[0] / "run.npz"))
     assert run(tmp_path / "a", "two_link", *options) == 0
     figures = summary(tmp_path / "a")["figures"]
     assert figures["attack"]["thorough"]
@@ -305,7 +305,7 @@ def reproduced(tmp_path_factory):
         family=8,
         longest=100,
         rounds=1,
-        duration=0.25,
+        duration=0.15,
         fine=(14.0, 0.005),
         poses=certificate_poses.Scale(arms=("two_link",), samples=500, climbs=4, sweeps=3),
     )

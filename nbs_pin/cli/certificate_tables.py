@@ -20,6 +20,8 @@ def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> 
     if figures["design"] is not None:
         console.print(_design(figures))
     bounds = [line for line in certificate["lines"] if line["group"] == "bounds" and line["unit"] in _ERRORS]
+    reasons = [line["because"] for line in bounds]
+    bounds.sort(key=lambda line: reasons.index(line["because"]))
     console.print(_errors(bounds, figures))
     console.print(_conditions(certificate["conditions"]))
     if figures["loads"]:
