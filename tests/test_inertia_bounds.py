@@ -14,7 +14,6 @@ from nbs_pin.certificates.inertia import (
     determinant_bound,
     largest_inertia_bound,
     least_inertia_bound,
-    multiplier_bounds,
     pencil_bound,
     trace_bound,
     trigonometric_bound,
@@ -138,7 +137,7 @@ def test_trees_of_turning_and_sliding_joints(kinds, branched):
     assert trace <= trace_bound(tree, weight) <= 1.7 * trace
     assert 0.0 < determinant_bound(tree) <= small
     assert 0.0 < pencil_bound(tree) <= small
-    least, most = multiplier_bounds(tree, np.eye(tree.nv))
+    least, most = least_inertia_bound(tree).value, largest_inertia_bound(tree, np.eye(tree.nv)).value
     top = np.linalg.eigvalsh(whole)[:, -1].max()
     assert 0.999 * max(pencil_bound(tree), determinant_bound(tree)) < least <= small
     assert top <= most <= 1.2 * top
@@ -155,14 +154,14 @@ def test_any_weight(seed):
     packed = pack_model(model)
     assert values.max() <= trigonometric_bound(packed, weight, 3000) <= 2.0 * values.max()
     assert values.max() <= trace_bound(packed, weight)
-    assert values.min() / 1.2 <= multiplier_bounds(packed, weight)[0] <= values.min()
+    assert values.min() / 1.2 <= least_inertia_bound(packed, weight).value <= values.min()
     assert values.max() <= largest_inertia_bound(packed, weight).value <= 1.2 * values.max()
 
 
 def test_bounds_scale_with_the_weight():
     robot = load_robot("ur3")
     eye = np.eye(robot.nv)
-    for bound in (trace_bound, trigonometric_bound, lambda arm, w: multiplier_bounds(arm, w)[1]):
+    for bound in (trace_bound, trigonometric_bound, lambda arm, w: largest_inertia_bound(arm, w).value):
         assert bound(robot, 4.0 * eye) == pytest.approx(0.25 * bound(robot, eye), rel=1e-3)
 
 

@@ -1,14 +1,14 @@
 """The constants of the bounds, each moved to the safe side and labelled with the way it is known."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.certificates.claims import Claim, Group, Label, weakest
-from nbs_pin.certificates.inertia import MULTIPLIERS, largest_inertia_bound, multiplier_bounds
+from nbs_pin.certificates.inertia import largest_inertia_bound, least_inertia_bound
 from nbs_pin.certificates.rounding import least_eigenvalue
 from nbs_pin.certificates.structure import DAMPING, check_structure
 from nbs_pin.controllers.controller import Controller
@@ -57,7 +57,7 @@ def constants_of(law: Controller) -> Constants:
     omega, root = float(controller.inertial_rate), np.sqrt(rate)
     rho = least_eigenvalue(2.0 * root[:, None] * stiffness * root)
     delta = least_eigenvalue(root[:, None] * floor * root)
-    largest, least = _inertia(controller.dynamics, floor)
+    largest, least, *plain = _inertia(controller.dynamics, floor)
     # With ωM in the damping no bound of M is needed, so one that is not proved is not used.
     used = omega == 0.0 or largest.label is Label.PROVED
     claim = Claim("δ = λ_min(Λ^½D₀Λ^½)", delta, "", Label.PROVED, "eigenvalue of the gains", Group.CONSTANTS)
@@ -71,7 +71,7 @@ def constants_of(law: Controller) -> Constants:
         least_floor=least_eigenvalue(floor),
         metric=above_inverse(floor),
         label=weakest(*(line.label for line in structure), *([largest.label, least.label] if used else [])),
-        lines=(*structure, largest, least, claim),
+        lines=(*structure, *plain, largest, least, claim),
     )
 
 
@@ -82,23 +82,27 @@ def _floor(controller: NeuralBackstepping, structure: tuple[Claim, ...]) -> Floa
     return next(line.value for line in structure if line.name == DAMPING) * np.eye(controller.nv)
 
 
-def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tuple[Claim, Claim]:
-    """1/κ and 1/ν [s]: rigorous for a rigid tree, learned or given, sampled for other models."""
+def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tuple[Claim, ...]:
+    """1/κ, 1/ν [s], a₂ and a₁ [kg·m²]: rigorous for a rigid tree, learned or given, sampled for other models."""
+    names = ("1/κ ≥ λ_max(D₀^-½MD₀^-½)", "1/ν ≤ λ_min(D₀^-½MD₀^-½)", "a₂ ≥ λ_max(M)", "a₁ ≤ λ_min(M)")
     arm = dynamics.robot if type(dynamics) is PinocchioDynamics else dynamics.packed_tree()
+    one = np.eye(len(floor))
     if arm is not None:
-        largest, least = largest_inertia_bound(arm, floor), multiplier_bounds(arm, floor)[0]
-        label, because = (largest.label, Label.PROVED), (largest.because, MULTIPLIERS)
-        values = (largest.value, least)
+        weights = (floor, np.eye(len(floor)))
+        known = [bound for w in weights for bound in (largest_inertia_bound(arm, w), least_inertia_bound(arm, w))]
     else:
-        mass = dynamics.mass_matrix(configurations(dynamics))
-        root = np.linalg.inv(np.linalg.cholesky(floor))
-        spectra = np.linalg.eigvalsh(root @ mass @ root.T)
-        label, because = (Label.EMPIRICAL,) * 2, (f"the extreme of {_SAMPLES} configurations of the model",) * 2
-        values = (float(spectra[:, -1].max()), float(spectra[:, 0].min()))
-    return (
-        Claim("1/κ ≥ λ_max(D₀^-½MD₀^-½) in every pose", values[0], "s", label[0], because[0], Group.INERTIA),
-        Claim("1/ν ≤ λ_min(D₀^-½MD₀^-½) in every pose", values[1], "s", label[1], because[1], Group.INERTIA),
-    )
+        known = _sampled(dynamics.mass_matrix(configurations(dynamics)), floor)
+    units = ("s", "s", "kg·m²", "kg·m²")
+    rows = zip(names, units, known, strict=True)
+    return tuple(replace(x, name=name, unit=unit, group=Group.INERTIA) for name, unit, x in rows)
+
+
+def _sampled(mass: Float[np.ndarray, "count n n"], floor: Float[np.ndarray, "n n"]) -> list[Claim]:
+    root = np.linalg.inv(np.linalg.cholesky(floor))
+    spectra = [np.linalg.eigvalsh(x) for x in (root @ mass @ root.T, mass)]
+    ends = [end for x in spectra for end in (float(x[:, -1].max()), float(x[:, 0].min()))]
+    because = f"the extreme of {len(mass)} configurations"
+    return [Claim("inertia of the model", end, "", Label.EMPIRICAL, because) for end in ends]
 
 
 def configurations(dynamics: DynamicsProvider) -> Float[np.ndarray, "count n"]:

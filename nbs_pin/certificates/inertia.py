@@ -43,30 +43,27 @@ def largest_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> Claim:
     return Claim(name, bounds[because], "", Label.PROVED, because)
 
 
-def least_inertia_bound(arm: Arm) -> Claim:
-    """a₁ ≤ min_q λ_min(M(q)) [kg·m², or kg along a joint that slides]: by multipliers, else the better of two others.
+def least_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None) -> Claim:
+    """At most min_q λ_min(W^-½ M(q) W^-½): by multipliers, else the better of two others ÷ λ_max(W).
 
-    The value is 0, with the reason, where all say nothing.
+    weight: W, None for I: a₁ [kg·m², or kg along a joint that slides]. The value is 0, with the reason, where all say
+    nothing. Raises ArgumentError for a W that is not symmetric positive definite.
     """
     tree = RigidTree.of(arm)
-    name, value = "least inertia, a₁ ⪯ M(q)", down(least_by_multipliers(tree))
+    weight = np.eye(tree.nv) if weight is None else weight
+    _check_weight(weight, tree.nv)
+    name, value = "least inertia over W, min λ(W^-½MW^-½)", down(least_by_multipliers(tree, weight))
     if value > 0.0:
-        return Claim(name, value, "kg·m²", Label.PROVED, MULTIPLIERS)
+        return Claim(name, value, "", Label.PROVED, MULTIPLIERS)
     bounds = {
         "speeds of the bodies alone (pencil)": pencil_bound(tree),
         "determinant by articulated inertias": determinant_bound(tree),
     }
     because = max(bounds, key=lambda key: bounds[key])
-    value = max(bounds[because], 0.0)
+    value = down(max(bounds[because], 0.0) / largest_eigenvalue(weight))
     if value == 0.0:
         because = "a body without inertia of its own, or travel without end, leaves no bound above 0"
-    return Claim(name, value, "kg·m²", Label.PROVED, because)
-
-
-def multiplier_bounds(arm: Arm, weight: Float[np.ndarray, "n n"]) -> tuple[float, float]:
-    """(a, b) with aW ⪯ M(q) ⪯ bW in every pose, as close as multipliers find them (`multipliers`); a ≥ 0, b ≤ inf."""
-    tree = RigidTree.of(arm)
-    return down(least_by_multipliers(tree, weight)), up(largest_by_multipliers(tree, weight))
+    return Claim(name, value, "", Label.PROVED, because)
 
 
 def trace_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> float:
