@@ -86,7 +86,6 @@ def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tup
     """1/κ, 1/ν [s], a₂ and a₁ [kg·m²]: rigorous for a rigid tree, learned or given, sampled for other models."""
     names = ("1/κ ≥ λ_max(D₀^-½MD₀^-½)", "1/ν ≤ λ_min(D₀^-½MD₀^-½)", "a₂ ≥ λ_max(M)", "a₁ ≤ λ_min(M)")
     arm = dynamics.robot if type(dynamics) is PinocchioDynamics else dynamics.packed_tree()
-    one = np.eye(len(floor))
     if arm is not None:
         weights = (floor, np.eye(len(floor)))
         known = [bound for w in weights for bound in (largest_inertia_bound(arm, w), least_inertia_bound(arm, w))]
