@@ -12,6 +12,14 @@ _ERRORS = ("rad", "m", "rad, m")
 _ORDER = ("bounds", "sampled control", "model error", "inertia", "constants", "structure")
 """Groups of claims, what a reader asks first at the top."""
 
+_GAINS = (
+    ("K", "N·m/rad", "N/m"),
+    ("Λ", "rad/s per N·m", "m/s per N"),
+    ("D₀", "N·m·s/rad", "N·s/m"),
+    ("torque", "N·m", "N"),
+)
+"""What a design gives each joint, with the units of joints that turn and of joints that slide."""
+
 
 def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> None:
     """Errors first, then what they rest on; `figures` as `studies.certifying.figures` gives them."""
@@ -94,7 +102,11 @@ def _design(figures: dict[str, Any]) -> Table:
         f"design: ω = {design['bandwidth_rad_per_s']:.3g} rad/s, control period {1e3 * design['period_s']:g} ms, "
         f"{design['torque_share'] or 0.0:.0%} of a torque limit at the bound"
     )
-    table = _table(title, "joint", "K\n[N·m/rad]", "Λ\n[rad/s per N·m]", "D₀\n[N·m·s/rad]", "torque\n[N·m]")
+    slides = "m" in figures["certificate"]["units"]
+    headings = [
+        f"{name}\n[{turning},\n{sliding}]" if slides else f"{name}\n[{turning}]" for name, turning, sliding in _GAINS
+    ]
+    table = _table(title, "joint", *headings)
     columns = ("stiffness_Nm_per_rad", "rate_rad_per_s_per_Nm", "damping_Nms_per_rad", "torque_Nm")
     for joint, *values in zip(figures["certificate"]["joints"], *(design[name] for name in columns), strict=True):
         table.add_row(Text(joint), *(_number(value) for value in values))
