@@ -2,6 +2,7 @@
 
 import textwrap
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -29,13 +30,13 @@ _TERMS = {
 def plot_monitor(monitored: Monitored, path: str | Path) -> Path:
     """Draws what a certificate promised of a run and what happened, and writes the picture (PNG); returns its path.
 
-    V against its promise on a logarithmic scale; ‖z1‖ against its bound, and each |z1_i| that went beyond its own; V̇
-    and each of its terms; and when each assumption failed. Stretches in which the torque was cut are shaded, and where
-    a promise was broken is marked.
+    V against its promise on a logarithmic scale; ‖z1‖ against its bound, and the |z1_i| that went furthest beyond its
+    own; V̇ and each of its terms; and when each assumption failed. Stretches in which the torque was cut are shaded, and
+    where a promise was broken is marked.
     """
     rows = max(len(monitored.failures), 1)
-    with picture(path, 11.0, 8.2 + 0.22 * rows) as figure:
-        heights = [2.6, 1.8, 3.0, 0.35 + 0.22 * rows]
+    with picture(path, 11.0, 8.2 + 0.34 * rows) as figure:
+        heights = [2.6, 1.8, 3.0, 0.35 + 0.34 * rows]
         storage, error, terms, flags = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         _draw_storage(storage, monitored)
         _draw_error(error, monitored)
@@ -100,11 +101,11 @@ def _draw_error(axes: Axes, seen: Monitored) -> None:
     )
     axes.plot(*thin(seen.t, seen.error), color=ERROR, label=f"‖z1‖, at most {seen.error.max():.3g} rad")
     _mark(axes, seen, "‖z1‖", seen.error)
-    for i, name in enumerate(seen.joint_names):
-        if f"|z1| of {name}" in seen.excesses:
-            text = _plain(f"|z1| of {name}")
-            axes.plot(*thin(seen.t, seen.joint_errors[:, i]), color=_VIOLET, linewidth=1.0, label=text)
-            axes.plot(*thin(seen.t, seen.joint_bounds[:, i]), color=_VIOLET, linewidth=1.0, linestyle=_DASHED)
+    names = [f"|z1| of {name}" for name in seen.joint_names]
+    i = int((seen.joint_errors - seen.joint_bounds).max(axis=0).argmax())
+    if names[i] in seen.excesses:
+        axes.plot(*thin(seen.t, seen.joint_errors[:, i]), color=_VIOLET, linewidth=1.0, label=_plain(names[i]))
+        axes.plot(*thin(seen.t, seen.joint_bounds[:, i]), color=_VIOLET, linewidth=1.0, linestyle=_DASHED)
     axes.set_ylim(0.0, 1.15 * max(float(seen.error_bound.max()), float(seen.error.max()), 1e-12))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     _title(axes, "tracking error [rad]")
@@ -128,7 +129,7 @@ def _draw_flags(axes: Axes, seen: Monitored) -> None:
     for k, name in enumerate(names):
         bars = [(seen.t[begin], seen.t[end] - seen.t[begin]) for begin, end in stretches(seen.failures[name])]
         axes.broken_barh(bars, (k - 0.35, 0.7), color=SATURATED if name is Assumption.EFFORT else ERROR, linewidth=0)
-    axes.set_yticks(range(len(names)), names)
+    axes.set_yticks(range(len(names)), [fill(name, 26) for name in names])
     axes.set_ylim(max(len(names), 1) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
     if not names:
@@ -194,12 +195,21 @@ def _mark(axes: Axes, seen: Monitored, name: str, values: np.ndarray) -> None:
     """Where the quantity of that name went beyond its bound."""
     if name in seen.excesses:
         where = np.where(seen.excesses[name], values, np.nan)
-        axes.plot(*thin(seen.t, where), color=ERROR, linewidth=2.2, label="promise broken")
+        label = "promise broken" if name == next(iter(seen.excesses)) else None
+        axes.plot(*thin(seen.t, where), color=ERROR, linewidth=2.2, label=label)
 
 
 def _title(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="left", color=_INK)
-    axes.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+    axes.legend(
+        frameon=False,
+        ncols=6,
+        handlelength=1.4,
+        columnspacing=1.2,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.1,
+    )
 
 
 def _plain(text: str) -> str:

@@ -4,7 +4,7 @@ Whatever the cause, a promise can only be broken by torques that are not admissi
 ones, V exceeds what was promised by at most the energy that the rest of the torque has brought, less what has decayed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,6 +48,11 @@ def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption,
         return f"promise broken{at}; of its assumptions this failed: {named}"
     why = f"this failed and does not account for it: {named}" if named else "none of its assumptions failed"
     return f"promise broken{at}, {why}: {WRONG}"
+
+
+def listed(excesses: Sequence[str]) -> str:
+    """What went beyond its bound, in a few words."""
+    return ", ".join(excesses[:3]) + (" and others" if len(excesses) > 3 else "")
 
 
 class Promise(NamedTuple):

@@ -15,6 +15,7 @@ from nbs_pin.certificates.assumptions import (
     failures,
     greatest,
     is_cut,
+    listed,
     quantities,
     sentence,
     summed,
@@ -78,7 +79,7 @@ class Monitored:
     def verdict(self) -> str:
         """One sentence: whether the promise was kept, and if not, by what, and which assumption failed or that none."""
         failed = {name: f" (t = {self.t[:-1][when][0]:.4g} s)" for name, when in self.failures.items()}
-        at = "" if self.is_kept else f" at t = {self.t[self.exceeded][0]:.4g} s by {', '.join(self.excesses)}"
+        at = "" if self.is_kept else f" at t = {self.t[self.exceeded][0]:.4g} s by {listed(tuple(self.excesses))}"
         return sentence(at, self.is_kept, self.is_wrong, failed, is_recorded=self.is_recorded)
 
 

@@ -16,6 +16,7 @@ from nbs_pin.certificates.assumptions import (
     excess_of,
     failures,
     greatest,
+    listed,
     quantities,
     sentence,
     wraps,
@@ -170,7 +171,7 @@ class Watch:
         names = zip(self._promise(memory).names, seen.over.tolist(), strict=True)
         excesses = tuple(name for name, is_over in names if is_over)
         is_wrong = seen.is_unaccounted and Assumption.WRAP not in memory.broken
-        at, failed = f" by {', '.join(excesses)}", dict.fromkeys(memory.broken, "")
+        at, failed = f" by {listed(excesses)}", dict.fromkeys(memory.broken, "")
         return Watched(
             storage=memory.storage,
             promise=float(seen.bounds[0]),
