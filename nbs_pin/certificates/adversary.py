@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.arena import Arena, Peaks, check_law
+from nbs_pin.certificates.arena import Arena, Peaks, law_of
 from nbs_pin.certificates.torque_waves import FASTEST, SLOWEST, constant, in_step, random_disturbances, square
 from nbs_pin.checks import PerJoint, floats
 from nbs_pin.controllers.controller import Controller
@@ -120,7 +120,7 @@ def worst_of(
 
     Arguments as in `attack`, errors too. Raises ArgumentError for disturbances of another shape or not finite.
     """
-    check_law(controller)
+    law_of(controller)
     _check_count("seed", seed, 0)
     disturbances = floats("disturbances", disturbances)
     if disturbances.ndim != 3 or disturbances.shape[-1] != controller.nv or 0 in disturbances.shape:

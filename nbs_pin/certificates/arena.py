@@ -61,19 +61,17 @@ class Arena:
         seed: int,
     ) -> "Arena":
         """The loop with the arguments of `attack`; raises ArgumentError when they do not fit."""
-        check_law(controller)
+        law = law_of(controller)
         positive("period", period, "s")
-        truth = controller.dynamics if plant_dynamics is None else plant_dynamics
-        followed = motions_of(controller.dynamics, reference, seed)
+        truth = law.dynamics if plant_dynamics is None else plant_dynamics
+        followed = motions_of(law.dynamics, reference, seed)
         if duration is None:
-            lasting = TIME_CONSTANTS / slowest_rate(controller, followed[0])
+            lasting = TIME_CONSTANTS / slowest_rate(law, followed[0])
             duration = period * min(max(math.ceil(lasting / period), 10), MOST_PERIODS)
-        plant = DynamicsPlant(truth, friction=controller.friction)
-        loop = Loop.of(
-            plant, controller.nv, duration, period, plant_step=None, effort_limit=effort_limit, lookahead=None
-        )
+        plant = DynamicsPlant(truth, friction=law.friction)
+        loop = Loop.of(plant, law.nv, duration, period, plant_step=None, effort_limit=effort_limit, lookahead=None)
         scenes = Batch.joined([Batch.of(loop, motion) for motion in followed])
-        return cls(controller, scenes, engine_for(controller, loop))
+        return cls(law, scenes, engine_for(law, loop))
 
     @property
     def loop(self) -> Loop:
@@ -135,13 +133,14 @@ class Arena:
         return z1
 
 
-def check_law(controller: Any) -> None:
-    """Raises ArgumentError unless it is a law with a model, which gradients of a motion go through."""
+def law_of(controller: Any) -> ModelLaw:
+    """The controller, once it is sure to be a law with a model; raises ArgumentError else."""
     if not isinstance(controller, ModelLaw):
         raise ArgumentError(
             f"a {type(controller).__name__} is no law with a model, which gradients of a motion go through; give a "
             "NeuralBackstepping, ComputedTorque or SlotineLi, and of a compiled law what it was compiled from."
         )
+    return controller
 
 
 def motions_of(
