@@ -273,6 +273,27 @@ def test_a_torque_held_too_long_is_named(law):
     assert not seen.is_wrong
 
 
+def test_a_reference_that_jumps_is_named():
+    """V jumps with it; that is no fault of the certificate. A smooth one is never named, however fast."""
+    robot = nbs.load_robot("two_link").with_effort_limit(np.inf)
+    law = nbs.NeuralBackstepping.for_robot(robot)
+    certificate, plant = nbs.certify(law, np.full(2, 0.1)), nbs.DynamicsPlant(law.dynamics)
+    hold = nbs.Hold(np.zeros(2))
+
+    def stepping(t):
+        aim = hold(t)
+        return nbs.Reference(aim.q + np.where(np.asarray(t) >= 0.05, 0.2, 0.0)[..., None], aim.v, aim.a)
+
+    seen = monitor(nbs.simulate(plant, law, stepping, 0.1, 0.001), certificate)
+    assert Assumption.REFERENCE in seen.broken
+    assert not seen.is_kept
+    assert not seen.is_wrong
+    for rate in (0.1, 3.0, 30.0):
+        fast = nbs.Sinusoid(np.array([0.5, -1.0]), rate, np.array([0.0, 1.0]))
+        smooth = monitor(nbs.simulate(plant, law, fast, 0.1, 0.001), certificate)
+        assert Assumption.REFERENCE not in smooth.broken
+
+
 def test_an_error_that_wraps_is_named():
     """A continuous joint thrown over its top by a torque no law could hold."""
     robot = nbs.load_robot("kinova")

@@ -143,21 +143,22 @@ class Setting(NamedTuple):
 def failures(
     flow: Balance,
     setting: Setting,
-    wrapped: Bool[np.ndarray, " periods"],
+    jumped: Mapping[Assumption, Bool[np.ndarray, " periods"]],
     held: Bool[np.ndarray, " periods"],
     is_broken: bool,
     recorded: Float[np.ndarray, "rows n"] | None,
 ) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
     """The assumptions that failed by more than can be told from the error of differences, and when.
 
-    held: when what the held torque has brought is worth reporting; where a promise `is_broken`, any of it is.
+    jumped: as `jumps` finds it. held: when what the held torque has brought is worth reporting; where a promise
+    `is_broken`, any of it is.
     recorded: the disturbance [N·m]; where it is None or zero, model and disturbance cannot be told apart, and what is
     unexplained is said of both.
     """
     told, admissible = setting.told, setting.admissible
     rest = beyond(admissible, flow.unexplained, setting.granted)
     unexplained = np.linalg.norm(rest, axis=-1) > told
-    found = {Assumption.EFFORT: is_cut(flow), Assumption.WRAP: wrapped}
+    found = {Assumption.EFFORT: is_cut(flow), **jumped}
     found[Assumption.TIME] = held | (is_broken & (setting.beyond(flow.unexplained - rest + flow.lag) > told))
     if recorded is None or not recorded.any():
         found[Assumption.MODEL] = found[Assumption.DISTURBANCE] = unexplained
@@ -219,9 +220,23 @@ def is_cut(flow: Balance) -> Bool[np.ndarray, " periods"]:
     return np.asarray((flow.cut != 0.0).any(axis=-1))
 
 
-def wraps(controller: NeuralBackstepping, z1: Float[np.ndarray, "rows n"]) -> Bool[np.ndarray, " periods"]:
-    """Whether an error jumped from one end of its turn to the other."""
-    robot = controller.dynamics.robot
-    if robot is None:
-        return np.zeros(len(z1) - 1, dtype=bool)
-    return np.asarray((np.abs(np.diff(z1, axis=0)) > np.pi)[:, robot.continuous].any(axis=-1))
+JUMPS = (Assumption.WRAP, Assumption.REFERENCE)
+"""Assumptions without which V itself jumps, so that no power accounts for what it does."""
+
+
+def jumps(controller: NeuralBackstepping, at: Instants) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
+    """When an error leapt from one end of its turn to the other, and when the reference is no motion with a velocity.
+
+    Between two instants a smooth reference moves by the mean of its velocities, but for a share of their change.
+    """
+    z1, robot = controller.dynamics.difference(at.q, at.q_ref), controller.dynamics.robot
+    wrapped = np.zeros(len(z1) - 1, dtype=bool)
+    if robot is not None:
+        wrapped = (np.abs(np.diff(z1, axis=0)) > np.pi)[:, robot.continuous].any(axis=-1)
+    broken = wrapped & False
+    for x, rate in ((at.q_ref, at.v_ref), (at.v_ref, at.a_ref)):
+        step = np.diff(at.t)[:, None]
+        rest = np.abs(np.diff(x, axis=0) - 0.5 * step * (rate[1:] + rate[:-1]))
+        size = 1.0 + np.abs(x[1:])
+        broken = broken | (rest > step * np.abs(np.diff(rate, axis=0)) + 1e-9 * size).any(axis=-1)
+    return {Assumption.WRAP: np.asarray(wrapped), Assumption.REFERENCE: np.asarray(broken)}

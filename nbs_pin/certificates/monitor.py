@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nbs_pin.certificates.assumptions import (
+    JUMPS,
     NOTICEABLE,
     Promise,
     Setting,
@@ -15,11 +16,11 @@ from nbs_pin.certificates.assumptions import (
     failures,
     greatest,
     is_cut,
+    jumps,
     listed,
     quantities,
     sentence,
     summed,
-    wraps,
 )
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
@@ -106,11 +107,11 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
     over = promise.exceeded(values, bounds)
     setting, steps, decay = Setting.of(certificate, flow, at), np.diff(at.t), certificate.level.c
     held = (summed(flow.held, steps, decay) > NOTICEABLE * bounds[:, 0])[1:]
-    failed = failures(flow, setting, wraps(controller, z1), held, bool(over.any()), recorded)
+    failed = failures(flow, setting, jumps(controller, at), held, bool(over.any()), recorded)
     power, ratio = excess_of(flow, setting)
     so_far = np.maximum.accumulate(np.concatenate([[1.0], ratio]))
     accounted = promise.accounted(bounds, summed(power, steps, decay), so_far)
-    is_wrong = Assumption.WRAP not in failed and bool((over & (values > accounted)).any())
+    is_wrong = not any(name in failed for name in JUMPS) and bool((over & (values > accounted)).any())
     if over.any() and not failed and not is_wrong:
         failed = dict.fromkeys(greatest(flow, certificate.admissible, recorded), power > 0.0)
     return Monitored(

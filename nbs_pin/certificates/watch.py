@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nbs_pin.certificates.assumptions import (
+    JUMPS,
     NOTICEABLE,
     Promise,
     Setting,
@@ -16,10 +17,10 @@ from nbs_pin.certificates.assumptions import (
     excess_of,
     failures,
     greatest,
+    jumps,
     listed,
     quantities,
     sentence,
-    wraps,
 )
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
@@ -159,9 +160,8 @@ class Watch:
     ) -> tuple[Assumption, ...]:
         """The assumptions that have failed, those of the last period among them."""
         controller = self.certificate.controller
-        wrapped = wraps(controller, controller.dynamics.difference(both.q, both.q_ref))
         held = np.array([memory.held > NOTICEABLE * seen.bounds[0]])
-        failed = failures(flow, setting, wrapped, held, bool(seen.over.any()), None)
+        failed = failures(flow, setting, jumps(controller, both), held, bool(seen.over.any()), None)
         broken = tuple(name for name in Assumption if name in failed or name in memory.broken)
         if seen.over.any() and not broken and not seen.is_unaccounted:
             return greatest(flow, setting.admissible, None)
@@ -170,7 +170,7 @@ class Watch:
     def _said(self, memory: WatchMemory, flow: Balance | None, seen: _Seen) -> Watched:
         names = zip(self._promise(memory).names, seen.over.tolist(), strict=True)
         excesses = tuple(name for name, is_over in names if is_over)
-        is_wrong = seen.is_unaccounted and Assumption.WRAP not in memory.broken
+        is_wrong = seen.is_unaccounted and not any(name in memory.broken for name in JUMPS)
         at, failed = f" by {listed(excesses)}", dict.fromkeys(memory.broken, "")
         return Watched(
             storage=memory.storage,
