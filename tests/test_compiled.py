@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -32,6 +33,7 @@ from nbs_pin.robot import load_robot
 from nbs_pin.runtime import jit, laws
 from nbs_pin.runtime.convex import potential
 from nbs_pin.runtime.damping import damping_force, tanh
+from nbs_pin.runtime.jit import compile_for
 from nbs_pin.runtime.laws import difference
 from nbs_pin.runtime.layout import workspace
 from nbs_pin.state import Reference
@@ -491,3 +493,14 @@ def test_machine_code_is_stamped_with_the_whole_folder():
     stamps = {laws.law_row._cache._cache_file._source_stamp, potential._cache._cache_file._source_stamp}
     assert stamps == {jit._SOURCES}
     assert len(jit._SOURCES) == 64
+
+
+def test_a_kernel_that_another_compiled_refuses_other_arguments_too():
+    """Whatever was compiled before it in the process, the fast path meets a TypeError and converts."""
+    inner = numba.njit(lambda x: x[0])
+    outer = numba.njit(lambda x: 2.0 * inner(x))
+    assert outer(np.ones(1)) == 2.0
+    compile_for(inner, numba.float64(numba.float64[::1]))
+    assert inner(np.ones(1)) == 1.0
+    with pytest.raises(TypeError):
+        inner(np.ones((1, 1)))

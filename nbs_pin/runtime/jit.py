@@ -32,7 +32,7 @@ def compile_for(dispatcher: Any, signature: Any) -> None:
     if signature.args not in dispatcher.overloads:
         dispatcher.disable_compile(False)
         dispatcher.compile(signature)
-        dispatcher.disable_compile()
+    dispatcher.disable_compile()  # even if another kernel, which calls this one, has compiled it before
 
 
 def _sources() -> str:
