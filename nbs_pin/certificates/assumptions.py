@@ -24,6 +24,7 @@ ROUNDING, DIFFERENCES = 1e-9, 1e-3
 NOTICEABLE = 0.01
 """Share of what V may be that a held torque may bring before it is reported."""
 _EPS = float(np.finfo(float).eps)
+_OF_RATE = 0.1
 _OF_BOUND, _OF_TORQUE = 1e-2, 1e-3  # torques below these shares are not told from the error of differences
 
 
@@ -227,7 +228,8 @@ JUMPS = (Assumption.WRAP, Assumption.REFERENCE)
 def jumps(controller: NeuralBackstepping, at: Instants) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
     """When an error leapt from one end of its turn to the other, and when the reference is no motion with a velocity.
 
-    Between two instants a smooth reference moves by the mean of its velocities, but for a share of their change.
+    Between two instants a smooth reference moves by the mean of its velocities, but for a share of these and of their
+    change; so does its velocity by the mean of its accelerations, which may jump.
     """
     z1, robot = controller.dynamics.difference(at.q, at.q_ref), controller.dynamics.robot
     wrapped = np.zeros(len(z1) - 1, dtype=bool)
@@ -237,6 +239,7 @@ def jumps(controller: NeuralBackstepping, at: Instants) -> dict[Assumption, Bool
     for x, rate in ((at.q_ref, at.v_ref), (at.v_ref, at.a_ref)):
         step = np.diff(at.t)[:, None]
         rest = np.abs(np.diff(x, axis=0) - 0.5 * step * (rate[1:] + rate[:-1]))
-        size = 1.0 + np.abs(x[1:])
-        broken = broken | (rest > step * np.abs(np.diff(rate, axis=0)) + 1e-9 * size).any(axis=-1)
+        change, size = np.abs(np.diff(rate, axis=0)), np.abs(rate[1:]) + np.abs(rate[:-1])
+        allowed = step * (change + _OF_RATE * size) + ROUNDING * (1.0 + np.abs(x[1:]))
+        broken = broken | (rest > allowed).any(axis=-1)
     return {Assumption.WRAP: np.asarray(wrapped), Assumption.REFERENCE: np.asarray(broken)}

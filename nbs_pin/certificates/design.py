@@ -2,7 +2,7 @@
 
 For the inertia-shaped law with K = s²K̂, D₀ = sD̂₀ and ω = sω̂ every constant of the proof scales with the speed s: V∞
 and Φ∞ fall with s⁻², the errors √(2Φ∞/K_i) with s⁻⁴ under the root, which is s⁻². So one bound per shape (K̂, D̂₀, ω̂)
-gives the slowest loop of that shape that certifies the wanted error (docs/certificates.md).
+gives the slowest loop of that shape that certifies the wanted error (docs/certificates.md §8).
 """
 
 from collections.abc import Iterator, Sequence
