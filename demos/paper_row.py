@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 import nbs_pin as nbs
-from nbs_pin import metrics
+from nbs_pin.simulation import metrics
 
 PERIOD = 0.01
 

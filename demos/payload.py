@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import nbs_pin as nbs
-from nbs_pin.catalogue import find
+from nbs_pin.robots.catalogue import find
 
 LOAD = """
 <robot>

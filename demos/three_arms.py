@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 import nbs_pin as nbs
-from nbs_pin.studies import tracking
-from nbs_pin.versions import versions
+from nbs_pin.base.versions import versions
+from nbs_pin.cli import tracking
 
 ARMS = ("two_link", "three_link", "panda")
 START_ERROR = 0.3  # rad, in every joint, with alternating sign

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import nbs_pin as nbs
-from nbs_pin.charts import plot_training
+from nbs_pin.reports.charts import plot_training
 
 PERIOD = 0.005
 

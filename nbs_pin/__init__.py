@@ -18,21 +18,21 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "nbs_pin.catalogue": ("ROBOT_NAMES",),
+    "nbs_pin.robots.catalogue": ("ROBOT_NAMES",),
     "nbs_pin.certificates.admissible": ("Admissible",),
-    "nbs_pin.certificates.adversary": ("Attack", "attack"),
-    "nbs_pin.certificates.certificate": ("Certificate", "certify"),
-    "nbs_pin.certificates.design": ("Proposal", "propose"),
+    "nbs_pin.certificates.attack": ("Attack", "attack"),
+    "nbs_pin.certificates.certify": ("Certificate", "certify"),
+    "nbs_pin.certificates.propose": ("Proposal", "propose"),
     "nbs_pin.certificates.monitor": ("Monitored", "monitor"),
-    "nbs_pin.certificates.watch": ("Watch",),
-    "nbs_pin.checkpoints": ("load", "save"),
+    "nbs_pin.certificates.online_monitor": ("Watch",),
+    "nbs_pin.storage.checkpoints": ("load", "save"),
     "nbs_pin.controllers.computed_torque": ("ComputedTorque",),
     "nbs_pin.controllers.controller": ("Controller", "MemorylessController"),
     "nbs_pin.controllers.neural_backstepping": ("NeuralBackstepping", "paper_controller"),
     "nbs_pin.controllers.pd": ("PD",),
     "nbs_pin.controllers.pid": ("PID",),
     "nbs_pin.controllers.slotine_li": ("SlotineLi",),
-    "nbs_pin.disturbances": ("ConstantTorque", "SinusoidalTorque", "SquareWave", "TorqueNoise"),
+    "nbs_pin.motions.disturbances": ("ConstantTorque", "SinusoidalTorque", "SquareWave", "TorqueNoise"),
     "nbs_pin.dynamics.analytic": ("AnalyticDynamics",),
     "nbs_pin.dynamics.equations": (
         "bias",
@@ -48,28 +48,28 @@ _HOMES = {
     "nbs_pin.dynamics.pinocchio": ("PinocchioDynamics",),
     "nbs_pin.dynamics.provider": ("DynamicsProvider",),
     "nbs_pin.dynamics.residual": ("ResidualDynamics",),
-    "nbs_pin.exceptions": ("NbsPinError",),
-    "nbs_pin.learning.costs": ("TimeOutside", "TorqueAware", "squared_error"),
-    "nbs_pin.learning.datasets": ("Dataset", "load_dataset"),
-    "nbs_pin.learning.fitting": ("fit",),
-    "nbs_pin.learning.identification": ("identify",),
-    "nbs_pin.learning.logs": ("load_log",),
-    "nbs_pin.learning.measuring": ("Noise",),
-    "nbs_pin.learning.recipes": ("collect",),
-    "nbs_pin.learning.training": ("Training", "train"),
-    "nbs_pin.model_error": ("ModelErrors", "compare"),
-    "nbs_pin.networks.damping": ("Damping",),
-    "nbs_pin.networks.potential": ("Potential",),
-    "nbs_pin.plants.dynamics_plant": ("DynamicsPlant",),
-    "nbs_pin.plants.mujoco_plant": ("MujocoPlant",),
-    "nbs_pin.plants.plant": ("Plant",),
-    "nbs_pin.plotting": ("plot_tracking",),
-    "nbs_pin.reference_files": ("Sampled", "load_reference"),
-    "nbs_pin.references": ("Hold", "MinimumJerk", "Sinusoid", "check_reference", "paper_reference"),
-    "nbs_pin.replay_page": ("replay",),
-    "nbs_pin.robot": ("Robot", "load_robot"),
-    "nbs_pin.simulation": ("simulate", "stream"),
-    "nbs_pin.state": ("Reference", "Run"),
+    "nbs_pin.base.exceptions": ("NbsPinError",),
+    "nbs_pin.simulation.costs": ("TimeOutside", "TorqueAware", "squared_error"),
+    "nbs_pin.identification.datasets": ("Dataset", "load_dataset"),
+    "nbs_pin.identification.fit": ("fit",),
+    "nbs_pin.identification.identify": ("identify",),
+    "nbs_pin.identification.logs": ("load_log",),
+    "nbs_pin.identification.measurement": ("Noise",),
+    "nbs_pin.identification.collect": ("collect",),
+    "nbs_pin.training.train": ("Training", "train"),
+    "nbs_pin.accuracy.compare": ("ModelErrors", "compare"),
+    "nbs_pin.controllers.damping": ("Damping",),
+    "nbs_pin.controllers.potential": ("Potential",),
+    "nbs_pin.simulation.dynamics_plant": ("DynamicsPlant",),
+    "nbs_pin.simulation.mujoco_plant": ("MujocoPlant",),
+    "nbs_pin.simulation.plant": ("Plant",),
+    "nbs_pin.reports.plotting": ("plot_tracking",),
+    "nbs_pin.motions.reference_files": ("Sampled", "load_reference"),
+    "nbs_pin.motions.references": ("Hold", "MinimumJerk", "Sinusoid", "check_reference", "paper_reference"),
+    "nbs_pin.reports.replay": ("replay",),
+    "nbs_pin.robots.robot": ("Robot", "load_robot"),
+    "nbs_pin.simulation.simulate": ("simulate", "stream"),
+    "nbs_pin.base.records": ("Reference", "Run"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
@@ -79,7 +79,7 @@ __all__ = ["__version__", "metrics", *sorted(_HOME_OF)]
 def __getattr__(name: str) -> Any:
     """A public name, imported from its room at first use: `import nbs_pin` stays light."""
     if name == "metrics":
-        return import_module("nbs_pin.metrics")
+        return import_module("nbs_pin.simulation.metrics")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'nbs_pin' has no attribute '{name}'")
     return getattr(import_module(_HOME_OF[name]), name)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from nbs_pin.networks.activations import SmoothedReLU, Squareplus
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import Potential
-from nbs_pin.runtime.adjoints import adjoint_workspace, law_adjoint, pid_adjoint
-from nbs_pin.runtime.convex import subtract_tangent
-from nbs_pin.runtime.convex_adjoint import potential_adjoint, room_for_potential
-from nbs_pin.runtime.damping_adjoint import damping_adjoint, room_for_damping
-from nbs_pin.runtime.laws import law_row, pid
-from nbs_pin.runtime.layout import (
+from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
+from nbs_pin.controllers.damping import Damping
+from nbs_pin.controllers.potential import Potential
+from nbs_pin.kernels.convex import subtract_tangent
+from nbs_pin.kernels.convex_adjoint import potential_adjoint, room_for_potential
+from nbs_pin.kernels.damping_adjoint import damping_adjoint, room_for_damping
+from nbs_pin.kernels.law_adjoints import adjoint_workspace, law_adjoint, pid_adjoint
+from nbs_pin.kernels.laws import law_row, pid
+from nbs_pin.kernels.layout import (
     BACKSTEPPING,
     COMPUTED_TORQUE,
     PART_HEADER,

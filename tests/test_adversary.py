@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import nbs_pin as nbs
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.adversary import attack, random_disturbances, worst_of
-from nbs_pin.certificates.arena import Arena, motions_of, slowest_rate
+from nbs_pin.certificates.attack import attack, random_disturbances, worst_of
+from nbs_pin.certificates.ensemble import Arena, motions_of, slowest_rate
 from nbs_pin.certificates.torque_waves import KINDS
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.references import Hold
-from nbs_pin.studies.certificate_study import constant_damping, one_joint
+from nbs_pin.motions.references import Hold
+from nbs_pin.reproduction.certificate_study import constant_damping, one_joint
 
 
 def linear_loop(stiffness, damping):

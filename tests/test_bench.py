@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.benchmarks import bench
+from nbs_pin.benchmarks.serial_chains import serial_chain
 from nbs_pin.cli import main
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.studies import bench
-from nbs_pin.studies.chains import serial_chain
 
 
 @pytest.mark.parametrize("joints", [1, 4, 30])

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import nbs_pin as nbs
+from nbs_pin.accuracy.mismatch import mismatch
+from nbs_pin.base.claims import Claim, Condition, Label, weakest
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.certificates import one_joint
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.claims import Claim, Condition, Label, weakest
-from nbs_pin.certificates.comparison import _STEEPNESS, Comparison, _growth, decay, level, reach
+from nbs_pin.certificates.comparison_system import _STEEPNESS, Comparison, _growth, decay, level, reach
 from nbs_pin.controllers.gains import gains_for_robot
-from nbs_pin.exceptions import ArgumentError, CertificateRefused
-from nbs_pin.mismatch import mismatch
 
 POSITIVE = st.floats(0.05, 20.0)
 CONSTANTS = st.builds(
@@ -233,7 +233,7 @@ def test_the_bound_grows_in_proportion_to_the_disturbance():
 
 def test_no_random_disturbance_breaks_a_bound():
     """Two arms, both kinds of damping; the thousand of each arm are `nbs-pin reproduce --part certificates`."""
-    from nbs_pin.certificates.adversary import worst_of
+    from nbs_pin.certificates.attack import worst_of
     from nbs_pin.certificates.torque_waves import random_disturbances
 
     for name, damping in (("two_link", "inertial"), ("two_link", "bounded"), ("three_link", "bounded")):
@@ -277,7 +277,7 @@ def test_what_follows_is_known_no_better_than_what_it_rests_on():
 
 
 def nbs_network(robot):
-    from nbs_pin.networks.families import make_network
+    from nbs_pin.dynamics.families import make_network
 
     return make_network("cholesky", [False] * robot.nv, seed=0)
 

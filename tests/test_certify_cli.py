@@ -12,13 +12,14 @@ import pytest
 
 import nbs_pin as nbs
 from nbs_pin import cli
-from nbs_pin.catalogue import find
-from nbs_pin.certificates.certificate import certify
-from nbs_pin.certificates.claims import Assumption
+from nbs_pin.base.claims import Assumption
+from nbs_pin.base.records import Run
+from nbs_pin.base.versions import versions
+from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.loads import friction, gravity_error, payload, total
-from nbs_pin.state import Run
-from nbs_pin.studies import certificate_poses, certificate_study, certifying
-from nbs_pin.versions import versions
+from nbs_pin.cli import certifying
+from nbs_pin.reproduction import certificate_poses, certificate_study
+from nbs_pin.robots.catalogue import find
 
 LOADS = ("--payload", "0.5", "--friction", "0.1,0.2", "--gravity-error", "0.2")
 GANTRY = Path(__file__).parent / "data" / "gantry.urdf"

@@ -11,30 +11,30 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import nbs_pin as nbs
-from nbs_pin.arrays import matvec
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.pd import PD
+from nbs_pin.dynamics.chain import Chain, Tree, random_tree
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import coordinates
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.learning.chain_fit import TreeGeometry, fit_chain
-from nbs_pin.learning.datasets import Dataset, joint_tree
-from nbs_pin.learning.fitting import fit
-from nbs_pin.learning.identification import explain, identify
-from nbs_pin.learning.levenberg_marquardt import Normal, levenberg_marquardt
-from nbs_pin.learning.measuring import Noise
-from nbs_pin.learning.physical_tree import FREE, PARALLEL, RIGHT, PhysicalTree
-from nbs_pin.learning.recipes import collect
-from nbs_pin.learning.regressor import RobotGeometry, Scalars
-from nbs_pin.learning.tree_guess import Measured, TreeGuess
-from nbs_pin.learning.unexcited import unexcited
-from nbs_pin.networks.chain import Chain, Tree, random_tree
-from nbs_pin.robot import load_robot
-from nbs_pin.runtime.layout import Packed
-from nbs_pin.runtime.tree_layout import BODY, tree_workspace
-from nbs_pin.runtime.tree_parameters import COLUMNS, tree_derivatives
+from nbs_pin.identification.chain_fit import TreeGeometry, fit_chain
+from nbs_pin.identification.collect import collect
+from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.fit import fit
+from nbs_pin.identification.identify import explain, identify
+from nbs_pin.identification.levenberg_marquardt import Normal, levenberg_marquardt
+from nbs_pin.identification.measurement import Noise
+from nbs_pin.identification.physical_tree import FREE, PARALLEL, RIGHT, PhysicalTree
+from nbs_pin.identification.regressor import RobotGeometry, Scalars
+from nbs_pin.identification.tree_search import Measured, TreeGuess
+from nbs_pin.identification.unidentifiable import unexcited
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.tree_layout import BODY, tree_workspace
+from nbs_pin.kernels.tree_parameters import COLUMNS, tree_derivatives
+from nbs_pin.robots.robot import load_robot
 from tests.test_dynamics import GANTRY, relative
 
 TREES = [
@@ -742,8 +742,8 @@ def test_ctrl_c_goes_on_with_the_best_tree_so_far(monkeypatch):
                 raise KeyboardInterrupt
         return levenberg_marquardt(*arguments, **options)
 
-    monkeypatch.setattr("nbs_pin.learning.chain_fit.levenberg_marquardt", interrupted)
-    monkeypatch.setattr("nbs_pin.learning.chain_fit._settled", lambda costs: False)
+    monkeypatch.setattr("nbs_pin.identification.chain_fit.levenberg_marquardt", interrupted)
+    monkeypatch.setattr("nbs_pin.identification.chain_fit._settled", lambda costs: False)
     found = fit_chain(data)
     assert found.stopped == "interrupted"
     assert len(found.costs) == 8

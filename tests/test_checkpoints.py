@@ -18,27 +18,27 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 import nbs_pin as nbs
-from nbs_pin.archives import read_archive, write_archive
-from nbs_pin.checkpoints import FORMAT, TrainingState, about, read_checkpoint, write_checkpoint
+from nbs_pin.base.archives import read_archive, write_archive
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError, RobotError, RobotNotFound
+from nbs_pin.base.files import ABANDONED, whole_file
+from nbs_pin.base.npz import LARGEST
+from nbs_pin.base.records import Reference
+from nbs_pin.base.versions import versions
+from nbs_pin.benchmarks.serial_chains import serial_chain
+from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
 from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.controllers.convex import FICNN
+from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.neural_backstepping import DAMPINGS, NeuralBackstepping, paper_controller
 from nbs_pin.controllers.pd import PD
 from nbs_pin.controllers.pid import PID
+from nbs_pin.controllers.potential import POTENTIALS, Potential
 from nbs_pin.controllers.slotine_li import SlotineLi
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.exceptions import ArgumentError, FileFormatError, RobotError, RobotNotFound
-from nbs_pin.files import ABANDONED, whole_file
-from nbs_pin.networks.activations import SmoothedReLU, Squareplus
-from nbs_pin.networks.convex import FICNN
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import POTENTIALS, Potential
-from nbs_pin.npz import LARGEST
-from nbs_pin.robot import load_robot
-from nbs_pin.state import Reference
-from nbs_pin.studies.chains import serial_chain
-from nbs_pin.versions import versions
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.storage.checkpoints import FORMAT, TrainingState, about, read_checkpoint, write_checkpoint
 from tests.test_networks import randomise
 
 TWO_LINK, PANDA, KINOVA = (load_robot(name) for name in ("two_link", "panda", "kinova"))

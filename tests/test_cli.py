@@ -17,10 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import nbs_pin as nbs
-from nbs_pin import cli, metrics
+from nbs_pin import cli
+from nbs_pin.base.versions import versions
+from nbs_pin.cli import tracking
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_number
-from nbs_pin.studies import tracking
-from nbs_pin.versions import versions
+from nbs_pin.simulation import metrics
 
 NBS_PIN = (sys.executable, "-m", "nbs_pin.cli")
 TRACKS = {
@@ -167,7 +168,7 @@ def test_a_motion_from_a_file_is_followed_for_its_length(tmp_path, capsys):
 
 
 def test_an_arm_from_a_file_is_found_again_from_anywhere(tmp_path, monkeypatch, capsys):
-    from nbs_pin.catalogue import find
+    from nbs_pin.robots.catalogue import find
 
     urdf = find("two_link").path.read_text()
     (tmp_path / "arm.urdf").write_text(urdf.replace('name="two_link"', 'name="my/arm"'))
@@ -314,7 +315,7 @@ def test_ctrl_c_while_drawing_keeps_the_old_results_whole(two_link, monkeypatch,
         raise KeyboardInterrupt
 
     before = contents(two_link)
-    monkeypatch.setattr("nbs_pin.replay_page.replay", interrupted)
+    monkeypatch.setattr("nbs_pin.reports.replay.replay", interrupted)
     assert cli.main(["track", "two_link", "--duration", "0.1", "--seed", "9", "--force", "--out", str(two_link)]) == 130
     assert "interrupted" in capsys.readouterr().err
     assert contents(two_link) == before

@@ -8,11 +8,11 @@ from numpy.testing import assert_array_equal
 
 import nbs_pin as nbs
 from nbs_pin import cli
-from nbs_pin.learning.datasets import load_dataset
-from nbs_pin.learning.measuring import Noise
-from nbs_pin.learning.recipes import collect
-from nbs_pin.studies import collecting
-from nbs_pin.versions import versions
+from nbs_pin.base.versions import versions
+from nbs_pin.cli import collecting
+from nbs_pin.identification.collect import collect
+from nbs_pin.identification.datasets import load_dataset
+from nbs_pin.identification.measurement import Noise
 from tests.test_plotting import png_size
 
 QUICK = ("--samples", "80", "--sampling", "0.01", "--duration", "0.4")

@@ -10,15 +10,15 @@ import pytest
 
 import nbs_pin as nbs
 from nbs_pin import cli
-from nbs_pin.catalogue import find
+from nbs_pin.accuracy.compare import compare
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.versions import versions
+from nbs_pin.cli import comparing as comparison
+from nbs_pin.dynamics.families import make_network
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.learning.datasets import Dataset
-from nbs_pin.model_error import compare
-from nbs_pin.networks.families import make_network
-from nbs_pin.studies import comparison
-from nbs_pin.versions import versions
+from nbs_pin.identification.datasets import Dataset
+from nbs_pin.robots.catalogue import find
 
 QUICK = ("--samples", "50", "--trajectories", "4")
 FILES = ["errors.csv", "errors.png", "summary.json"]

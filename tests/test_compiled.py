@@ -13,30 +13,30 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nbs_pin.arrays import array_namespace
+from nbs_pin.base.arrays import array_namespace
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
+from nbs_pin.controllers.activations import Activation, SmoothedReLU, Squareplus
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.neural_backstepping import DAMPINGS, NeuralBackstepping, paper_controller
 from nbs_pin.controllers.pd import PD
 from nbs_pin.controllers.pid import PID
+from nbs_pin.controllers.potential import POTENTIALS, Potential
 from nbs_pin.controllers.slotine_li import SlotineLi
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.activations import Activation, SmoothedReLU, Squareplus
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import POTENTIALS, Potential
-from nbs_pin.robot import load_robot
-from nbs_pin.runtime import jit, laws
-from nbs_pin.runtime.convex import potential
-from nbs_pin.runtime.damping import damping_force, tanh
-from nbs_pin.runtime.jit import compile_for
-from nbs_pin.runtime.laws import difference
-from nbs_pin.runtime.layout import workspace
-from nbs_pin.state import Reference
+from nbs_pin.kernels import jit, laws
+from nbs_pin.kernels.convex import potential
+from nbs_pin.kernels.damping import damping_force, tanh
+from nbs_pin.kernels.jit import compile_for
+from nbs_pin.kernels.laws import difference
+from nbs_pin.kernels.layout import workspace
+from nbs_pin.robots.robot import load_robot
 from tests.test_networks import randomise
 
 LAWS = {
@@ -462,7 +462,7 @@ import numpy as np
 from nbs_pin.controllers.slotine_li import SlotineLi
 from nbs_pin.controllers.pid import PID
 from nbs_pin.dynamics.analytic import AnalyticDynamics
-from nbs_pin.runtime import convex, laws
+from nbs_pin.kernels import convex, laws
 compiled = SlotineLi(AnalyticDynamics(), rate=1.0, gain=1.0).compile()
 kernels = (laws.law_row, laws.law_rows, laws.pid)
 before = [(len(k.overloads), sum(k.stats.cache_misses.values())) for k in kernels]

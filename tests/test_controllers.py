@@ -9,24 +9,24 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nbs_pin.arrays import matvec
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
 from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.gains import effective_inertia, gains_for_robot, largest_inertia
 from nbs_pin.controllers.neural_backstepping import DAMPINGS, NeuralBackstepping, paper_controller
 from nbs_pin.controllers.pd import PD
 from nbs_pin.controllers.pid import PID, PIDMemory
+from nbs_pin.controllers.potential import POTENTIALS, Potential
 from nbs_pin.controllers.slotine_li import SlotineLi
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import POTENTIALS, Potential
-from nbs_pin.plants.dynamics_plant import DynamicsPlant
-from nbs_pin.references import Hold, Sinusoid
-from nbs_pin.robot import load_robot
-from nbs_pin.simulation import simulate
-from nbs_pin.state import Reference
+from nbs_pin.motions.references import Hold, Sinusoid
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.simulate import simulate
 from tests.test_networks import randomise
 
 LAWS = {

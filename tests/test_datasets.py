@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import nbs_pin as nbs
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.exceptions import ArgumentError, FileFormatError
-from nbs_pin.learning.datasets import Dataset, joint_tree, load_dataset, trajectory_slices
-from nbs_pin.learning.excitation import configuration_box, excitation, torque_limits
-from nbs_pin.learning.logs import load_log
-from nbs_pin.learning.measuring import Noise, derivative, quantised
-from nbs_pin.learning.recipes import collect
-from nbs_pin.plants.mujoco_plant import MujocoPlant
+from nbs_pin.identification.collect import collect
+from nbs_pin.identification.datasets import Dataset, joint_tree, load_dataset, trajectory_slices
+from nbs_pin.identification.excitation import configuration_box, excitation, torque_limits
+from nbs_pin.identification.logs import load_log
+from nbs_pin.identification.measurement import Noise, derivative, quantised
+from nbs_pin.simulation.mujoco_plant import MujocoPlant
 
 GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # prismatic, revolute and continuous
 ARRAYS = ("q", "v", "a", "tau", "t", "trajectory", "parents", "prismatic")

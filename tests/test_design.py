@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import nbs_pin as nbs
+from nbs_pin.base.claims import Label
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.certificate import certify
-from nbs_pin.certificates.claims import Label
-from nbs_pin.certificates.design import FAST, PERIODS, STIFF, propose
+from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.margins import sampled_control
-from nbs_pin.exceptions import ArgumentError
+from nbs_pin.certificates.propose import FAST, PERIODS, STIFF, propose
 
 unchecked = inspect.unwrap(propose)
 """Without the annotations' own checks, as a user has it."""

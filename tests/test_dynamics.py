@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from nbs_pin.arrays import matvec
-from nbs_pin.catalogue import ROBOT_NAMES
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics import equations
 from nbs_pin.dynamics.analytic import AnalyticDynamics
+from nbs_pin.dynamics.chain import Chain
+from nbs_pin.dynamics.families import make_network
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.chain import Chain
-from nbs_pin.networks.families import make_network
-from nbs_pin.robot import load_robot
+from nbs_pin.robots.catalogue import ROBOT_NAMES
+from nbs_pin.robots.robot import load_robot
 
 GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # prismatic, revolute and continuous
 LEARNED = ["chain", "cholesky", "homogenised", "residual"]

@@ -8,16 +8,16 @@ import pytest
 import safetensors.torch
 import torch
 
-from nbs_pin.archives import read_archive, write_archive
-from nbs_pin.certificates.claims import weakest
+from nbs_pin.base.archives import read_archive, write_archive
+from nbs_pin.base.claims import weakest
+from nbs_pin.base.exceptions import NbsPinError
 from nbs_pin.certificates.structure import check_structure
-from nbs_pin.checkpoints import FORMAT, load, save
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping, paper_controller
+from nbs_pin.dynamics.cholesky import CholeskyNetwork
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.exceptions import NbsPinError
-from nbs_pin.networks.cholesky import CholeskyNetwork
-from nbs_pin.robot import load_robot
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.storage.checkpoints import FORMAT, load, save
 
 ROBOT = load_robot("two_link")
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nbs_pin.benchmarks import fair
 from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.learning.training import Training, train
-from nbs_pin.studies import fair
+from nbs_pin.training.train import Training, train
 
 SMALL = fair.Setting(
     "two_link", 0.02, starts=2, checking=1, start_error=1.0, search=2, epochs=3, duration=0.4, judged=2.0

@@ -8,19 +8,19 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 import nbs_pin as nbs
-from nbs_pin.catalogue import find
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.dynamics.families import NETWORKS, make_network
 from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.learning import network_fit
-from nbs_pin.learning.datasets import Dataset, joint_tree
-from nbs_pin.learning.fit_report import torque_errors, torque_nmse
-from nbs_pin.learning.fitting import MODELS, fit, parted
-from nbs_pin.learning.network_equations import Equation, Equations
-from nbs_pin.learning.network_fit import fit_network
-from nbs_pin.learning.recipes import collect
-from nbs_pin.learning.same_arm import arm_fault
-from nbs_pin.learning.unexcited import unexcited
-from nbs_pin.networks.families import NETWORKS, make_network
+from nbs_pin.identification import network_fit
+from nbs_pin.identification.collect import collect
+from nbs_pin.identification.compatibility import arm_fault
+from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.fit import MODELS, fit, parted
+from nbs_pin.identification.fit_report import torque_errors, torque_nmse
+from nbs_pin.identification.network_equations import Equation, Equations
+from nbs_pin.identification.network_fit import fit_network
+from nbs_pin.identification.unidentifiable import unexcited
+from nbs_pin.robots.catalogue import find
 
 ROBOT = nbs.load_robot("two_link")
 TRUTH = nbs.PinocchioDynamics(ROBOT)
@@ -79,7 +79,7 @@ def test_the_jacobian_is_that_of_finite_differences(name, loss, friction):
 def test_the_normal_equations_are_sums_over_blocks(monkeypatch):
     system = equations("cholesky", friction=FRICTION)
     theta, rows = system.theta, torch.tensor([0, 2, 3, 5])
-    monkeypatch.setattr("nbs_pin.learning.network_equations._LARGEST_BLOCK", 3 * 2 * len(theta))
+    monkeypatch.setattr("nbs_pin.identification.network_equations._LARGEST_BLOCK", 3 * 2 * len(theta))
     matrix, slope = system.normal(theta, rows)
     J, r = system.jacobian(theta, rows), system.residual(theta, rows).reshape(-1)
     assert_allclose(matrix, J.T @ J / 8, atol=1e-12)

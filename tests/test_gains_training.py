@@ -9,22 +9,22 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.controllers.damping import Damping
+from nbs_pin.controllers.gain import Gain
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.controllers.pd import PD
 from nbs_pin.controllers.pid import PID
+from nbs_pin.controllers.potential import Potential
 from nbs_pin.controllers.slotine_li import SlotineLi
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.gain import Gain
-from nbs_pin.networks.potential import Potential
-from nbs_pin.robot import load_robot
-from nbs_pin.runtime import layout
-from nbs_pin.state import Reference
+from nbs_pin.kernels import layout
+from nbs_pin.robots.robot import load_robot
 from tests.test_controllers import arguments, call
 from tests.test_networks import randomise
 

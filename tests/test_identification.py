@@ -7,20 +7,20 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from nbs_pin.arrays import matvec
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.pd import PD
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import BASIS, coordinates, inertial_parameters, pseudo_inertia, symmetric
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.learning.consistent_fit import consistent_fit
-from nbs_pin.learning.datasets import Dataset, joint_tree
-from nbs_pin.learning.identification import identify
-from nbs_pin.learning.measuring import Noise
-from nbs_pin.learning.recipes import collect
-from nbs_pin.robot import Robot, load_robot
+from nbs_pin.identification.collect import collect
+from nbs_pin.identification.consistent_fit import consistent_fit
+from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.identify import identify
+from nbs_pin.identification.measurement import Noise
+from nbs_pin.robots.robot import Robot, load_robot
 
 GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # prismatic, revolute and continuous
 REAL = Noise(encoder=2.0**-16, torque=0.5)

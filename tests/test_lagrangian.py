@@ -9,20 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import nbs_pin as nbs
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics import equations
 from nbs_pin.dynamics.analytic import AnalyticDynamics
+from nbs_pin.dynamics.cholesky import CholeskyNetwork
+from nbs_pin.dynamics.families import NETWORKS, make_network
+from nbs_pin.dynamics.features import JointFeatures
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
+from nbs_pin.dynamics.lagrangian_network import GeneralLagrangianNetwork, LagrangianNetwork
+from nbs_pin.dynamics.picnn import PICNN
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork, nominal_terms
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.cholesky import CholeskyNetwork
-from nbs_pin.networks.families import NETWORKS, make_network
-from nbs_pin.networks.features import JointFeatures
-from nbs_pin.networks.lagrangian import GeneralLagrangianNetwork, LagrangianNetwork
-from nbs_pin.networks.picnn import PICNN
-from nbs_pin.networks.softplus import SoftplusNetwork, paper_spread, softplus
+from nbs_pin.dynamics.softplus_network import SoftplusNetwork, paper_spread, softplus
 
 JOINTS = (False, True, False)
 SCALES = {"inertia": (2.0, 0.3, 5.0), "energy": 7.0, "epsilon": 0.05}

@@ -9,11 +9,11 @@ from numpy.testing import assert_array_equal
 
 import nbs_pin as nbs
 from nbs_pin import cli
-from nbs_pin.learning.datasets import load_dataset
-from nbs_pin.learning.fit_report import torque_errors
-from nbs_pin.learning.fitting import parted
-from nbs_pin.learning.recipes import collect
-from nbs_pin.studies import learning
+from nbs_pin.cli import learning
+from nbs_pin.identification.collect import collect
+from nbs_pin.identification.datasets import load_dataset
+from nbs_pin.identification.fit import parted
+from nbs_pin.identification.fit_report import torque_errors
 from tests.test_plotting import png_size
 
 ROBOT = nbs.load_robot("two_link")
@@ -82,7 +82,7 @@ def test_a_log_needs_a_named_arm(path, tmp_path, capsys):
 
 
 def test_an_early_end_keeps_the_best(path, tmp_path, monkeypatch, capsys):
-    from nbs_pin.learning.network_equations import Equations
+    from nbs_pin.identification.network_equations import Equations
 
     calls, normal = [], Equations.normal
 

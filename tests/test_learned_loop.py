@@ -8,20 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nbs_pin import metrics
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.pages import Section, page
 from nbs_pin.cli import main
 from nbs_pin.controllers.neural_backstepping import paper_controller
+from nbs_pin.dynamics.cholesky import CholeskyNetwork
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.learning.fitting import fit
-from nbs_pin.learning.recipes import collect
-from nbs_pin.networks.cholesky import CholeskyNetwork
-from nbs_pin.references import paper_reference
-from nbs_pin.robot import load_robot
-from nbs_pin.studies import figure5, learned_loop, passive_data
-from nbs_pin.studies.figure5 import Weightless
-from nbs_pin.studies.pages import Section, page
+from nbs_pin.identification.collect import collect
+from nbs_pin.identification.fit import fit
+from nbs_pin.motions.references import paper_reference
+from nbs_pin.reproduction import figure5, learned_loop, passive_data
+from nbs_pin.reproduction.figure5 import Weightless
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.simulation import metrics
 from tests.test_plotting import png_size
 
 SMALL = learned_loop.Scale(

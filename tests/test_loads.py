@@ -5,10 +5,10 @@ import pinocchio as pin
 import pytest
 
 import nbs_pin as nbs
+from nbs_pin.base.claims import Label
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.claims import Label
 from nbs_pin.certificates.loads import friction, gravity_error, label_of, payload, tool_frame, total
-from nbs_pin.exceptions import ArgumentError
 
 ARMS = ("two_link", "panda", "ur5", "kinova")
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from nbs_pin import metrics
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.state import Run
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Run
+from nbs_pin.simulation import metrics
 
 PERIOD = 0.01
 

@@ -12,15 +12,16 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 import nbs_pin as nbs
-from nbs_pin import error_charts, mismatch
-from nbs_pin.arrays import matvec
+from nbs_pin.accuracy import mismatch
+from nbs_pin.accuracy.compare import DISTANCES, SPEEDS, compare
+from nbs_pin.accuracy.energy_drift import free_motion
+from nbs_pin.accuracy.error_maps import error_map, telling_joints
+from nbs_pin.accuracy.relative_errors import ACCELERATION, Box, Errors, judge
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.error_maps import error_map, telling_joints
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.free_motion import free_motion
-from nbs_pin.learning.excitation import configuration_box
-from nbs_pin.model_error import DISTANCES, SPEEDS, compare
-from nbs_pin.relative_errors import ACCELERATION, Box, Errors, judge
+from nbs_pin.identification.excitation import configuration_box
+from nbs_pin.reports import error_charts
 from tests.test_plotting import drawn, png_size
 
 ARM = nbs.load_robot("three_link")

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nbs_pin.accuracy.compare import compare
+from nbs_pin.base.pages import Section
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.learning.recipes import collect
-from nbs_pin.model_error import compare
-from nbs_pin.robot import load_robot
-from nbs_pin.studies import model_study
-from nbs_pin.studies.inverse_mlp import fit_mlp
-from nbs_pin.studies.model_noise import Noisy, _ranking, _ratios, friction_of, noise_section
-from nbs_pin.studies.model_structure import structure_section
-from nbs_pin.studies.model_trials import MLP, SPEED, Judge, Trial, attempt, chosen, column
-from nbs_pin.studies.pages import Section
+from nbs_pin.identification.collect import collect
+from nbs_pin.reproduction import model_study
+from nbs_pin.reproduction.inverse_mlp import fit_mlp
+from nbs_pin.reproduction.model_noise import Noisy, _ranking, _ratios, friction_of, noise_section
+from nbs_pin.reproduction.model_structure import structure_section
+from nbs_pin.reproduction.model_trials import MLP, SPEED, Judge, Trial, attempt, chosen, column
+from nbs_pin.robots.robot import load_robot
 from tests.test_plotting import png_size
 
 SMALL = model_study.Scale(
@@ -61,7 +61,7 @@ def small(tmp_path_factory):
     code = f"""
 import json
 from pathlib import Path
-from nbs_pin.studies.model_study import reproduce_models
+from nbs_pin.reproduction.model_study import reproduce_models
 from tests.test_model_study import SMALL
 print(json.dumps(reproduce_models(Path({str(folder)!r}), seed=3, scale=SMALL)))
 """

@@ -8,24 +8,24 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 import nbs_pin as nbs
-from nbs_pin.certificate_charts import plot_certificate, plot_monitor
+from nbs_pin.accuracy.mismatch import mismatch
+from nbs_pin.base.claims import Assumption
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.adversary import attack, random_disturbances
 from nbs_pin.certificates.assumptions import Promise, jumps
-from nbs_pin.certificates.certificate import certify
-from nbs_pin.certificates.claims import Assumption
+from nbs_pin.certificates.attack import attack, random_disturbances
+from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.energy_balance import Instants, balance, beyond, storage_of
 from nbs_pin.certificates.monitor import monitor
-from nbs_pin.certificates.watch import Watch
+from nbs_pin.certificates.online_monitor import Watch
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
-from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave
+from nbs_pin.dynamics.families import make_network
 from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.mismatch import mismatch
-from nbs_pin.networks.families import make_network
-from nbs_pin.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE
-from nbs_pin.references import Sinusoid
-from nbs_pin.state import Reference
+from nbs_pin.motions.disturbances import ConstantTorque, SinusoidalTorque, SquareWave
+from nbs_pin.motions.references import Sinusoid
+from nbs_pin.reports.certificate_charts import plot_certificate, plot_monitor
+from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE
 
 BOUND = np.array([5.0, 3.0])
 

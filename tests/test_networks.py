@@ -6,11 +6,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.activations import SmoothedReLU, Squareplus
-from nbs_pin.networks.convex import FICNN
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import POTENTIALS, Potential
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
+from nbs_pin.controllers.convex import FICNN
+from nbs_pin.controllers.damping import Damping
+from nbs_pin.controllers.potential import POTENTIALS, Potential
 
 seeds = st.integers(0, 2**31 - 1)
 sizes = st.integers(1, 8)

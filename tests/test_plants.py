@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nbs_pin.catalogue import ROBOT_NAMES
+from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.equations import bias, energy, forward_dynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.exceptions import ArgumentError, RobotError, SimulationDiverged
-from nbs_pin.plants.dynamics_plant import DynamicsPlant
-from nbs_pin.plants.integrators import INTEGRATORS
-from nbs_pin.plants.mujoco_plant import MujocoPlant
-from nbs_pin.references import Sinusoid
-from nbs_pin.robot import load_robot
-from nbs_pin.simulation import simulate
+from nbs_pin.motions.references import Sinusoid
+from nbs_pin.robots.catalogue import ROBOT_NAMES
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.integrators import INTEGRATORS
+from nbs_pin.simulation.mujoco_plant import MujocoPlant
+from nbs_pin.simulation.simulate import simulate
 
 GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # prismatic, revolute and continuous
 PUBLISHED = {  # docs/theory.md §8: row k is the state after k − 1 steps of 1 ms

@@ -5,9 +5,9 @@ import struct
 import numpy as np
 import pytest
 
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.plotting import plot_tracking, stretches, thin
-from nbs_pin.state import Run
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Run
+from nbs_pin.reports.plotting import plot_tracking, stretches, thin
 
 
 def sinusoid_run(n, *, batch=(), rows=301, limit=5.0, names=None, **fields):
@@ -62,7 +62,7 @@ def test_any_number_of_joints_gives_a_picture_that_grows_with_them(n, tmp_path):
 
 
 def test_curves_are_those_of_the_chosen_start(tmp_path, monkeypatch):
-    from nbs_pin.plotting import ACTUAL, ERROR, TORQUE
+    from nbs_pin.reports.plotting import ACTUAL, ERROR, TORQUE
 
     run = sinusoid_run(2, batch=(3,))
     run.q[:, 2] += 0.5
@@ -74,7 +74,7 @@ def test_curves_are_those_of_the_chosen_start(tmp_path, monkeypatch):
 
 
 def test_error_of_a_continuous_joint_is_wrapped(tmp_path, monkeypatch):
-    from nbs_pin.plotting import ERROR
+    from nbs_pin.reports.plotting import ERROR
 
     run = sinusoid_run(2, continuous=np.array([True, False]))
     run.q[:] += 2.0 * np.pi

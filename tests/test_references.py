@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nbs_pin.catalogue import ROBOT_NAMES, find
-from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
-from nbs_pin.exceptions import ArgumentError, FileFormatError
-from nbs_pin.npz import write_npz
-from nbs_pin.reference_files import Sampled, load_reference
-from nbs_pin.references import Hold, MinimumJerk, Sinusoid, check_reference, paper_reference, resting_posture
-from nbs_pin.robot import load_robot
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
+from nbs_pin.base.npz import write_npz
+from nbs_pin.motions.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
+from nbs_pin.motions.reference_files import Sampled, load_reference
+from nbs_pin.motions.references import Hold, MinimumJerk, Sinusoid, check_reference, paper_reference, resting_posture
+from nbs_pin.robots.catalogue import ROBOT_NAMES, find
+from nbs_pin.robots.robot import load_robot
 
 T = np.linspace(0.0, 2.0, 21)
 JOINTS = ("shoulder", "elbow")

@@ -9,12 +9,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from nbs_pin.exceptions import ArgumentError, RobotError
-from nbs_pin.meshes import MeshError, find_mesh, read_mesh
-from nbs_pin.replay_page import body_poses, replay
-from nbs_pin.robot import load_robot
-from nbs_pin.state import Run
-from nbs_pin.visuals import STEEL, Mimic, Transmission, link_visuals, read_couplings, tip
+from nbs_pin.base.exceptions import ArgumentError, RobotError
+from nbs_pin.base.records import Run
+from nbs_pin.reports.replay import body_poses, replay
+from nbs_pin.robots.meshes import MeshError, find_mesh, read_mesh
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.robots.visuals import STEEL, Mimic, Transmission, link_visuals, read_couplings, tip
 from tests.browser import Browser, find_chromium
 
 needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium: install it or set $CHROMIUM")

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from nbs_pin import metrics
-from nbs_pin.arrays import matvec
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.pages import Section, page, plain, short
 from nbs_pin.cli import main
 from nbs_pin.dynamics.analytic import AnalyticDynamics
-from nbs_pin.references import paper_reference
-from nbs_pin.studies import paper
-from nbs_pin.studies.authors import PERIOD, AuthorsLaw, follow_authors, train_authors
-from nbs_pin.studies.pages import Section, page, plain, short
-from nbs_pin.studies.paper_alpha import LARGEST_INERTIA, corrected_bound, regulariser, swept_controller
-from nbs_pin.studies.paper_table import COLUMNS, PRINTED, Row
+from nbs_pin.motions.references import paper_reference
+from nbs_pin.reproduction import paper
+from nbs_pin.reproduction.authors import PERIOD, AuthorsLaw, follow_authors, train_authors
+from nbs_pin.reproduction.paper_alpha import LARGEST_INERTIA, corrected_bound, regulariser, swept_controller
+from nbs_pin.reproduction.paper_table import COLUMNS, PRINTED, Row
+from nbs_pin.simulation import metrics
 from tests.test_plotting import png_size
 
 SMALL = paper.Scale(seeds=2, epochs=3, alphas=4, duration=5.0)
@@ -48,7 +48,7 @@ def test_seed_3_of_the_papers_program_gives_the_papers_digits():
     code = """
 import torch
 from nbs_pin import metrics
-from nbs_pin.studies.authors import AuthorsLaw, follow_authors, train_authors
+from nbs_pin.reproduction.authors import AuthorsLaw, follow_authors, train_authors
 torch.set_num_threads(1)
 law = AuthorsLaw([3])
 before = follow_authors(law, 100.0)

@@ -8,10 +8,10 @@ import pinocchio as pin
 import pytest
 import torch
 
-from nbs_pin.catalogue import ROBOT_NAMES, find
+from nbs_pin.base.exceptions import ArgumentError, RobotError, RobotNotFound
 from nbs_pin.controllers.pid import PID
-from nbs_pin.exceptions import ArgumentError, RobotError, RobotNotFound
-from nbs_pin.robot import configuration_difference, load_robot
+from nbs_pin.robots.catalogue import ROBOT_NAMES, find
+from nbs_pin.robots.robot import configuration_difference, load_robot
 
 
 @pytest.fixture(params=ROBOT_NAMES)

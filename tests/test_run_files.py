@@ -10,9 +10,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from nbs_pin.exceptions import ArgumentError, FileFormatError
-from nbs_pin.npz import LARGEST, read_npz, write_npz
-from nbs_pin.state import Run
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
+from nbs_pin.base.npz import LARGEST, read_npz, write_npz
+from nbs_pin.base.records import Run
 
 
 def make_run(batch=(), rows=5, n=2):
@@ -137,7 +137,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     np.savez_compressed(path, q=np.zeros(1_000_000))
     assert path.stat().st_size < 20_000
     assert LARGEST == 2**31
-    monkeypatch.setattr("nbs_pin.npz.LARGEST", 1_000_000)
+    monkeypatch.setattr("nbs_pin.base.npz.LARGEST", 1_000_000)
     with pytest.raises(FileFormatError, match="at most 1000000"):
         read_npz(path)
 
@@ -169,7 +169,7 @@ def test_a_killed_write_never_leaves_half_a_file(tmp_path):
     path = tmp_path / "run.npz"
     write_npz(path, {"q": np.zeros(200_000)})
     program = (
-        "import sys, numpy as np; from nbs_pin.npz import write_npz; print('on', flush=True)\n"
+        "import sys, numpy as np; from nbs_pin.base.npz import write_npz; print('on', flush=True)\n"
         "while True: write_npz(sys.argv[1], {'q': np.random.rand(200_000)})"
     )
     for delay in (0.01, 0.03, 0.05):

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 import torch
 
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.base.progress import tracked
+from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.controllers.pid import PID
-from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError, SimulationDiverged
-from nbs_pin.plants.dynamics_plant import DynamicsPlant
-from nbs_pin.plants.mujoco_plant import MujocoPlant
-from nbs_pin.progress import tracked
-from nbs_pin.reference_files import Sampled
-from nbs_pin.references import Hold, Sinusoid
-from nbs_pin.robot import load_robot
-from nbs_pin.simulation import simulate, stream
-from nbs_pin.state import Reference, Run
+from nbs_pin.motions.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
+from nbs_pin.motions.reference_files import Sampled
+from nbs_pin.motions.references import Hold, Sinusoid
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.mujoco_plant import MujocoPlant
+from nbs_pin.simulation.simulate import simulate, stream
 
 N = 2
 
@@ -448,11 +448,11 @@ class Terminal(io.StringIO):
 
 def test_progress_shows_only_at_a_terminal_and_only_for_long_work(monkeypatch):
     clock = iter(range(1000))
-    monkeypatch.setattr("nbs_pin.progress.time.perf_counter", lambda: 0.3 * next(clock))
+    monkeypatch.setattr("nbs_pin.base.progress.time.perf_counter", lambda: 0.3 * next(clock))
     monkeypatch.setattr(sys, "stderr", quick := Terminal())
     assert list(tracked(range(5), "working")) == [0, 1, 2, 3, 4]
     assert "working" not in quick.getvalue()
-    monkeypatch.setattr("nbs_pin.progress.time.perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr("nbs_pin.base.progress.time.perf_counter", lambda: float(next(clock)))
     assert list(tracked(range(5), "working", show=False)) == [0, 1, 2, 3, 4]
     assert quick.getvalue().count("working") == 0
     assert list(tracked(range(5), "working")) == [0, 1, 2, 3, 4]

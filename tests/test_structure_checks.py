@@ -8,38 +8,38 @@ import numpy as np
 import pytest
 import torch
 
-from nbs_pin.certificates.claims import Label
+from nbs_pin.accuracy.mismatch import Mismatch, violation_chance
+from nbs_pin.base.claims import Label
+from nbs_pin.base.exceptions import CertificateRefused
+from nbs_pin.benchmarks.serial_chains import serial_chain
 from nbs_pin.certificates.model_structure import check_box, check_fit, check_model
-from nbs_pin.certificates.rounding import least_eigenvalue
 from nbs_pin.certificates.structure import DAMPING, check_structure
-from nbs_pin.checkpoints import load, save
+from nbs_pin.controllers.activations import Activation, SmoothedReLU, Squareplus
 from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.controllers.convex import FICNN
+from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping, paper_controller
 from nbs_pin.controllers.pd import PD
 from nbs_pin.controllers.pid import PID
+from nbs_pin.controllers.potential import Potential
 from nbs_pin.controllers.slotine_li import SlotineLi
 from nbs_pin.dynamics.analytic import AnalyticDynamics
+from nbs_pin.dynamics.chain import Chain
+from nbs_pin.dynamics.cholesky import CholeskyNetwork
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
+from nbs_pin.dynamics.picnn import PICNN, HomogenisedPicnn, PaperPicnn
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
-from nbs_pin.exceptions import CertificateRefused
-from nbs_pin.learning.datasets import joint_tree
-from nbs_pin.learning.training import train
-from nbs_pin.mismatch import Mismatch, violation_chance
-from nbs_pin.networks.activations import Activation, SmoothedReLU, Squareplus
-from nbs_pin.networks.chain import Chain
-from nbs_pin.networks.cholesky import CholeskyNetwork
-from nbs_pin.networks.convex import FICNN
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.picnn import PICNN, HomogenisedPicnn, PaperPicnn
-from nbs_pin.networks.potential import Potential
-from nbs_pin.networks.unconstrained import UnconstrainedLagrangian
-from nbs_pin.plants.dynamics_plant import DynamicsPlant
-from nbs_pin.references import Sinusoid
-from nbs_pin.robot import load_robot
-from nbs_pin.studies.chains import serial_chain
+from nbs_pin.dynamics.unconstrained import UnconstrainedLagrangian
+from nbs_pin.identification.datasets import joint_tree
+from nbs_pin.inertia.rounding import least_eigenvalue
+from nbs_pin.motions.references import Sinusoid
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.storage.checkpoints import load, save
+from nbs_pin.training.train import train
 from tests.test_networks import randomise
 
 ROBOT, OTHER = load_robot("three_link"), load_robot("two_link")

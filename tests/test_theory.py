@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from nbs_pin.arrays import matvec
+from nbs_pin.base.arrays import matvec
+from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping, paper_controller
-from nbs_pin.disturbances import SquareWave
+from nbs_pin.controllers.potential import POTENTIALS, Potential
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import POTENTIALS, Potential
-from nbs_pin.plants.dynamics_plant import DynamicsPlant
-from nbs_pin.references import Hold, Sinusoid
-from nbs_pin.robot import load_robot
-from nbs_pin.simulation import simulate
+from nbs_pin.motions.disturbances import SquareWave
+from nbs_pin.motions.references import Hold, Sinusoid
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.simulate import simulate
 from tests.test_networks import randomise
 
 

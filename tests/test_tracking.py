@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import nbs_pin as nbs
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.cli import tracking
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import LAWS as LAW_NAMES
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.studies import tracking
-from nbs_pin.studies.motions import motion_of
+from nbs_pin.motions.by_name import motion_of
 
 STATE = {"q": [0.3, -0.2], "v": [0.1, 0.4], "q_ref": [0.0, 0.1], "v_ref": [0.2, 0.0], "a_ref": [0.0, 1.0]}
 
@@ -30,7 +30,7 @@ LAWS = """
 import json
 from typing import get_args
 import nbs_pin as nbs
-from nbs_pin.studies import tracking
+from nbs_pin.cli import tracking
 robot, late = nbs.load_robot("three_link"), {}
 for name in get_args(tracking.ControllerName):
     run, _ = tracking.track(robot, controller=name, duration=1.5, period=0.002, start_error=0.1, plant="pinocchio")

@@ -12,10 +12,10 @@ import pytest
 
 import nbs_pin as nbs
 from nbs_pin import cli
-from nbs_pin.charts import plot_training
-from nbs_pin.learning import trainer
-from nbs_pin.studies import training
-from nbs_pin.versions import versions
+from nbs_pin.base.versions import versions
+from nbs_pin.reports.charts import plot_training
+from nbs_pin.training import train_robot as training
+from nbs_pin.training import trainer
 from tests.test_plotting import drawn, png_size, sinusoid_run
 
 QUICK = ("--starts", "6", "--duration", "0.3", "--frequencies", "1,2", "--epochs", "6", "--bandwidth", "4")

@@ -7,14 +7,14 @@ import pickle
 import numpy as np
 import pytest
 
+from nbs_pin.controllers.gain import Gain
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.learning.training import train
-from nbs_pin.networks.gain import Gain
-from nbs_pin.plants.dynamics_plant import DynamicsPlant
-from nbs_pin.references import Sinusoid
-from nbs_pin.robot import load_robot
-from nbs_pin.simulation import simulate
+from nbs_pin.motions.references import Sinusoid
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.simulate import simulate
+from nbs_pin.training.train import train
 from tests.test_compiled import assert_one_law
 from tests.test_controllers import arguments, check_lyapunov_identity, check_storage_falls
 from tests.test_networks import check_floor, check_psi, check_strong_convexity, randomise

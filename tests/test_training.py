@@ -8,13 +8,13 @@ import pytest
 import torch
 
 import nbs_pin as nbs
-from nbs_pin.checkpoints import about, read_checkpoint
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.cli.tracking import build_controller
 from nbs_pin.controllers.model_law import ModelLaw
-from nbs_pin.exceptions import ArgumentError, SimulationDiverged
-from nbs_pin.learning.closed_loop import Batch, engine_for, motions, recorded, running_cost
-from nbs_pin.learning.costs import TimeOutside, TorqueAware, squared_error
-from nbs_pin.loop import Loop
-from nbs_pin.studies.tracking import build_controller
+from nbs_pin.simulation.costs import TimeOutside, TorqueAware, squared_error
+from nbs_pin.simulation.loop import Loop
+from nbs_pin.simulation.rollout import Batch, engine_for, motions, recorded, running_cost
+from nbs_pin.storage.checkpoints import about, read_checkpoint
 
 LAWS = ("nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid")
 PERIOD = 0.01
@@ -134,7 +134,7 @@ def test_gradients_of_many_starts_are_the_sum_of_those_of_few(monkeypatch):
     robot = arm("two_link")
     controller, batch = law_for(robot), problem(robot, starts=7)
     whole = value_and_gradient(controller, batch, squared_error, "kernels")
-    monkeypatch.setattr("nbs_pin.learning.closed_loop._TOGETHER", 3)
+    monkeypatch.setattr("nbs_pin.simulation.rollout._TOGETHER", 3)
     parts = value_and_gradient(controller, batch, squared_error, "kernels")
     torch.testing.assert_close(parts[1], whole[1], rtol=1e-12, atol=1e-15)
 
@@ -276,7 +276,7 @@ def stop_at(monkeypatch, epoch):
             os.kill(os.getpid(), signal.SIGINT)
         return motions(*arguments)
 
-    monkeypatch.setattr("nbs_pin.learning.trainer.motions", rollouts)
+    monkeypatch.setattr("nbs_pin.training.trainer.motions", rollouts)
 
 
 def test_ctrl_c_keeps_the_best(monkeypatch, tmp_path):

@@ -5,21 +5,21 @@ import pinocchio as pin
 import pytest
 import torch
 
-from nbs_pin.catalogue import ROBOT_NAMES
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics, pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.robot import load_robot
-from nbs_pin.runtime.layout import Packed
-from nbs_pin.runtime.tree_layout import Link, pack_tree
-from nbs_pin.runtime.trees import (
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.tree_layout import Link, pack_tree
+from nbs_pin.kernels.trees import (
     tree_acceleration,
     tree_acceleration_adjoint,
     tree_torque,
     tree_torque_adjoint,
     tree_workspace,
 )
+from nbs_pin.robots.catalogue import ROBOT_NAMES
+from nbs_pin.robots.robot import load_robot
 from tests.test_dynamics import GANTRY, make, relative
 
 TREES = range(24)

@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from nbs_pin.catalogue import ROBOT_NAMES
-from nbs_pin.exceptions import ArgumentError, RobotError, RobotNotFound
-from nbs_pin.robot import load_robot
-from nbs_pin.urdf import read_urdf
-from nbs_pin.urdf_source import MAX_BYTES
+from nbs_pin.base.exceptions import ArgumentError, RobotError, RobotNotFound
+from nbs_pin.robots.catalogue import ROBOT_NAMES
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.robots.urdf import read_urdf
+from nbs_pin.robots.urdf_source import MAX_BYTES
 
 ARM = """<?xml version="1.0"?>
 <robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">

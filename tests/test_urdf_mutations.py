@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nbs_pin.catalogue import find
-from nbs_pin.exceptions import RobotError
-from nbs_pin.robot import load_robot
+from nbs_pin.base.exceptions import RobotError
+from nbs_pin.robots.catalogue import find
+from nbs_pin.robots.robot import load_robot
 
 ARM = find("two_link").path.read_bytes()
 

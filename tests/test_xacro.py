@@ -4,9 +4,9 @@ import sys
 
 import pytest
 
-from nbs_pin.exceptions import MissingExtra, RobotError
-from nbs_pin.robot import load_robot
-from nbs_pin.urdf import read_urdf
+from nbs_pin.base.exceptions import MissingExtra, RobotError
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.robots.urdf import read_urdf
 
 
 def write(folder, text, name):

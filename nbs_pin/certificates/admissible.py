@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.checks import PerJoint, floats
-from nbs_pin.exceptions import ArgumentError
+from nbs_pin.base.checks import PerJoint, floats
+from nbs_pin.base.exceptions import ArgumentError
 
 _LEAST, _GREATEST = 1e-100, 1e100
 

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.claims import Assumption
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.certificate import Certificate
-from nbs_pin.certificates.claims import Assumption
+from nbs_pin.certificates.certify import Certificate
 from nbs_pin.certificates.energy_balance import Balance, Instants, beyond
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
-from nbs_pin.exceptions import ArgumentError
 
 WRONG = "the certificate is wrong"
 """What is said when none of the assumptions accounts for what happened."""

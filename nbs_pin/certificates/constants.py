@@ -7,15 +7,15 @@ from typing import cast
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.certificates.claims import Claim, Group, Label, weakest
-from nbs_pin.certificates.inertia import largest_inertia_bound, least_inertia_bound
-from nbs_pin.certificates.rounding import least_eigenvalue
+from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.certificates.structure import DAMPING, check_structure
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.inertia.bounds import largest_inertia_bound, least_inertia_bound
+from nbs_pin.inertia.rounding import least_eigenvalue
 
 _SAMPLES = 2000
 

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import matvec
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.records import Reference, Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.equations import inverse_dynamics
-from nbs_pin.state import Reference, Run
 
 _TOGETHER = 4096  # states a network sees at once
 

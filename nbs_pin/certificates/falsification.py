@@ -3,12 +3,12 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import matvec
+from nbs_pin.base.arrays import matvec
 from nbs_pin.certificates.model_structure import refuse, sample_states, strange
+from nbs_pin.controllers.activations import Activation
+from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
-from nbs_pin.networks.activations import Activation
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import Potential
+from nbs_pin.controllers.potential import Potential
 
 _STATES = 48
 _SIZES = (0.03, 0.3, 3.0)

@@ -11,14 +11,14 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
+from nbs_pin.base.checks import PerJoint, floats, positive
+from nbs_pin.base.claims import Claim, Group, Label, weakest
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.claims import Claim, Group, Label, weakest
-from nbs_pin.checks import PerJoint, floats, positive
 from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.references import DesiredMotion
-from nbs_pin.robot import Robot
-from nbs_pin.state import Reference
+from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.robots.robot import Robot
 
 MARGIN = 1.5
 """How many times the torque on the reference the arm may need beside it, unless said otherwise."""

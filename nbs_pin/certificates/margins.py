@@ -3,15 +3,15 @@
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.claims import Claim, Condition, Group, Label
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.claims import Claim, Condition, Group, Label
 from nbs_pin.certificates.constants import configurations
 from nbs_pin.certificates.model_structure import check_box
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.references import DesiredMotion
-from nbs_pin.robot import Robot
+from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.robots.robot import Robot
 
 _INSTANTS = 2001
 _RULE = "a rule that told calm from chatter in 52 runs of a panda (docs/theory.md §5), over sampled configurations"

@@ -7,29 +7,29 @@ import numpy as np
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.arrays import matvec
-from nbs_pin.certificates.claims import Claim, Label
-from nbs_pin.certificates.rigid_tree import RigidTree
+from nbs_pin.accuracy.mismatch import Mismatch, violation_chance
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.claims import Claim, Label
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.dynamics.analytic import AnalyticDynamics
+from nbs_pin.dynamics.chain import Chain
+from nbs_pin.dynamics.cholesky import CholeskyNetwork
+from nbs_pin.dynamics.features import JointFeatures
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
+from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
+from nbs_pin.dynamics.picnn import PICNN, HomogenisedPicnn, PaperPicnn
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics, pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
-from nbs_pin.exceptions import ArgumentError, CertificateRefused
-from nbs_pin.learning.datasets import joint_tree
-from nbs_pin.mismatch import Mismatch, violation_chance
-from nbs_pin.networks.chain import Chain
-from nbs_pin.networks.cholesky import CholeskyNetwork
-from nbs_pin.networks.features import JointFeatures
-from nbs_pin.networks.lagrangian import LagrangianNetwork
-from nbs_pin.networks.picnn import PICNN, HomogenisedPicnn, PaperPicnn
-from nbs_pin.networks.scales import Scales
-from nbs_pin.networks.softplus import SoftplusNetwork
-from nbs_pin.networks.tanh import TanhNetwork
-from nbs_pin.networks.unconstrained import UnconstrainedLagrangian
-from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import Packed
+from nbs_pin.dynamics.scales import Scales
+from nbs_pin.dynamics.softplus_network import SoftplusNetwork
+from nbs_pin.dynamics.tanh_network import TanhNetwork
+from nbs_pin.dynamics.unconstrained import UnconstrainedLagrangian
+from nbs_pin.identification.datasets import joint_tree
+from nbs_pin.inertia.rigid_tree import RigidTree
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.robots.robot import Robot
 
 _POSITIVE = "M̂ ≻ 0"
 _SKEW = "Ṁ − 2C skew, largest deviation"

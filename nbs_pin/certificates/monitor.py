@@ -6,6 +6,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.claims import Assumption
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Run
 from nbs_pin.certificates.assumptions import (
     JUMPS,
     NOTICEABLE,
@@ -22,11 +25,8 @@ from nbs_pin.certificates.assumptions import (
     sentence,
     summed,
 )
-from nbs_pin.certificates.certificate import Certificate
-from nbs_pin.certificates.claims import Assumption
+from nbs_pin.certificates.certify import Certificate
 from nbs_pin.certificates.energy_balance import Balance, Instants, balance, storage_of
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.state import Run
 
 
 @dataclass(frozen=True, eq=False)

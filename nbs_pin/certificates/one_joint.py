@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from nbs_pin.certificates.intervals import Interval
-from nbs_pin.networks.activations import SmoothedReLU, Squareplus
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.potential import Potential
+from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
+from nbs_pin.controllers.damping import Damping
+from nbs_pin.controllers.potential import Potential
 
 _OUTWARD = 1.0 + 1e-9
 _CELLS = 400

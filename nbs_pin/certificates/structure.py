@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, is_torch_array
-from nbs_pin.certificates.claims import Claim, Label
+from nbs_pin.base.arrays import Array, is_torch_array
+from nbs_pin.base.claims import Claim, Label
 from nbs_pin.certificates.falsification import (
     SAMPLES,
     falsify_activation,
@@ -15,15 +15,15 @@ from nbs_pin.certificates.falsification import (
     falsify_potential,
 )
 from nbs_pin.certificates.model_structure import check_finite, check_model, first_strange, refuse, strange
-from nbs_pin.certificates.rounding import least_eigenvalue
+from nbs_pin.controllers.activations import Activation, SmoothedReLU, Squareplus
+from nbs_pin.controllers.convex import FICNN
+from nbs_pin.controllers.damping import DAMPINGS, Damping
+from nbs_pin.controllers.gain import Gain
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.potential import POTENTIALS, Potential
 from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.networks.activations import Activation, SmoothedReLU, Squareplus
-from nbs_pin.networks.convex import FICNN
-from nbs_pin.networks.damping import DAMPINGS, Damping
-from nbs_pin.networks.gain import Gain
-from nbs_pin.networks.potential import POTENTIALS, Potential
-from nbs_pin.robot import Robot
+from nbs_pin.inertia.rounding import least_eigenvalue
+from nbs_pin.robots.robot import Robot
 
 DAMPING = "D ⪰ D₀, least eigenvalue"
 """Name of the claim whose value is the largest known d with D ⪰ dI."""

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.exceptions import ArgumentError
 
 SLOWEST, FASTEST = 1.0, 300.0
 """Rates of waves [rad/s]."""

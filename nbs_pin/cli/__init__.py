@@ -16,6 +16,7 @@ import tyro
 from rich.console import Console
 
 from nbs_pin import __version__
+from nbs_pin.base.exceptions import NbsPinError
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.collect import Collect
@@ -27,7 +28,6 @@ from nbs_pin.cli.robots import Robots
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import OptionError
-from nbs_pin.exceptions import NbsPinError
 
 Command: TypeAlias = (
     Annotated[Track, tyro.conf.subcommand("track")]

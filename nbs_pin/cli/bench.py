@@ -59,9 +59,9 @@ class Bench:
         """Measures, writes and prints; raises NbsPinError or OSError."""
         old = None if self.compare is None else _read(self.compare)
         with notes.status("compiling"):
-            from nbs_pin.charts import plot_scaling
-            from nbs_pin.files import write_whole
-            from nbs_pin.studies import bench
+            from nbs_pin.base.files import write_whole
+            from nbs_pin.benchmarks import bench
+            from nbs_pin.reports.charts import plot_scaling
 
         known = None if old is None else bench.rows_of(old)
         rows = []

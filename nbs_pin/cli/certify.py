@@ -120,9 +120,9 @@ class Certify:
         if self.wanted is not None and self.controller.endswith(SAVED):
             raise OptionError(f"--wanted designs a controller for an arm, and '{self.controller}' is one; give an arm.")
         with notes.status(f"loading {self.controller}"):
-            from nbs_pin.state import Run
-            from nbs_pin.studies import certifying
-            from nbs_pin.versions import versions
+            from nbs_pin.base.records import Run
+            from nbs_pin.base.versions import versions
+            from nbs_pin.cli import certifying
 
             controller = self._controller()
             task = self._task(controller)
@@ -151,7 +151,7 @@ class Certify:
 
     def _controller(self) -> Any:
         """The one to certify; with --wanted one whose arm counts alone."""
-        from nbs_pin.studies.certifying import controller_of
+        from nbs_pin.cli.certifying import controller_of
 
         return controller_of(self.controller, bandwidth=self.bandwidth, period=self.period or 0.001, seed=self.seed)
 
@@ -159,9 +159,9 @@ class Certify:
         """Where and against what to certify; raises OptionError for options that do not fit each other."""
         from nbs_pin.certificates.loads import MARGIN
         from nbs_pin.certificates.model_structure import is_exact
-        from nbs_pin.robot import load_robot
-        from nbs_pin.studies.certifying import TRAJECTORIES, Task, arm_of, box_or_ball
-        from nbs_pin.studies.motions import motion_of
+        from nbs_pin.cli.certifying import TRAJECTORIES, Task, arm_of, box_or_ball
+        from nbs_pin.motions.by_name import motion_of
+        from nbs_pin.robots.robot import load_robot
 
         self._check_options()
         period = self.period or 0.001

@@ -57,11 +57,11 @@ class Collect:
     def run(self, console: Console, notes: Console) -> None:
         """Collects, writes and prints; raises NbsPinError and OSError."""
         with notes.status(f"loading {self.robot}"):
-            from nbs_pin.learning.measuring import Noise
-            from nbs_pin.learning.recipes import collect
-            from nbs_pin.robot import load_robot
-            from nbs_pin.studies import collecting
-            from nbs_pin.versions import versions
+            from nbs_pin.base.versions import versions
+            from nbs_pin.cli import collecting
+            from nbs_pin.identification.collect import collect
+            from nbs_pin.identification.measurement import Noise
+            from nbs_pin.robots.robot import load_robot
 
             robot = load_robot(self.robot)
         if self.friction and not (robot.damping.any() or robot.friction.any()):

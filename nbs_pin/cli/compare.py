@@ -77,9 +77,9 @@ class Compare:
     def run(self, console: Console, notes: Console) -> None:
         """Compares, writes and prints; raises NbsPinError and OSError."""
         with notes.status(f"loading {self.model}"):
-            from nbs_pin.state import Run
-            from nbs_pin.studies import comparison
-            from nbs_pin.versions import versions
+            from nbs_pin.base.records import Run
+            from nbs_pin.base.versions import versions
+            from nbs_pin.cli import comparing as comparison
 
             model = comparison.model_of(self.model)
             robot = self._arm(model)
@@ -110,7 +110,7 @@ class Compare:
 
     def _arm(self, model: Any) -> Any:
         """The true arm; raises OptionError when neither the file nor the options name one."""
-        from nbs_pin.robot import load_robot
+        from nbs_pin.robots.robot import load_robot
 
         if self.against is not None:
             return load_robot(self.against)
@@ -122,7 +122,7 @@ class Compare:
         """Where to compare: the box of the data, or the arm's."""
         if self.data is None:
             return {"speed": 2.0 if self.speed is None else self.speed}
-        from nbs_pin.learning.datasets import load_dataset
+        from nbs_pin.identification.datasets import load_dataset
 
         data = load_dataset(self.data)
         if data.nv != robot.nv:

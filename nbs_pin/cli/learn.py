@@ -58,8 +58,8 @@ class Learn:
     def run(self, console: Console, notes: Console) -> None:
         """Learns, writes and prints; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
         with notes.status(f"loading {self.data}"):
-            from nbs_pin.studies import learning
-            from nbs_pin.versions import versions
+            from nbs_pin.base.versions import versions
+            from nbs_pin.cli import learning
 
             data, robot = learning.data_and_arm(self.data, self.robot)
         name = self.data.stem if robot is None else robot.name

@@ -44,9 +44,9 @@ class Replay:
         if self.out and page.exists() and not self.force:
             raise OptionError(f"'{page}' exists; give another --out, or --force to replace it.")
         with notes.status(f"drawing {page}"):
-            from nbs_pin.replay_page import replay
-            from nbs_pin.robot import load_robot
-            from nbs_pin.state import Run
+            from nbs_pin.base.records import Run
+            from nbs_pin.reports.replay import replay
+            from nbs_pin.robots.robot import load_robot
 
             run = Run.load(source)
             replay(run, page, None if self.robot is None else load_robot(self.robot), start=self.start)

@@ -42,14 +42,14 @@ class Reproduce:
     def run(self, console: Console, notes: Console) -> None:
         """Runs, writes and prints; raises NbsPinError or OSError."""
         with notes.status("loading"):
-            from nbs_pin.files import write_whole
-            from nbs_pin.studies.certificate_study import reproduce_certificates
-            from nbs_pin.studies.fair import fair_part
-            from nbs_pin.studies.learned_loop import reproduce_learned
-            from nbs_pin.studies.model_study import reproduce_models
-            from nbs_pin.studies.pages import page
-            from nbs_pin.studies.paper import reproduce_paper
-            from nbs_pin.versions import versions
+            from nbs_pin.base.files import write_whole
+            from nbs_pin.base.pages import page
+            from nbs_pin.base.versions import versions
+            from nbs_pin.benchmarks.fair import fair_part
+            from nbs_pin.reproduction.certificate_study import reproduce_certificates
+            from nbs_pin.reproduction.learned_loop import reproduce_learned
+            from nbs_pin.reproduction.model_study import reproduce_models
+            from nbs_pin.reproduction.paper import reproduce_paper
 
             parts: dict[str, Callable[[Path, int, bool], Sequence[Any]]] = {
                 "paper": reproduce_paper,

@@ -24,7 +24,7 @@ class Robots:
         for heading in ("joints", "effort [N·m]", "continuous", "friction"):
             table.add_column(Text(heading), justify="right", no_wrap=True)
         with notes.status("loading every arm"):
-            from nbs_pin.studies.arms import known_arms
+            from nbs_pin.cli.arms import known_arms
 
             for arm in known_arms():
                 table.add_row(*_cells(arm))

@@ -94,9 +94,10 @@ class Track:
         if self.start is not None and self.start_error:
             raise OptionError("--start and --start-error were both given; choose one.")
         with notes.status(f"loading {self.robot}"):
-            from nbs_pin.robot import load_robot
-            from nbs_pin.studies import motions, tracking
-            from nbs_pin.versions import versions
+            from nbs_pin.base.versions import versions
+            from nbs_pin.cli import tracking
+            from nbs_pin.motions import by_name as motions
+            from nbs_pin.robots.robot import load_robot
 
             robot = load_robot(self.robot)
         if self.no_effort_limit or self.effort_limit is not None:

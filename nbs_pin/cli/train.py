@@ -77,9 +77,9 @@ class Train:
         if self.no_effort_limit and self.effort_limit is not None:
             raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
         with notes.status(f"loading {self.robot}"):
-            from nbs_pin.robot import load_robot
-            from nbs_pin.studies import training
-            from nbs_pin.versions import versions
+            from nbs_pin.base.versions import versions
+            from nbs_pin.robots.robot import load_robot
+            from nbs_pin.training import train_robot as training
 
             robot = load_robot(self.robot)
         if self.no_effort_limit or self.effort_limit is not None:

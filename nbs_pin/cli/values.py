@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 
 from tyro.constructors import PrimitiveConstructorSpec
 
-from nbs_pin.exceptions import NbsPinError
+from nbs_pin.base.exceptions import NbsPinError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INTEGER = re.compile(r"[0-9]+")
@@ -111,7 +111,7 @@ class DisturbanceText:
 
     def build(self, nv: int, period: float, seed: int) -> Callable[..., Any] | None:
         """The torque on `nv` joints; noise changes every `period` [s]. Raises OptionError for another number."""
-        from nbs_pin.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
+        from nbs_pin.motions.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
 
         if len(self.sizes) not in (0, 1, nv):
             raise OptionError(

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.base.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.runtime.laws import compile_laws, law_row, law_rows
-from nbs_pin.runtime.layout import Packed
-from nbs_pin.runtime.threads import over_cores
-from nbs_pin.runtime.tree_laws import compile_tree_laws, tree_law, tree_law_workspace, tree_laws
+from nbs_pin.kernels.laws import compile_laws, law_row, law_rows
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.threads import over_cores
+from nbs_pin.kernels.tree_laws import compile_tree_laws, tree_law, tree_law_workspace, tree_laws
 
 
 class CompiledController(MemorylessController):

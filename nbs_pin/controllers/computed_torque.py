@@ -3,14 +3,14 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, as_vectors
+from nbs_pin.base.arrays import Array, as_vectors
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, gains_for_robot, largest_inertia, warn_if_too_fast
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import COMPUTED_TORQUE, Packed
+from nbs_pin.kernels.layout import COMPUTED_TORQUE, Packed
+from nbs_pin.robots.robot import Robot
 
 
 class ComputedTorque(ModelLaw):

@@ -5,10 +5,10 @@ from typing import Any
 
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.runtime.layout import Packed
-from nbs_pin.state import Reference
+from nbs_pin.base.arrays import Array
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
+from nbs_pin.kernels.layout import Packed
 
 
 class Controller(ABC):

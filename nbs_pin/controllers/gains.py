@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.arrays import Array, is_torch_array
+from nbs_pin.base.arrays import Array, is_torch_array
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.controllers.gain import Gain
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.gain import Gain
-from nbs_pin.robot import Robot
+from nbs_pin.robots.robot import Robot
 
 PerJoint: TypeAlias = float | Float[np.ndarray, " n"]
 """One number for all joints, or one per joint (n,)."""

@@ -5,12 +5,12 @@ from typing import Any
 
 from torch import nn
 
-from nbs_pin.arrays import Array
+from nbs_pin.base.arrays import Array
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.runtime.layout import Packed, pack_law
+from nbs_pin.kernels.layout import Packed, pack_law
 
 
 class ModelLaw(MemorylessController, nn.Module):

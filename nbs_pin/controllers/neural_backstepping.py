@@ -5,17 +5,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, array_namespace, as_vectors, matvec
+from nbs_pin.base.arrays import Array, array_namespace, as_vectors, matvec
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.controllers.damping import Damping
+from nbs_pin.controllers.gain import Gain, positive_scale
 from nbs_pin.controllers.gains import Gains, gains_for_robot, warn_if_too_fast
 from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.controllers.potential import Potential
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.damping import Damping
-from nbs_pin.networks.gain import Gain, positive_scale
-from nbs_pin.networks.potential import Potential
-from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import BACKSTEPPING, Packed
+from nbs_pin.kernels.layout import BACKSTEPPING, Packed
+from nbs_pin.robots.robot import Robot
 
 DAMPINGS = ("inertial", "bounded", "paper")
 

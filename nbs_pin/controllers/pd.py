@@ -3,15 +3,15 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, as_vectors
+from nbs_pin.base.arrays import Array, as_vectors
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import PD_GRAVITY, PD_REFERENCE, Packed
+from nbs_pin.kernels.layout import PD_GRAVITY, PD_REFERENCE, Packed
+from nbs_pin.robots.robot import Robot
 
 FEEDFORWARDS = ("gravity", "reference")
 

@@ -6,16 +6,16 @@ import numpy as np
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.arrays import Array, array_namespace, as_vectors, constant_like, is_torch_array
+from nbs_pin.base.arrays import Array, array_namespace, as_vectors, constant_like, is_torch_array
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, positive_gains
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.robot import Robot, configuration_difference
-from nbs_pin.runtime import layout
-from nbs_pin.runtime.laws import compile_laws, pid
-from nbs_pin.runtime.layout import Packed
-from nbs_pin.state import Reference
+from nbs_pin.kernels import layout
+from nbs_pin.kernels.laws import compile_laws, pid
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.robots.robot import Robot, configuration_difference
 
 
 class PIDMemory(NamedTuple):

@@ -3,14 +3,14 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, as_vectors
+from nbs_pin.base.arrays import Array, as_vectors
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, effective_inertia, gains_for_robot, warn_if_too_fast
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import SLOTINE_LI, Packed
+from nbs_pin.kernels.layout import SLOTINE_LI, Packed
+from nbs_pin.robots.robot import Robot
 
 
 class SlotineLi(ModelLaw):

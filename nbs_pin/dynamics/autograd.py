@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
-from nbs_pin.arrays import over_rows
+from nbs_pin.base.arrays import over_rows
 
 
 def differentiable(

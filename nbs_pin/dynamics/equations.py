@@ -2,7 +2,7 @@
 
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, array_namespace, as_vectors, matvec
+from nbs_pin.base.arrays import Array, array_namespace, as_vectors, matvec
 from nbs_pin.dynamics.provider import DynamicsProvider
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, array_namespace, constant_like
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.robot import Robot
+from nbs_pin.base.arrays import Array, array_namespace, constant_like
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.robots.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)

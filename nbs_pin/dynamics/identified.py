@@ -7,15 +7,15 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array
-from nbs_pin.checks import floats
+from nbs_pin.base.arrays import Array
+from nbs_pin.base.checks import floats
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics, pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import Packed
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.robots.robot import Robot
 
 _ROUNDING = 1e-9
 """How far below zero an eigenvalue of J, scaled to a unit diagonal, is still taken for a zero that was rounded."""

@@ -10,15 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.base.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.dynamics.lagrangian_network import CompiledTorque, LagrangianNetwork
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.lagrangian import CompiledTorque, LagrangianNetwork
-from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import Packed
-from nbs_pin.runtime.tree_layout import tree_workspace
-from nbs_pin.runtime.tree_rows import tree_accelerations
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.tree_layout import tree_workspace
+from nbs_pin.kernels.tree_rows import tree_accelerations
+from nbs_pin.robots.robot import Robot
 
 
 class LagrangianDynamics(DynamicsProvider, nn.Module):

@@ -8,12 +8,12 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, as_vectors, is_torch_array, over_rows
+from nbs_pin.base.arrays import Array, as_vectors, is_torch_array, over_rows
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.robot import Robot
-from nbs_pin.runtime.layout import Packed
-from nbs_pin.runtime.tree_layout import Link, pack_tree
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.tree_layout import Link, pack_tree
+from nbs_pin.robots.robot import Robot
 
 Row: TypeAlias = np.ndarray
 _TURNING = ("JointModelRX", "JointModelRY", "JointModelRZ", "JointModelRevoluteUnaligned")

@@ -4,9 +4,9 @@ from abc import ABC, abstractmethod
 
 from jaxtyping import Float
 
-from nbs_pin.arrays import Array, array_namespace, matvec
-from nbs_pin.robot import Robot, configuration_difference
-from nbs_pin.runtime.layout import Packed
+from nbs_pin.base.arrays import Array, array_namespace, matvec
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.robots.robot import Robot, configuration_difference
 
 
 class DynamicsProvider(ABC):

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.arrays import matvec
+from nbs_pin.base.arrays import matvec
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.dynamics.cholesky import CholeskyNetwork
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
+from nbs_pin.dynamics.lagrangian_network import Tensor
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.exceptions import ArgumentError
-from nbs_pin.networks.cholesky import CholeskyNetwork
-from nbs_pin.networks.lagrangian import Tensor
 
 
 class Terms(NamedTuple):

@@ -1,0 +1,135 @@
+"""The mismatch δ of a model on the states that a closed loop visits, and a bound that says how sure it is.
+
+δ = (M − M̂) v̇ + (C − Ĉ) v + (G − Ĝ) [N·m], the true torque minus the modelled one at the acceleration the arm has:
+M̂v̇ + Ĉv + Ĝ + δ = τ + τ_d (paper, the equation before its Theorem 4). The corrected theorem asks for
+‖δ‖ ≤ a‖q‖ + b‖v‖ + c, and v̇ depends on the law, so the constants hold for a law, not for a model (docs/theory.md §6).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linprog
+from scipy.special import betainccinv
+
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Run
+from nbs_pin.dynamics.equations import inverse_dynamics
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.provider import DynamicsProvider
+
+DOUBT = 1e-6
+"""β: the chance that the starts drawn were so unusual that the bound says more than is true."""
+_LEAST_WEIGHT = 0.1
+_UNKNOWNS = 3
+
+
+class Mismatch(NamedTuple):
+    """δ along a run, and ‖δ‖ ≤ a‖q‖ + b‖v‖ + c at every row of every trajectory.
+
+    With confidence 1 − `doubt`, a further trajectory drawn as those were (same law, same arm, same reference, starts
+    from the same distribution) breaks the bound at some control instant with a chance of at most `violation`.
+    """
+
+    a: float
+    """[N·m/rad]."""
+    b: float
+    """[N·m·s/rad]."""
+    c: float
+    """[N·m]."""
+    violation: float
+    """ε, by the scenario theorem over trajectories, not samples; 1 says nothing, as for a single trajectory."""
+    doubt: float
+    """β."""
+    trajectories: int
+    """Independent starts: those with different states in the first row, as copies of one say nothing new."""
+    rms: Float[np.ndarray, " n"]
+    """Root mean square of δ per joint [N·m]."""
+    t: Float[np.ndarray, " rows"]
+    """Time [s]."""
+    q_norm: Float[np.ndarray, "rows starts"]
+    """‖q‖ at the rows whose torque acted [rad]."""
+    v_norm: Float[np.ndarray, "rows starts"]
+    """‖v‖ [rad/s]."""
+    size: Float[np.ndarray, "rows starts"]
+    """‖δ‖ [N·m]."""
+
+    def bound(self, q_norm: Float[np.ndarray, "*x"], v_norm: Float[np.ndarray, "*x"]) -> Float[np.ndarray, "*x"]:
+        """a‖q‖ + b‖v‖ + c [N·m]."""
+        return self.a * q_norm + self.b * v_norm + self.c
+
+
+def mismatch(
+    model: DynamicsProvider,
+    truth: DynamicsProvider,
+    run: Run,
+    *,
+    friction: JointFriction | None = None,
+    doubt: float = DOUBT,
+) -> Mismatch:
+    """δ on the states of a run of the truth, and the (a, b, c) whose bound is least on average along its reference.
+
+    run: axes between time and joint are starts, drawn independently of each other; those with the same first state
+    count once. friction: of the plant.
+    Raises ArgumentError for a run of another number of joints, and a doubt outside (0, 1).
+    """
+    if not 0.0 < doubt < 1.0:
+        raise ArgumentError(f"doubt is {doubt}, expected a chance in (0, 1); 1e-6 is usual.")
+    a = accelerations(truth, run, friction)
+    q, v = run.q[:-1], run.v[:-1]
+    rows = zip(q, v, a, strict=True)  # one instant at a time: networks need memory for every state they see at once
+    delta = np.array([inverse_dynamics(truth, *row) - inverse_dynamics(model, *row) for row in rows])
+    if not np.isfinite(delta).all():
+        raise ArgumentError("the model or the run is not finite along the run; give a run that did not diverge.")
+    norms = [np.linalg.norm(x, axis=-1).reshape(len(q), -1) for x in (q, v, delta)]
+    # Weights that the starts have no part in: the scenario theorem asks for a goal that is fixed before they are drawn.
+    weights = [max(float(np.linalg.norm(x, axis=-1).mean()), _LEAST_WEIGHT) for x in (run.q_ref, run.v_ref)]
+    constants = _least_bound(norms[0].ravel(), norms[1].ravel(), norms[2].ravel(), weights)
+    first = np.concatenate([x[0].reshape(-1, run.nv) for x in (q, v)], axis=1)
+    count = len(np.unique(first, axis=0))
+    rms = np.sqrt(np.mean(delta.reshape(-1, run.nv) ** 2, axis=0))
+    return Mismatch(*constants, violation_chance(count, doubt), doubt, count, rms, run.t[:-1], *norms)
+
+
+def accelerations(
+    truth: DynamicsProvider, run: Run, friction: JointFriction | None = None
+) -> Float[np.ndarray, "rows *batch n"]:
+    """v̇ [rad/s²] of the truth at the rows of a run whose torque acted: all but the last."""
+    if run.nv != truth.nv:
+        raise ArgumentError(f"the run has {run.nv} joints and the truth {truth.nv}; give a run of that arm.")
+    net = run.tau[:-1] + run.disturbance[:-1]
+    if friction is not None:
+        net = net - friction.torque(run.v[:-1])
+    return truth.forward_dynamics(run.q[:-1], run.v[:-1], net)
+
+
+def violation_chance(trajectories: int, doubt: float = DOUBT, unknowns: int = _UNKNOWNS) -> float:
+    """The least ε such that Σ_{i<d} (N over i) εⁱ(1 − ε)^{N−i} ≤ β, for d unknowns of a convex program.
+
+    374 trajectories give 5 %, 1905 give 1 %, with β = 1e-6 and three unknowns; 1 where there are too few.
+    Source: Campi and Garatti, "The exact feasibility of randomized solutions of uncertain convex programs" (2008).
+    """
+    if trajectories <= unknowns:
+        return 1.0
+    return float(betainccinv(unknowns, trajectories - unknowns + 1, doubt))
+
+
+def _least_bound(
+    q_norm: np.ndarray, v_norm: np.ndarray, size: np.ndarray, weights: list[float]
+) -> tuple[float, float, float]:
+    """(a, b, c) ≥ 0 of the least w_q a + w_v b + c with a‖q‖ + b‖v‖ + c ≥ ‖δ‖ at every point, by cutting planes."""
+    scale = float(size.max())
+    if scale == 0.0:
+        return 0.0, 0.0, 0.0
+    points = np.column_stack([q_norm, v_norm, np.ones_like(q_norm)])
+    wanted, chosen = size / scale, np.array([int(size.argmax())])
+    while True:
+        constants = linprog([*weights, 1.0], A_ub=-points[chosen], b_ub=-wanted[chosen]).x
+        lack = wanted - points @ constants
+        worst = np.argsort(-lack)[:30]
+        if lack[worst[0]] <= 1e-7:
+            break
+        chosen = np.union1d(chosen, worst)
+    a, b, c = (scale * np.maximum(constants, 0.0)).tolist()
+    bound = a * q_norm + b * v_norm + c  # as `Mismatch.bound` computes it
+    return a, b, c + max(0.0, float((size - bound).max())) + 4.0 * np.finfo(float).eps * float(bound.max())

@@ -1,0 +1,68 @@
+"""One code for numpy arrays and torch tensors: the array kind in is the array kind out."""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+from array_api_compat import array_namespace, is_torch_array
+
+from nbs_pin.base.exceptions import ArgumentError
+
+Array: TypeAlias = Any
+"""A `numpy.ndarray` or a `torch.Tensor`; shapes are annotated with jaxtyping around it."""
+
+__all__ = ["Array", "array_namespace", "as_vectors", "constant_like", "is_torch_array", "matvec", "over_rows"]
+
+
+def matvec(matrix: Array, vector: Array) -> Array:
+    """Product of matrices (..., m, n) with vectors (..., n), shape (..., m)."""
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
+    """The given vectors as arrays of one kind and one batch shape (..., nv).
+
+    Lists and numbers become float64 numpy arrays; tensors stay tensors.
+    Raises ArgumentError when kinds are mixed, a tensor is not float64, a last axis is not nv, or batches do not
+    broadcast.
+    """
+    given = tuple(vectors.values())
+    shape = np.shape(given[0])
+    if (
+        shape
+        and shape[-1] == nv
+        and all(type(x) is np.ndarray and x.shape == shape and x.dtype == float for x in given)
+    ):
+        return given  # the common case, without a detour
+    arrays = [x if is_torch_array(x) else np.asarray(x, dtype=float) for x in vectors.values()]
+    if len({is_torch_array(x) for x in arrays}) > 1:
+        kinds = ", ".join(f"{k} {type(x).__name__}" for k, x in vectors.items())
+        raise ArgumentError(f"numpy and torch were mixed ({kinds}); give all arguments in one kind.")
+    for name, x in zip(vectors, arrays, strict=True):
+        if str(x.dtype) not in ("float64", "torch.float64"):
+            raise ArgumentError(f"{name} is a {x.dtype} tensor, expected float64; give {name}.double().")
+        if x.ndim == 0 or x.shape[-1] != nv:
+            raise ArgumentError(f"{name} has shape {tuple(x.shape)}, expected (..., {nv}): one number per joint.")
+    if len({tuple(x.shape) for x in arrays}) == 1:
+        return tuple(arrays)
+    try:
+        return tuple(array_namespace(*arrays).broadcast_arrays(*arrays))
+    except (ValueError, RuntimeError) as error:
+        shapes = ", ".join(f"{k} {tuple(x.shape)}" for k, x in zip(vectors, arrays, strict=True))
+        raise ArgumentError(f"batch shapes do not broadcast ({shapes}); give equal leading axes.") from error
+
+
+def constant_like(x: Array, constant: np.ndarray) -> Array:
+    """The numpy constant in the kind, precision and place of x."""
+    if not is_torch_array(x):
+        return constant
+    return array_namespace(x).asarray(constant, dtype=x.dtype, device=x.device)
+
+
+def over_rows(function: Callable[..., np.ndarray], *arguments: np.ndarray) -> np.ndarray:
+    """The function of every row of numpy arrays with equal leading axes, stacked with those axes."""
+    batch = arguments[0].shape[:-1]
+    rows = [x.reshape(-1, x.shape[-1]) for x in arguments]
+    values = [function(*row) for row in zip(*rows, strict=True)]
+    shape = values[0].shape if values else function(*(np.zeros(x.shape[-1]) for x in arguments)).shape
+    return np.array(values).reshape((*batch, *shape))

@@ -1,0 +1,152 @@
+"""Small named records that every room passes around."""
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nbs_pin.base.arrays import Array
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
+from nbs_pin.base.npz import read_npz, require, write_npz
+
+RUN_FORMAT = "nbs_pin run 1"
+"""What the `format` entry of a run file says."""
+_PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+_PER_JOINT = ("effort_limit", "continuous", "joint_names")
+_JSON = ("robot_options", "info")
+
+
+class Reference(NamedTuple):
+    """Desired configuration q [rad], velocity v [rad/s] and acceleration a [rad/s²], shape (..., nv)."""
+
+    q: Array
+    v: Array
+    a: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One recorded simulation: row k of every array belongs to the time t[k], the control instant k.
+
+    The torque in row k acts from t[k] to t[k+1]; the last row's torque was computed but not applied.
+    A batch of starts adds axes between time and joint: q has shape (steps + 1, ..., nv).
+    """
+
+    t: Float[np.ndarray, " rows"]
+    """Time [s]."""
+    q: Float[np.ndarray, "rows *batch n"]
+    """Configuration [rad]."""
+    v: Float[np.ndarray, "rows *batch n"]
+    """Velocity [rad/s]."""
+    tau: Float[np.ndarray, "rows *batch n"]
+    """Torque applied, after the effort limits [N·m]."""
+    tau_command: Float[np.ndarray, "rows *batch n"]
+    """Torque the controller asked for [N·m]."""
+    disturbance: Float[np.ndarray, "rows *batch n"]
+    """Disturbance torque τ_d at the control instants [N·m], 0 in the last row."""
+    q_ref: Float[np.ndarray, "rows *batch n"]
+    """Desired configuration [rad]."""
+    v_ref: Float[np.ndarray, "rows *batch n"]
+    """Desired velocity [rad/s]."""
+    a_ref: Float[np.ndarray, "rows *batch n"]
+    """Desired acceleration [rad/s²]."""
+    effort_limit: Float[np.ndarray, " n"]
+    """Largest |τ| per joint [N·m], inf where none."""
+    continuous: Bool[np.ndarray, " n"]
+    """True for joints whose error is wrapped to (−π, π]."""
+    joint_names: tuple[str, ...]
+    """Names of the joints, in order."""
+    period: float
+    """Control period [s]."""
+    robot: str = ""
+    """`Robot.source` of the arm, or empty."""
+    robot_sha256: str = ""
+    """`Robot.sha256` of that arm, or empty."""
+    robot_options: dict[str, Any] = field(default_factory=dict)
+    """`Robot.options` of that arm."""
+    info: dict[str, Any] = field(default_factory=dict)
+    """Free notes (controller, plant, seed, versions), stored as JSON."""
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return int(self.q.shape[-1])
+
+    def save(self, path: str | Path) -> None:
+        """Write the run to an npz file; missing folders are made, an older file is replaced whole or left alone.
+
+        Raises ArgumentError when `info` holds something JSON cannot say.
+        """
+        values = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+        texts = {name: _dumped(name, values[name]) for name in _JSON} | {"format": RUN_FORMAT}
+        write_npz(path, {name: np.asarray(value) for name, value in (values | texts).items()})
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Run":
+        """The run in the npz file that `save` wrote.
+
+        Raises FileFormatError for a damaged file, a missing key, a wrong shape or a number that is not finite.
+        """
+        data = {"robot_options": np.array("{}"), **read_npz(path)}  # which the first runs did not record
+        require(data, path, {"format": "U", "t": "f", **dict.fromkeys(_PER_ROW, "f"), "effort_limit": "f"})
+        require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", *_JSON), "U")})
+        require(data, path, {"period": "f"})
+        if str(data["format"]) != RUN_FORMAT:
+            raise FileFormatError(f"{path}: format '{data['format']}', expected '{RUN_FORMAT}'; record the run again.")
+        _check_shapes(path, data)
+        _check_numbers(path, data)
+        return cls(
+            **{name: data[name] for name in ("t", *_PER_ROW, "effort_limit", "continuous")},
+            joint_names=tuple(str(name) for name in data["joint_names"]),
+            period=float(data["period"]),
+            robot=str(data["robot"]),
+            robot_sha256=str(data["robot_sha256"]),
+            robot_options=_parsed(path, data, "robot_options"),
+            info=_parsed(path, data, "info"),
+        )
+
+
+def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
+    shape = data["q"].shape
+    expected = dict.fromkeys(_PER_ROW, shape) | dict.fromkeys(_PER_JOINT, shape[-1:]) | {"t": shape[:1], "period": ()}
+    for name, wanted in expected.items():
+        if len(shape) < 2 or data[name].shape != wanted:
+            raise FileFormatError(
+                f"{path}: '{name}' has shape {data[name].shape}, expected {wanted} beside q of shape {shape}, "
+                "(rows, ..., joints); record the run again."
+            )
+
+
+def _check_numbers(path: str | Path, data: dict[str, np.ndarray]) -> None:
+    faults = {name: "numbers that are not finite" for name in ("t", *_PER_ROW) if not np.isfinite(data[name]).all()}
+    if not (data["effort_limit"] > 0.0).all():
+        faults["effort_limit"] = "limits that are not > 0"
+    if not 0.0 < data["period"] < np.inf:
+        faults["period"] = "no finite time > 0"
+    if not (np.diff(data["t"]) > 0.0).all():
+        faults.setdefault("t", "times that do not increase")
+    for name, fault in faults.items():
+        raise FileFormatError(f"{path}: '{name}' has {fault}; record the run again.")
+
+
+def _dumped(name: str, value: dict[str, Any]) -> str:
+    try:
+        return json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"run.{name} cannot be stored as JSON ({error}); keep numbers, text and lists.") from error
+
+
+def _parsed(path: str | Path, data: dict[str, np.ndarray], name: str) -> dict[str, Any]:
+    try:
+        value = json.loads(str(data[name]))
+    except json.JSONDecodeError as error:
+        raise FileFormatError(f"{path}: '{name}' is not JSON ({error}); record the run again.") from error
+    if not isinstance(value, dict):
+        raise FileFormatError(
+            f"{path}: '{name}' is a {type(value).__name__}, expected an object; record the run again."
+        )
+    return value

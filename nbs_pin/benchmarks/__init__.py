@@ -1,0 +1,1 @@
+"""What laws, plants and training cost; laws compared."""

@@ -1,0 +1,189 @@
+"""Many motions of one closed loop, each on its reference at first, under any held disturbances; with gradients."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from nbs_pin.base.checks import PerJoint, positive
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.base.progress import tracked
+from nbs_pin.base.records import Reference, Run
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.motions.references import DesiredMotion, Hold, Sinusoid
+from nbs_pin.robots.robot import configuration_difference
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.loop import Loop
+from nbs_pin.simulation.rollout import Batch, Engine, engine_for, motions, recorded
+
+POSTURES = 7
+"""Postures held still, beside the arm's own motion, where no reference is given."""
+TIME_CONSTANTS, MOST_PERIODS = 7.0, 4000
+"""Default duration: so many of the slowest, but no more periods than these."""
+_TOGETHER = 128  # motions in memory at once
+_PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+
+
+class Peaks(NamedTuple):
+    """Largest errors of motions, a row per motion."""
+
+    error: Float[np.ndarray, " count"]
+    """max_t ‖z1(t)‖ [rad]."""
+    joint_errors: Float[np.ndarray, "count n"]
+    """max_t |z1_i(t)| [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arena:
+    """A closed loop and the motions it can be made to follow; `of` makes it."""
+
+    controller: ModelLaw
+    scenes: Batch
+    """One row per motion to follow, undisturbed."""
+    engine: Engine
+
+    @classmethod
+    def of(
+        cls,
+        controller: Controller,
+        reference: DesiredMotion | Sequence[DesiredMotion] | None,
+        plant_dynamics: DynamicsProvider | None,
+        duration: float | None,
+        period: float,
+        effort_limit: PerJoint,
+        seed: int,
+    ) -> "Arena":
+        """The loop with the arguments of `attack`; raises ArgumentError when they do not fit."""
+        law = law_of(controller)
+        positive("period", period, "s")
+        truth = law.dynamics if plant_dynamics is None else plant_dynamics
+        followed = motions_of(law.dynamics, reference, seed)
+        if duration is None:
+            lasting = TIME_CONSTANTS / slowest_rate(law, followed[0])
+            duration = period * min(max(math.ceil(lasting / period), 10), MOST_PERIODS)
+        plant = DynamicsPlant(truth, friction=law.friction)
+        loop = Loop.of(plant, law.nv, duration, period, plant_step=None, effort_limit=effort_limit, lookahead=None)
+        scenes = Batch.joined([Batch.of(loop, motion) for motion in followed])
+        return cls(law, scenes, engine_for(law, loop))
+
+    @property
+    def loop(self) -> Loop:
+        """Period, steps and plant."""
+        return self.scenes.loop
+
+    def batch(self, motion: Int[np.ndarray, " count"], tau_d: Float[np.ndarray, "count steps n"]) -> Batch:
+        """Those motions under those torques."""
+        picked = {name: getattr(self.scenes, name)[motion] for name in ("aims", "desired", "q0", "v0")}
+        return replace(self.scenes, **picked, tau_d=np.ascontiguousarray(tau_d))
+
+    def peaks(
+        self, motion: Int[np.ndarray, " count"], tau_d: Float[np.ndarray, "count steps n"], progress: bool = False
+    ) -> Peaks:
+        """Largest errors of those motions under those torques [N·m]."""
+        parts = [slice(k, k + _TOGETHER) for k in range(0, len(motion), _TOGETHER)]
+        found = []
+        with torch.no_grad():
+            for part in tracked(parts, "motions under disturbance", progress):
+                z1 = np.abs(self._errors(self.batch(motion[part], tau_d[part])).numpy())
+                found.append((np.linalg.norm(z1, axis=-1).max(axis=1), z1.max(axis=1)))
+        return Peaks(*(np.concatenate(x) for x in zip(*found, strict=True)))
+
+    def climb(
+        self,
+        motion: Int[np.ndarray, " count"],
+        tau_d: Float[np.ndarray, "count steps n"],
+        weights: Float[np.ndarray, "count n"],
+        at_end: bool,
+    ) -> Float[np.ndarray, "count steps n"]:
+        """The gradient by τ_d of Σ w_i z1_i² at the end, or at the time of its peak."""
+        torque = torch.tensor(tau_d, requires_grad=True)
+        z1 = self._errors(self.batch(motion, tau_d), torque)
+        goal = (torch.as_tensor(weights)[:, None] * z1**2).sum(-1)
+        row = torch.full((len(goal),), -1) if at_end else goal.argmax(dim=1)
+        (gradient,) = torch.autograd.grad(goal[torch.arange(len(goal)), row].sum(), torque)
+        return np.asarray(gradient.numpy())
+
+    def run(self, motion: int, tau_d: Float[np.ndarray, "steps n"], **info: str) -> Run:
+        """One motion under one torque as a run."""
+        batch = self.batch(np.array([motion]), tau_d[None])
+        with torch.no_grad():
+            moved = motions(self.controller, batch, self.engine)
+        many = recorded(moved, batch, type(self.controller).__name__)
+        return replace(many, **{name: getattr(many, name)[:, 0] for name in _PER_ROW}, info={**many.info, **info})
+
+    def _errors(self, batch: Batch, tau_d: torch.Tensor | None = None) -> torch.Tensor:
+        """z1 (count, rows, n); raises SimulationDiverged when one is not finite."""
+        q = motions(self.controller, batch, self.engine, tau_d).q
+        robot = batch.loop.plant.robot
+        continuous = None if robot is None else robot.continuous
+        z1 = configuration_difference(q, torch.as_tensor(batch.desired[:, :, 0]), continuous)
+        if not bool(torch.isfinite(z1).all()):
+            row = int((~torch.isfinite(z1).all(-1)).any(0).to(torch.uint8).argmax())
+            raise SimulationDiverged(
+                f"the closed loop left the finite numbers at t = {row * batch.loop.period:g} s under an admissible"
+                f" disturbance; take a shorter control period than {batch.loop.period:g} s."
+            )
+        return z1
+
+
+def law_of(controller: Any) -> ModelLaw:
+    """The controller, once it is sure to be a law with a model; raises ArgumentError else."""
+    if not isinstance(controller, ModelLaw):
+        raise ArgumentError(
+            f"a {type(controller).__name__} is no law with a model, which gradients of a motion go through; give a "
+            "NeuralBackstepping, ComputedTorque or SlotineLi, and of a compiled law what it was compiled from."
+        )
+    return controller
+
+
+def motions_of(
+    dynamics: DynamicsProvider, reference: DesiredMotion | Sequence[DesiredMotion] | None, seed: int
+) -> list[DesiredMotion]:
+    """The motions given, or without any, the arm's own (`Sinusoid.for_robot`) and postures held still.
+
+    Raises ArgumentError for an empty list, and for what is no motion.
+    """
+    if reference is not None:
+        followed = list(reference) if isinstance(reference, Sequence) else [reference]
+        if not followed:
+            raise ArgumentError("reference is an empty list, expected at least one motion; leave it out for the arm's.")
+        for motion in followed:
+            _check_motion(motion)
+        return followed
+    rng, robot, n = np.random.default_rng(seed), dynamics.robot, dynamics.nv
+    low, high = (np.full(n, -np.pi), np.full(n, np.pi)) if robot is None else robot.sampling_range
+    own: list[DesiredMotion] = [Hold(np.zeros(n)) if robot is None else Sinusoid.for_robot(robot, 1.0)]
+    return own + [Hold(rng.uniform(low, high)) for _ in range(POSTURES)]
+
+
+def _check_motion(motion: Any) -> None:
+    sampled = motion(np.zeros(1)) if callable(motion) else None
+    if not isinstance(sampled, tuple) or len(sampled) != len(Reference._fields):
+        raise ArgumentError(
+            f"the reference {motion!s:.80} is no motion, expected a function of time that gives a Reference (q, v, a); "
+            "take Hold, Sinusoid or one from a file."
+        )
+
+
+def slowest_rate(controller: ModelLaw, reference: DesiredMotion) -> float:
+    """The least |Re λ| [1/s] of the undisturbed loop, linearised at the start of the reference held still.
+
+    With z1, z2: ż1 = z2 − Λ∇²Φ(0)z1 and M ż2 = −∇²Φ(0)z1 − (ωM + D(0))z2; other laws than NBS have 1.
+    """
+    if not isinstance(controller, NeuralBackstepping):
+        return 1.0
+    n, zero = controller.nv, np.zeros(controller.nv)
+    eye = np.eye(n)
+    hessian = controller.potential.terms(np.zeros((n, n)), eye)[2]
+    mass = controller.dynamics.mass_matrix(np.asarray(reference(np.zeros(1)).q)[0])
+    damping = controller.inertial_rate * eye + np.linalg.solve(mass, controller.damping.matrix(zero))
+    above = np.hstack([-controller.rate.numpy()[:, None] * hessian, eye])
+    loop = np.vstack([above, np.hstack([-np.linalg.solve(mass, hessian), -damping])])
+    return float(max(np.abs(np.linalg.eigvals(loop).real).min(), 1e-6))

@@ -1,0 +1,51 @@
+"""From energies to radians: bounds of ‖z1‖ and of each |z1_i|."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.certificates import one_joint
+from nbs_pin.certificates.comparison_system import Comparison
+from nbs_pin.certificates.constants import above_inverse
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.inertia.rounding import least_eigenvalue
+
+
+def errors(
+    controller: NeuralBackstepping, comparison: Comparison, storage: float, potential: float
+) -> tuple[float, Float[np.ndarray, " n"], str]:
+    """Bounds of ‖z1‖ and each |z1_i| [rad], and where they come from."""
+    size, joints = radians(np.asarray(controller.potential.stiffness.numpy()), potential)
+    exact = math.inf
+    # Friction fed forward leaves a term that is not linear, a model's error another.
+    if controller.nv == 1 and controller.friction is None and comparison.alpha == comparison.beta == 0.0:
+        exact = _of_one_joint(controller, comparison, storage, size)
+    if exact < size:
+        return exact, np.array([exact]), "the loop of one joint is linear up to ψ and T, docs/certificates.md §4"
+    return size, joints, "Φ ≥ z1ᵀSz1 and Φ∞, docs/certificates.md §3"
+
+
+def _of_one_joint(controller: NeuralBackstepping, comparison: Comparison, storage: float, size: float) -> float:
+    """The bound of |z1| that linear theory gives, inf where it does not apply; `size` [rad] is one already."""
+    if type(controller.dynamics) is not PinocchioDynamics or controller.damping.floor is None:
+        return math.inf
+    loop = one_joint.Loop(
+        inertia=float(controller.dynamics.mass_matrix(np.zeros(1))[0, 0]),
+        rate=float(controller.rate.numpy()[0]),
+        omega=float(controller.inertial_rate),
+        stiffness=2.0 * float(controller.potential.stiffness.numpy()[0, 0]),
+        damping=float(controller.damping.floor.numpy()[0, 0]),
+    )
+    within = one_joint.Worst(size, math.sqrt(2.0 * storage / loop.inertia) * (1.0 + 1e-12))
+    torque = comparison.t * math.sqrt(loop.damping)
+    return one_joint.worst_error(loop, torque, controller.potential, controller.damping, within)
+
+
+def radians(stiffness: Float[np.ndarray, "n n"], potential: float) -> tuple[float, Float[np.ndarray, " n"]]:
+    """√(Φ/λ_min(S)) and √(Φ (S⁻¹)_ii), which bound ‖z1‖ and |z1_i| where Φ ≥ z1ᵀSz1 is at most `potential`."""
+    joints = np.sqrt(potential * np.diag(above_inverse(stiffness)))
+    # The joints together are never further than the ellipsoid is long, nor than the corner of their own bounds.
+    total = min(math.sqrt(potential / least_eigenvalue(stiffness)), float(np.linalg.norm(joints)))
+    return total, np.minimum(joints, total)

@@ -1,0 +1,189 @@
+"""A certificate held against a loop while it runs."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nbs_pin.base.claims import Assumption
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
+from nbs_pin.certificates.assumptions import (
+    JUMPS,
+    NOTICEABLE,
+    Promise,
+    Setting,
+    check_certificate,
+    decayed,
+    excess_of,
+    failures,
+    greatest,
+    jumps,
+    listed,
+    quantities,
+    sentence,
+)
+from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.energy_balance import Balance, Instants, balance, storage_of
+from nbs_pin.controllers.controller import MemorylessController
+
+
+class WatchMemory(NamedTuple):
+    """What a `Watch` remembers from one instant to the next."""
+
+    began: float
+    """Time of the first instant [s]."""
+    initial: float
+    """V at that time [J]."""
+    last: Instants
+    """The instant before."""
+    storage: float
+    """V then [J]."""
+    excess: float
+    """Energy that torques beyond the admissible ones can have brought and that has not decayed [J]."""
+    held: float
+    """Energy that holding the torque has brought and that has not decayed [J]."""
+    ratio: float
+    """How many times the bound torques have been so far, at least 1."""
+    broken: tuple[Assumption, ...]
+    """Assumptions that have failed so far."""
+
+
+class Watched(NamedTuple):
+    """What a `Watch` says at one instant."""
+
+    storage: float
+    """V [J]."""
+    promise: float
+    """What V is not to exceed [J]."""
+    error: float
+    """‖z1‖ [rad]."""
+    error_bound: float
+    """What ‖z1‖ is not to exceed [rad]."""
+    joint_errors: Float[np.ndarray, " n"]
+    """|z1_i| [rad]."""
+    joint_bounds: Float[np.ndarray, " n"]
+    """What each is not to exceed [rad]."""
+    excesses: tuple[str, ...]
+    """What is beyond its bound now: "V", "‖z1‖" or "|z1| of" a joint by name."""
+    broken: tuple[Assumption, ...]
+    """Assumptions that have failed so far."""
+    balance: Balance | None
+    """V̇ and its terms over the last period; None at the first instant."""
+    verdict: str
+    """One sentence."""
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether V, ‖z1‖ and every |z1_i| are within the promise, now."""
+        return not self.excesses
+
+
+class _Seen(NamedTuple):
+    """V, ‖z1‖ and each |z1_i| at one instant, and their bounds."""
+
+    values: Float[np.ndarray, " quantities"]
+    bounds: Float[np.ndarray, " quantities"]
+    over: Bool[np.ndarray, " quantities"]
+    is_unaccounted: bool
+    """Whether one is beyond what torques that are not admissible can have done."""
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """A certificate held against a loop while it runs, one instant after the other; its memory is the caller's.
+
+    Of a live arm no disturbance is on record: all that is unexplained is said of model and disturbance both.
+    Raises ArgumentError for what is no certificate.
+    """
+
+    certificate: Certificate
+
+    def __post_init__(self) -> None:
+        check_certificate(self.certificate)
+
+    @cached_property
+    def _law(self) -> MemorylessController:
+        return cast(MemorylessController, self.certificate.controller.compile())
+
+    def step(
+        self,
+        memory: WatchMemory | None,
+        t: float,
+        q: Float[np.ndarray, " n"],
+        v: Float[np.ndarray, " n"],
+        reference: Reference,
+        tau: Float[np.ndarray, " n"],
+        tau_command: Float[np.ndarray, " n"],
+    ) -> tuple[Watched, WatchMemory]:
+        """What is to be said at time t [s], and what to remember; memory is None at first, tau acts from t on [N·m].
+
+        Raises ArgumentError for an instant that is not after the last one.
+        """
+        now = Instants(np.array(t), q, v, reference.q, reference.v, reference.a, tau, tau_command)
+        storage = float(storage_of(self.certificate.controller, now))
+        if memory is None:
+            memory = WatchMemory(t, storage, now, storage, 0.0, 0.0, 1.0, ())
+            return self._said(memory, None, self._seen(memory)), memory
+        step = t - float(memory.last.t)
+        if not step > 0.0:
+            raise ArgumentError(f"the instant t = {t} s is not after the last, {memory.last.t} s; give them in order.")
+        both = Instants(*(np.stack([a, b]) for a, b in zip(memory.last, now, strict=True)))
+        change = np.array([storage - memory.storage])
+        flow = balance(self.certificate.controller, both.rows(slice(1)), both.rows(slice(1, None)), change, self._law)
+        setting, decay = Setting.of(self.certificate, flow, both), self.certificate.level.c
+        power, ratio = (float(x[0]) for x in excess_of(flow, setting))
+        memory = memory._replace(
+            last=now,
+            storage=storage,
+            excess=decayed(memory.excess, power, step, decay),
+            held=decayed(memory.held, float(flow.held[0]), step, decay),
+            ratio=max(memory.ratio, ratio),
+        )
+        seen = self._seen(memory)
+        memory = memory._replace(broken=self._broken(memory, flow, setting, both, seen))
+        return self._said(memory, flow, seen), memory
+
+    def _seen(self, memory: WatchMemory) -> _Seen:
+        """The memory's last instant beside what was promised of it."""
+        dynamics, now, promise = self.certificate.controller.dynamics, memory.last, self._promise(memory)
+        values = quantities(np.array([memory.storage]), dynamics.difference(now.q, now.q_ref)[None])
+        bounds = promise.bounds(np.array([float(now.t) - memory.began]))
+        over = promise.exceeded(values, bounds)
+        accounted = promise.accounted(bounds, np.array([memory.excess]), np.array([memory.ratio]))
+        return _Seen(values[0], bounds[0], over[0], bool((over & (values > accounted)).any()))
+
+    def _broken(
+        self, memory: WatchMemory, flow: Balance, setting: Setting, both: Instants, seen: _Seen
+    ) -> tuple[Assumption, ...]:
+        """The assumptions that have failed, those of the last period among them."""
+        controller = self.certificate.controller
+        held = np.array([memory.held > NOTICEABLE * seen.bounds[0]])
+        failed = failures(flow, setting, jumps(controller, both), held, bool(seen.over.any()), None)
+        broken = tuple(name for name in Assumption if name in failed or name in memory.broken)
+        if seen.over.any() and not broken and not seen.is_unaccounted:
+            return greatest(flow, setting.admissible, None)
+        return broken
+
+    def _said(self, memory: WatchMemory, flow: Balance | None, seen: _Seen) -> Watched:
+        names = zip(self._promise(memory).names, seen.over.tolist(), strict=True)
+        excesses = tuple(name for name, is_over in names if is_over)
+        is_wrong = seen.is_unaccounted and not any(name in memory.broken for name in JUMPS)
+        at, failed = f" by {listed(excesses)}", dict.fromkeys(memory.broken, "")
+        return Watched(
+            storage=memory.storage,
+            promise=float(seen.bounds[0]),
+            error=float(seen.values[1]),
+            error_bound=float(seen.bounds[1]),
+            joint_errors=seen.values[2:],
+            joint_bounds=seen.bounds[2:],
+            excesses=excesses,
+            broken=memory.broken,
+            balance=flow,
+            verdict=sentence(at, not excesses, is_wrong, failed, is_recorded=False),
+        )
+
+    def _promise(self, memory: WatchMemory) -> Promise:
+        return Promise(self.certificate, memory.initial)

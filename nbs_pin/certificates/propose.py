@@ -1,0 +1,285 @@
+"""Gains and a control period chosen from the bound: a given error for a given disturbance, certified.
+
+For the inertia-shaped law with K = s²K̂, D₀ = sD̂₀ and ω = sω̂ every constant of the proof scales with the speed s: V∞
+and Φ∞ fall with s⁻², the errors √(2Φ∞/K_i) with s⁻⁴ under the root, which is s⁻². So one bound per shape (K̂, D̂₀, ω̂)
+gives the slowest loop of that shape that certifies the wanted error (docs/certificates.md §8).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.checks import PerJoint, floats, positive
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.comparison_system import Comparison, level, reach
+from nbs_pin.certificates.loads import sampled
+from nbs_pin.controllers.gains import Gains, effective_inertia, largest_inertia
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.motions.references import DesiredMotion, Sinusoid
+from nbs_pin.robots.robot import Robot
+
+PERIODS = (0.01, 0.005, 0.002, 0.001, 0.0005, 0.00025)
+"""Control periods to choose from unless told otherwise, the longest first [s]."""
+STIFF, FAST = 0.4, 0.25
+"""Largest √(K_i/M_e,i)·h and ωh: what sampled loops without delay stay calm at (docs/theory.md §2, measured)."""
+_ALIKE = (0.0, 0.5, 1.0)
+"""Exponents of M_e in K̂: 0 makes the stiffness of all joints what their errors ask for, 1 their frequencies alike."""
+_SLOWNESS = (1.0, 1.6, 2.5, 4.0)
+"""√(K/M_e) of the lightest joint in units of ω."""
+_DAMPING = (0.5, 0.7, 1.0)
+"""ζ of D₀ = 2ζ√(K M_e)."""
+_SPARE = 1.0 - 1e-6
+"""The design aims at so much of the wanted error, so that the rounding of its certificate fits in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """An inertia-shaped law whose certificate keeps the wanted error."""
+
+    gains: Gains
+    """ω, K = 2S, D₀; Λ = ωK⁻¹ is their `rate`."""
+    period: float
+    """The longest control period found for it [s]."""
+    controller: NeuralBackstepping
+    """The law with these gains and fresh networks; the bound holds for every weight of theirs."""
+    error: float
+    """Bound of ‖z1‖ [rad]; `certify` gives this or less."""
+    joint_errors: Float[np.ndarray, " n"]
+    """Bound of every |z1_i| [rad]."""
+    torque: Float[np.ndarray, " n"]
+    """|τ_ref| + disturbance + K_i·(bound of |z1_i|), the stiffness at its bound, per joint [N·m]."""
+    share: float
+    """The largest share of an effort limit in `torque`; 0 without limits."""
+    stiff: float
+    """Largest √(K_i/M_e,i)·h, at most `STIFF`."""
+    fast: float
+    """ωh, at most `FAST`."""
+
+
+def propose(
+    robot: Robot,
+    disturbance: PerJoint | Admissible,
+    error: PerJoint,
+    *,
+    reference: DesiredMotion | None = None,
+    duration: float = 10.0,
+    periods: Sequence[float] = PERIODS,
+    dynamics: DynamicsProvider | None = None,
+    seed: int = 0,
+) -> Proposal:
+    """S, Λ, D₀ and the control period that certify the wanted error inside the arm's torque limits.
+
+    The longest period wins, then the gentlest law: the least answer (K_i + ωD₀,i + ω²M_ii)·|z1_i| to its error bounds.
+    The limits must leave room for reference, disturbance and the stiffness at its bound, which is a margin and no
+    proof that no joint saturates. That torque is the same for every wanted error: a stiffer law has a smaller one.
+
+    disturbance: as in `certify`. error: of ‖z1‖, or one per joint on |z1_i| [rad]. reference: whose torque over
+    `duration` [s] the limits must allow as well; None takes `Sinusoid.for_robot`. periods: to choose from [s].
+    dynamics: the exact model of the arm; None takes Pinocchio's. seed: of the networks.
+    Raises ArgumentError that says what forbids it, the torque limit of a joint or the control periods, and for
+    arguments that are none.
+    """
+    _check_kinds(robot, reference, dynamics)
+    admissible = Admissible.of(disturbance, robot.nv)
+    wanted = _wanted(error, robot.nv)
+    choice = _periods(periods)
+    arm = _Arm.of(robot, dynamics, admissible, reference, duration)
+    _check_limits(robot, arm)
+    candidates = [c for shape in _shapes(arm, wanted) if (c := _scaled(shape, admissible, wanted))]
+    for period in choice:
+        calm = [c for c in candidates if c.fits(arm, period)]
+        light = [c for c in calm if c.share(arm, robot) <= 1.0]
+        if light:
+            best = min(light, key=lambda c: c.answer(arm, robot))
+            return _proposal(robot, arm, best, period, dynamics, seed)
+    raise ArgumentError(_forbidden(robot, arm, candidates, choice[-1], admissible))
+
+
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """What a design needs to know of the arm, (n,) each."""
+
+    effective: np.ndarray
+    """M_e [kg·m²]."""
+    largest: np.ndarray
+    """max M_ii [kg·m²]."""
+    reference_torque: np.ndarray
+    """Peak |τ| of the reference [N·m]."""
+    disturbance: np.ndarray
+    """Largest |τ_d,i| [N·m]."""
+
+    @classmethod
+    def of(
+        cls,
+        robot: Robot,
+        dynamics: DynamicsProvider | None,
+        admissible: Admissible,
+        reference: DesiredMotion | None,
+        duration: float,
+    ) -> "_Arm":
+        model = PinocchioDynamics(robot) if dynamics is None else dynamics
+        motion = Sinusoid.for_robot(robot) if reference is None else reference
+        desired = sampled(robot, motion, duration)
+        tau = model.reference_torque(desired.q, desired.v, desired.v, desired.a)
+        peak = np.full(robot.nv, admissible.radius) if admissible.box is None else admissible.box
+        return cls(
+            effective_inertia(robot, model), largest_inertia(robot, model), np.abs(tau).max(axis=0), peak.astype(float)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Gains that certify the error, at the least speed of their shape."""
+
+    gains: Gains
+    potential: float
+    """Φ∞ [J]."""
+
+    @property
+    def joint_errors(self) -> np.ndarray:
+        return np.sqrt(2.0 * self.potential / self.gains.stiffness)
+
+    def fits(self, arm: _Arm, period: float) -> bool:
+        return self.stiff(arm, period) <= STIFF and self.gains.bandwidth * period <= FAST
+
+    def stiff(self, arm: _Arm, period: float) -> float:
+        return float(np.sqrt(self.gains.stiffness / arm.effective).max()) * period
+
+    def torque(self, arm: _Arm) -> np.ndarray:
+        return arm.reference_torque + arm.disturbance + self.gains.stiffness * self.joint_errors
+
+    def answer(self, arm: _Arm, robot: Robot) -> float:
+        """The largest torque of the law at rest at its error bounds, as a share of the limits where all have one."""
+        omega, limits = self.gains.bandwidth, robot.effort_limit
+        total = self.gains.stiffness + omega * self.gains.damping + omega**2 * arm.largest
+        return float((total * self.joint_errors / (limits if np.isfinite(limits).all() else 1.0)).max())
+
+    def share(self, arm: _Arm, robot: Robot) -> float:
+        return float((self.torque(arm) / robot.effort_limit).max())
+
+
+def _shapes(arm: _Arm, wanted: np.ndarray) -> Iterator[Gains]:
+    """Gains up to their speed: ω̂ = 1."""
+    need = 1.0 / wanted**2
+    for exponent, slowness, damping in product(_ALIKE, _SLOWNESS, _DAMPING):
+        stiffness = need ** (1.0 - exponent) * arm.effective**exponent
+        stiffness *= slowness**2 / (stiffness / arm.effective).max()
+        yield Gains(1.0, stiffness, 2.0 * damping * np.sqrt(stiffness * arm.effective))
+
+
+def _scaled(shape: Gains, admissible: Admissible, wanted: np.ndarray) -> "_Candidate | None":
+    """The shape at the least speed that certifies the error; None for no disturbance at all."""
+    unit = _potential(shape, admissible)
+    errors = np.sqrt(2.0 * unit / shape.stiffness)
+    missing = float((errors / wanted).max())
+    s = np.sqrt(missing / _SPARE)
+    gains = Gains(float(s), s**2 * shape.stiffness, s * shape.damping)
+    return _Candidate(gains, unit / s**2) if s > 0.0 else None
+
+
+def _potential(gains: Gains, admissible: Admissible) -> float:
+    """Φ∞ [J] of the inertia-shaped law, whatever M is: ρ = ω because ΛK = ωI."""
+    omega = gains.bandwidth
+    delta = float((omega * gains.damping / gains.stiffness).min())
+    t = float(np.sqrt(admissible.energy(np.diag(1.0 / gains.damping))))
+    comparison = Comparison(rho=omega, delta=delta, kappa=0.0, nu=np.inf, omega=omega, t=t)
+    return reach(comparison, level(comparison).storage)
+
+
+def _proposal(
+    robot: Robot, arm: _Arm, best: _Candidate, period: float, dynamics: DynamicsProvider | None, seed: int
+) -> Proposal:
+    controller = NeuralBackstepping.for_robot(robot, dynamics, period=period, gains=best.gains, seed=seed)
+    return Proposal(
+        gains=best.gains,
+        period=period,
+        controller=controller,
+        error=float(np.sqrt(2.0 * best.potential / best.gains.stiffness.min())),
+        joint_errors=best.joint_errors,
+        torque=best.torque(arm),
+        share=best.share(arm, robot),
+        stiff=best.stiff(arm, period),
+        fast=best.gains.bandwidth * period,
+    )
+
+
+def _check_kinds(robot: Any, reference: Any, dynamics: Any) -> None:
+    """Raises ArgumentError for what is no arm, no motion, no model, or a model of another number of joints."""
+    if not isinstance(robot, Robot):
+        raise ArgumentError(
+            f"a design is made for an arm and was given {_shown(robot)}; give load_robot(…), or of a controller its "
+            "dynamics.robot."
+        )
+    if reference is not None and not callable(reference):
+        raise ArgumentError(f"the reference is {_shown(reference)}, expected a motion like Sinusoid.for_robot(robot).")
+    if dynamics is not None and not (isinstance(dynamics, DynamicsProvider) and dynamics.nv == robot.nv):
+        raise ArgumentError(
+            f"dynamics is {_shown(dynamics)}, expected a model of the {robot.nv} joints of {robot.name}; leave it out "
+            "for Pinocchio's."
+        )
+
+
+def _shown(value: Any) -> str:
+    """A value in a sentence: itself where it is short, else its kind."""
+    return f"'{value}'" if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+
+
+def _periods(periods: Any) -> list[float]:
+    """The control periods to choose from [s], the longest first."""
+    choice = floats("periods", periods)
+    if choice.ndim != 1:
+        raise ArgumentError(f"periods is {_shown(periods)}, expected a list to choose from: periods=(0.001,) [s].")
+    if not choice.size:
+        raise ArgumentError("no control period was given to choose from; give at least one [s].")
+    for period in choice.tolist():
+        positive("a period", period, "s")
+    return sorted(choice.tolist(), reverse=True)
+
+
+def _wanted(error: PerJoint, nv: int) -> np.ndarray:
+    """The wanted error of every joint [rad]."""
+    wanted = floats("the wanted error", error)
+    if wanted.shape not in ((), (nv,)) or not (np.isfinite(wanted).all() and (wanted > 0.0).all()):
+        raise ArgumentError(f"the wanted error is {error}; give one number > 0, or {nv}, one per joint [rad].")
+    return np.full(nv, wanted)
+
+
+def _check_limits(robot: Robot, arm: _Arm) -> None:
+    """Raises ArgumentError where a joint cannot even hold reference and disturbance."""
+    spare = robot.effort_limit - arm.reference_torque - arm.disturbance
+    i = int(np.argmin(spare))
+    if spare[i] <= 0.0:
+        raise ArgumentError(
+            f"joint '{robot.joint_names[i]}' of {robot.name} gives {robot.effort_limit[i]:g} N·m, and reference and"
+            f" disturbance alone take {arm.reference_torque[i]:.3g} + {arm.disturbance[i]:.3g} N·m; no gains can help:"
+            " give a gentler motion, less load or a stronger drive."
+        )
+
+
+def _forbidden(robot: Robot, arm: _Arm, candidates: "list[_Candidate]", period: float, admissible: Admissible) -> str:
+    """Why no candidate will do, in one sentence."""
+    if not candidates:
+        return f"{admissible} asks for no gains at all; give a disturbance above 0."
+    light = [c for c in candidates if c.share(arm, robot) <= 1.0]
+    if not light:
+        best = min(candidates, key=lambda c: c.share(arm, robot))
+        i = int(np.argmax(best.torque(arm) / robot.effort_limit))
+        return (
+            f"the torque limit of joint '{robot.joint_names[i]}' of {robot.name} forbids it: reference, disturbance and"
+            f" the stiffness at its error bound take {best.torque(arm)[i]:.3g} N·m, whatever the wanted error, and it"
+            f" gives {robot.effort_limit[i]:g}; take a gentler motion, less load or a stronger drive."
+        )
+    best = min(light, key=lambda c: max(c.stiff(arm, 1.0) / STIFF, c.gains.bandwidth / FAST))
+    need = min(STIFF / best.stiff(arm, 1.0), FAST / best.gains.bandwidth)
+    return (
+        f"a control period of {1e3 * period:g} ms forbids it: √(K/M)·h would be {best.stiff(arm, period):.2g} and ωh"
+        f" {best.gains.bandwidth * period:.2g}, where sampled loops stay calm to {STIFF:g} and {FAST:g}; take a period"
+        f" of at most {1e3 * need:.2g} ms, or want a larger error."
+    )

@@ -1,0 +1,346 @@
+"""One law certified, attacked and watched: the study behind `nbs-pin certify`."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.accuracy.mismatch import Mismatch, mismatch
+from nbs_pin.base.checks import PerJoint
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused, SimulationDiverged
+from nbs_pin.base.files import write_whole
+from nbs_pin.base.pages import plain
+from nbs_pin.base.progress import waiting
+from nbs_pin.base.records import Run
+from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.attack import Attack, attack, random_disturbances
+from nbs_pin.certificates.certify import Certificate, certify
+from nbs_pin.certificates.ensemble import motions_of
+from nbs_pin.certificates.loads import MARGIN, Load, friction, gravity_error, label_of, payload, total
+from nbs_pin.certificates.model_structure import is_exact
+from nbs_pin.certificates.monitor import Monitored, monitor
+from nbs_pin.certificates.propose import PERIODS, Proposal, propose
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.simulate import simulate
+from nbs_pin.storage.checkpoints import load, save
+
+FILES = ("certificate.png", "run.npz", "summary.json")
+"""What `write_results` always writes, the summary last."""
+MONITOR, DESIGNED = "monitor.png", "controller.nbs"
+"""What it writes beside them when a run was watched or a law designed."""
+TRAJECTORIES = 374
+"""Closed-loop motions that a learned model is judged on (`mismatch.py`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Certified:
+    """A certificate and what was held beside it."""
+
+    certificate: Certificate
+    loads: tuple[Load, ...]
+    """What of the disturbance was worked out."""
+    attack: Attack | None
+    """The worst motion found; None where nothing disturbs or no motion stayed finite."""
+    thorough: bool
+    """Whether the adversary climbed, or only waves were tried."""
+    diverged: str = ""
+    """Why no motion was found, where one left the finite numbers."""
+    beaten: Monitored | None = None
+    """The worst motion held against the certificate, where it or another one exceeded a bound."""
+    watched: Monitored | None = None
+    """The run that was given, held against it."""
+    proposal: Proposal | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Where and against what a law is certified."""
+
+    reference: DesiredMotion
+    duration: float = 10.0
+    """How much of the reference counts [s]."""
+    period: float = 0.001
+    """Control period [s]."""
+    disturbance: Admissible | None = None
+    """What was given as numbers."""
+    payload: float | None = None
+    """Mass that the model leaves out [kg]."""
+    link: str | None = None
+    """The link that carries it; None takes `loads.tool_frame`."""
+    friction: tuple[PerJoint, PerJoint] | str | None = None
+    """Viscous and Coulomb coefficients of friction that nothing feeds forward, or "urdf"."""
+    gravity_error: float | None = None
+    """‖Δg‖ [m/s²]."""
+    margin: float = MARGIN
+    """What loads along the reference are multiplied with."""
+    start_error: float = 0.0
+    """Of every joint, in turn up and down, for the overshoot [rad]."""
+    truth: Robot | None = None
+    """The true arm, where it is not the one of the model."""
+    trajectories: int = TRAJECTORIES
+    """Closed-loop motions that a model that is not exact is judged on."""
+    seed: int = 0
+
+    def loads(self, robot: Robot) -> tuple[Load, ...]:
+        """The loads worked out for the arm; raises ArgumentError for numbers that do not fit it."""
+        along: dict[str, Any] = {"duration": self.duration, "margin": self.margin}
+        found = []
+        if self.payload is not None:
+            found.append(payload(robot, self.payload, self.reference, frame=self.link, **along))
+        if self.friction is not None:
+            viscous, coulomb = (None, None) if isinstance(self.friction, str) else self.friction
+            found.append(friction(robot, self.reference, viscous=viscous, coulomb=coulomb, **along))
+        if self.gravity_error is not None:
+            found.append(gravity_error(robot, self.gravity_error, self.reference, **along))
+        return tuple(found)
+
+
+def controller_of(text: str, *, bandwidth: float = 8.0, period: float = 0.001, seed: int = 0) -> NeuralBackstepping:
+    """The controller that a .nbs file holds, or the one that `NeuralBackstepping.for_robot` makes for an arm.
+
+    Raises CertificateRefused for a file with anything but an NBS law, errors of `load` and `load_robot` else.
+    """
+    if not text.endswith(".nbs"):
+        return NeuralBackstepping.for_robot(load_robot(text), bandwidth=bandwidth, period=period, seed=seed)
+    stored = load(text)
+    if not isinstance(stored, NeuralBackstepping):
+        raise CertificateRefused(
+            f"{text} holds a {type(stored).__name__}, of which no Lyapunov function is known here; give a file with an "
+            "NBS law."
+        )
+    return stored
+
+
+def certify_controller(
+    controller: NeuralBackstepping,
+    task: Task,
+    *,
+    thorough: bool = False,
+    run: Run | None = None,
+    proposal: Proposal | None = None,
+    progress: bool = False,
+) -> Certified:
+    """The certificate, the worst motion that waves (or, thorough, the adversary) find, and a run held against it.
+
+    Raises CertificateRefused for a controller of which nothing can be promised, ArgumentError for what does not fit.
+    """
+    robot = arm_of(controller, task)
+    loads, admissible = disturbance_of(robot, task)
+    error, start = None, None
+    if not is_exact(controller.dynamics, robot):
+        error = model_error(controller, robot, task, admissible, progress)
+    if task.start_error:
+        start = task.reference(np.zeros(1)).q[0] + task.start_error * (-1.0) ** np.arange(robot.nv)
+    with waiting("certifying", progress):
+        certificate = certify(
+            controller,
+            admissible,
+            reference=task.reference,
+            duration=task.duration,
+            q0=start,
+            mismatch=error,
+            period=task.period,
+            robot=robot,
+        )
+    watched = None if run is None else monitor(run, certificate)
+    found, diverged = _attacked(certificate, task, thorough, progress)
+    beaten = None
+    if found is not None and exceeds(found, certificate):
+        beaten = monitor(found.run, certificate)
+    return Certified(certificate, loads, found, thorough, diverged, beaten, watched, proposal)
+
+
+def exceeds(found: Attack, certificate: Certificate) -> bool:
+    """Whether the worst found is beyond a bound, of ‖z1‖ or of a joint."""
+    return found.error > certificate.error or bool((found.joint_errors > certificate.joint_errors).any())
+
+
+def design(robot: Robot, task: Task, error: PerJoint, *, period: float | None = None) -> Proposal:
+    """`propose` for the disturbance of the task; period: the only one to take [s], None takes the longest that does."""
+    _, admissible = disturbance_of(robot, task)
+    periods = PERIODS if period is None else (period,)
+    return propose(
+        robot,
+        admissible,
+        error,
+        reference=task.reference,
+        duration=task.duration,
+        periods=periods,
+        seed=task.seed,
+    )
+
+
+def arm_of(controller: NeuralBackstepping, task: Task) -> Robot:
+    """The true arm; raises ArgumentError where none is known or its joints are of another number."""
+    robot = controller.dynamics.robot if task.truth is None else task.truth
+    if robot is None:
+        raise ArgumentError("the controller's model names no arm; give --against ROBOT, the true one.")
+    if robot.nv != controller.nv:
+        raise ArgumentError(f"the controller has {controller.nv} joints and {robot.name} {robot.nv}; give its own arm.")
+    return robot
+
+
+def disturbance_of(robot: Robot, task: Task) -> tuple[tuple[Load, ...], Admissible]:
+    """The loads of the task, and all of its disturbance together; raises ArgumentError where there is none."""
+    loads = task.loads(robot)
+    given = [] if task.disturbance is None else [task.disturbance]
+    if not (given or loads):
+        raise ArgumentError("no disturbance was given; give --disturbance, --payload, --friction or --gravity-error.")
+    return loads, total(*given, *loads)
+
+
+def model_error(
+    controller: NeuralBackstepping, robot: Robot, task: Task, admissible: Admissible, progress: bool = False
+) -> Mismatch:
+    """δ of the controller's model along its own closed loop on the true arm, from independent starts and disturbances.
+
+    Starts are at rest within ±0.1 rad of the reference, disturbances are random and admissible, over 2 s.
+    """
+    truth, period, rng = PinocchioDynamics(robot), max(task.period, 0.002), np.random.default_rng((task.seed, 3))
+    steps = round(2.0 / period)
+    torques = random_disturbances(admissible, steps, period, task.trajectories, rng, nv=robot.nv)
+
+    def disturbance(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return torques[:, min(int(t / period + 1e-6), steps - 1)]
+
+    away = rng.uniform(-0.1, 0.1, (task.trajectories, robot.nv))
+    run = simulate(
+        DynamicsPlant(truth, friction=controller.friction),
+        controller,
+        task.reference,
+        steps * period,
+        period,
+        q0=task.reference(np.zeros(1)).q[0] + away,
+        plant_step=period,
+        disturbance=disturbance,
+        effort_limit=robot.effort_limit,
+        progress=progress,
+    )
+    return mismatch(controller.dynamics, truth, run, friction=controller.friction)
+
+
+def _attacked(certificate: Certificate, task: Task, thorough: bool, progress: bool) -> tuple[Attack | None, str]:
+    """The worst motion, or why there is none.
+
+    Along the reference, and in other postures too where the disturbance does not depend on it.
+    """
+    if certificate.admissible.is_zero or certificate.robot is None:
+        return None, ""
+    controller, robot = certificate.controller, certificate.robot
+    exact = is_exact(controller.dynamics, robot)
+    free = thorough and exact and task.payload is None and task.friction is None and task.gravity_error is None
+    others = motions_of(controller.dynamics, None, task.seed)[1:] if free else []
+    waves: dict[str, Any] = {} if thorough else {"rounds": 0, "starts": 1}
+    try:
+        found = attack(
+            controller,
+            certificate.admissible,
+            reference=[task.reference, *others],
+            plant_dynamics=None if exact else PinocchioDynamics(robot),
+            period=task.period,
+            seed=task.seed,
+            progress=progress,
+            **waves,
+        )
+    except SimulationDiverged as error:
+        return None, str(error)
+    return found, ""
+
+
+def figures(result: Certified) -> dict[str, Any]:
+    """Everything found, units in the keys, as JSON can store it; None for what is not finite."""
+    certificate, found, proposal = result.certificate, result.attack, result.proposal
+    numbers: dict[str, Any] = {
+        "arm": None if certificate.robot is None else certificate.robot.name,
+        "certificate": certificate.summary(),
+        "loads": [load.claim.plain() | {"box_Nm": load.admissible.box} for load in result.loads],
+        "disturbance_label": str(label_of(*result.loads)),
+        "attack": None,
+        "attack_diverged": result.diverged or None,
+        "monitor": None,
+        "design": None,
+    }
+    if found is not None:
+        numbers["attack"] = {
+            "error_rad": found.error,
+            "joint_errors_rad": found.joint_errors,
+            "certified_over_found": certificate.error / found.error if found.error > 0.0 else None,
+            "exceeds": result.beaten is not None,
+            "verdict": None if result.beaten is None else result.beaten.verdict,
+            "found_by": found.found_by,
+            "thorough": result.thorough,
+            "duration_s": found.duration,
+            "period_s": found.period,
+        }
+    if result.watched is not None:
+        watched = result.watched
+        numbers["monitor"] = {
+            "verdict": watched.verdict,
+            "is_kept": watched.is_kept,
+            "is_wrong": watched.is_wrong,
+            "broken": watched.broken,
+            "largest_share": float((watched.storage / watched.promise).max()) if watched.promise.all() else None,
+            "largest_error_rad": float(watched.error.max()),
+            "largest_error_bound_rad": float(watched.error_bound.max()),
+        }
+    if proposal is not None:
+        numbers["design"] = {
+            "bandwidth_rad_per_s": proposal.gains.bandwidth,
+            "stiffness_Nm_per_rad": proposal.gains.stiffness,
+            "rate_rad_per_s_per_Nm": proposal.gains.rate,
+            "damping_Nms_per_rad": proposal.gains.damping,
+            "period_s": proposal.period,
+            "error_rad": proposal.error,
+            "joint_errors_rad": proposal.joint_errors,
+            "torque_Nm": proposal.torque,
+            "torque_share": proposal.share,
+        }
+    plained: dict[str, Any] = plain(numbers)
+    return plained
+
+
+def write_results(result: Certified, folder: Path, facts: dict[str, Any]) -> tuple[dict[str, Any], list[Path]]:
+    """Writes `FILES` and what goes with them into the folder; returns the figures and the paths written.
+
+    facts: what summary.json holds beside the figures. Raises OSError when they cannot be written.
+    """
+    from nbs_pin.reports.certificate_charts import plot_certificate, plot_monitor
+
+    found, written = figures(result), [folder / FILES[0]]
+    plot_certificate(result.certificate, result.attack, written[0])
+    if result.attack is not None:
+        result.attack.run.save(folder / FILES[1])
+        written.append(folder / FILES[1])
+    if result.watched is not None:
+        plot_monitor(result.watched, folder / MONITOR)
+        written.append(folder / MONITOR)
+    if result.proposal is not None:
+        save(result.proposal.controller, folder / DESIGNED)
+        written.append(folder / DESIGNED)
+    text = json.dumps(facts | {"figures": found}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    written.append(write_whole(folder / FILES[2], text.encode()))
+    return found, written
+
+
+def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
+    """|τ_d,i| ≤ the numbers, one for all joints or one each, or ‖τ_d‖ ≤ the only one [N·m].
+
+    Raises ArgumentError for another count.
+    """
+    if norm:
+        if len(numbers) != 1:
+            raise ArgumentError(f"a norm is one number and {len(numbers)} were given; give one, or leave out --norm.")
+        return Admissible.of(numbers[0], nv)
+    if len(numbers) not in (1, nv):
+        raise ArgumentError(
+            f"{len(numbers)} torques were given for {nv} joints; give one for every joint, or one for each [N·m]."
+        )
+    box: Float[np.ndarray, " n"] = np.full(nv, numbers, dtype=float)
+    return Admissible.of(box, nv)

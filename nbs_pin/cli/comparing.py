@@ -1,0 +1,229 @@
+"""A model of an arm held against another: the study behind `nbs-pin compare`."""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nbs_pin.accuracy.compare import ModelErrors, compare
+from nbs_pin.accuracy.error_maps import ErrorMap, error_map, telling_joints
+from nbs_pin.accuracy.relative_errors import check_joints
+from nbs_pin.base.checks import PerJoint
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.base.files import write_whole
+from nbs_pin.base.pages import plain, write_csv
+from nbs_pin.base.progress import waiting
+from nbs_pin.base.records import Run
+from nbs_pin.controllers.gains import gains_for_robot
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.motions.references import Sinusoid
+from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.simulate import simulate
+from nbs_pin.storage.checkpoints import load
+
+FILES = ("errors.png", "errors.csv", "summary.json")
+"""What `write_results` writes, the summary last."""
+TRAJECTORIES = 374
+"""Starts for which the bound on δ holds for 95 % of further ones, but for one chance in a million (`mismatch.py`)."""
+_ENDINGS = ("", ".nbs", ".urdf", ".xacro", ".xml")
+
+
+class Comparison(NamedTuple):
+    """Errors, their map over two joints, and why there is no closed loop if there is none."""
+
+    errors: ModelErrors
+    heat: ErrorMap | None
+    """None for an arm of one joint."""
+    missing: str
+    """Empty where there is a closed loop."""
+
+
+def model_of(text: str) -> DynamicsProvider:
+    """The model that a .nbs file holds, the one its law believes in if it holds a law, or Pinocchio's of an arm.
+
+    Raises ArgumentError for a law without a model, and a file that is neither by its ending; errors of `load` and
+    `load_robot` else.
+    """
+    if Path(text).suffix not in _ENDINGS:
+        raise ArgumentError(
+            f"'{text}' is neither a model nor an arm; give a .nbs file with a model, or an arm by name or as a .urdf "
+            "or .xacro file."
+        )
+    if not text.endswith(".nbs"):
+        return PinocchioDynamics(load_robot(text))
+    stored: Any = load(text)
+    if isinstance(stored, DynamicsProvider):
+        return stored
+    if isinstance(stored, ModelLaw):
+        return stored.dynamics
+    raise ArgumentError(f"{text} holds a {type(stored).__name__}, which has no model of its arm; give one that has.")
+
+
+def compare_models(
+    model: DynamicsProvider,
+    robot: Robot,
+    *,
+    samples: int = 2_000,
+    speed: PerJoint = 2.0,
+    seed: int = 1,
+    box: Sequence[PerJoint] | None = None,
+    joints: tuple[int, int] | None = None,
+    run: Run | None = None,
+    trajectories: int = TRAJECTORIES,
+    frequency: float = 1.0,
+    progress: bool = False,
+) -> Comparison:
+    """The model against Pinocchio's of the arm, on a box and along a closed loop.
+
+    samples, speed, seed, box: as in `compare`. joints: those of the map, from 0; None takes `telling_joints`.
+    run: the closed loop, its plant this arm; None simulates `closed_loop` from so many starts, none for 0.
+    Raises ArgumentError for arguments that do not fit, and a run of another arm or one in which joint friction acted.
+    """
+    truth = PinocchioDynamics(robot)
+    check_joints(model, truth)
+    missing = "no closed loop was run"
+    if run is not None:
+        if run.robot_sha256 != robot.sha256:
+            raise ArgumentError(f"the run is of the arm '{run.robot}', not of {robot.name}; give one of that arm.")
+        plant = str(run.info.get("plant", ""))
+        if "joint_friction=" in plant and "joint_friction=drop" not in plant:
+            raise ArgumentError("joint friction acted in the run, so its torques do not tell v̇; record one without it.")
+        missing = ""
+    elif trajectories:
+        try:
+            run, missing = (
+                closed_loop(model, robot, trajectories, frequency=frequency, seed=seed, progress=progress),
+                "",
+            )
+        except SimulationDiverged as error:  # of a model so wrong that its law is unstable: that is a result
+            missing = f"the closed loop diverged\n{str(error)[:60]} …"
+    with waiting("comparing", progress):
+        errors = compare(model, truth, samples, speed, seed, box, run)
+        if robot.nv < 2:
+            return Comparison(errors, None, missing)
+        pair = telling_joints(model, truth, errors.box) if joints is None else joints
+        return Comparison(errors, error_map(model, truth, errors.box, pair), missing)
+
+
+def closed_loop(
+    model: DynamicsProvider,
+    robot: Robot,
+    starts: int = TRAJECTORIES,
+    *,
+    frequency: float = 1.0,
+    bandwidth: float = 8.0,
+    start_error: float = 0.3,
+    duration: float = 2.0,
+    period: float = 0.004,
+    seed: int = 1,
+    progress: bool = False,
+) -> Run:
+    """Neural backstepping on the model, with the gains it has on the exact one and a plant that is the exact one.
+
+    The starts are at rest, drawn independently and uniformly within ±start_error [rad] of the beginning of
+    `Sinusoid.for_robot` at `frequency` [rad/s]; the arm's effort limits act. bandwidth [rad/s], duration, period [s].
+    Raises SimulationDiverged when a motion does.
+    """
+    truth = PinocchioDynamics(robot)
+    gains = gains_for_robot(robot, truth, bandwidth=bandwidth, period=period)
+    controller = NeuralBackstepping.for_robot(robot, dynamics=model, gains=gains)
+    reference = Sinusoid.for_robot(robot, frequency)
+    away = np.random.default_rng((seed, 2)).uniform(-start_error, start_error, (starts, robot.nv))
+    return simulate(
+        DynamicsPlant(truth),
+        controller,
+        reference,
+        duration,
+        period,
+        q0=reference(0.0).q + away,
+        plant_step=period,
+        progress=progress,
+    )
+
+
+def figures(result: Comparison, robot: Robot) -> dict[str, Any]:
+    """Everything found, units in the keys, as JSON can store it; None for what is not finite."""
+    e, m = result.errors, result.errors.mismatch
+    numbers: dict[str, Any] = {
+        "relative_error": e.errors._asdict(),
+        "torque_nmse": e.torque_nmse,
+        "joints": list(robot.joint_names),
+        "torque_rms_Nm": e.torque_rms,
+        "torque_deviation_Nm": e.torque_deviation,
+        "eigenvalue_margin_kgm2": e.eigenvalue_margin,
+        "mass_ratio": e.mass_ratio,
+        "energy_drift": e.energy_drift,
+        "energy_drift_own": None if e.motion is None else float(np.max(e.motion.own)),
+        "energy_drift_floor": None if e.motion is None else float(np.max(e.motion.floor)),
+        "scale_factor": e.scale.factor,
+        "scale_error": e.scale.error,
+        "by_speed": [{"at": at, **x._asdict()} for at, x in zip(*e.by_speed, strict=True)],
+        "by_distance": [{"at": at, **x._asdict()} for at, x in zip(*e.by_distance, strict=True)],
+        "box": {"lower_rad": e.box.lower, "upper_rad": e.box.upper, "speed_rad_per_s": e.box.speed},
+        "along_run": None if e.along_run is None else e.along_run._asdict(),
+        "mismatch": None,
+        "no_closed_loop_because": result.missing or None,
+    }
+    if m is not None:
+        numbers["mismatch"] = {
+            "a_Nm_per_rad": m.a,
+            "b_Nms_per_rad": m.b,
+            "c_Nm": m.c,
+            "violation_chance": m.violation,
+            "doubt": m.doubt,
+            "trajectories": m.trajectories,
+            "rms_Nm": m.rms,
+            "largest_Nm": float(m.size.max()),
+        }
+    found: dict[str, Any] = plain(numbers)
+    return found
+
+
+def write_results(result: Comparison, robot: Robot, folder: Path, facts: dict[str, Any], title: str) -> dict[str, Any]:
+    """Writes `FILES` into the folder; returns the figures.
+
+    facts: what summary.json holds beside the figures. Raises OSError when they cannot be written.
+    """
+    from nbs_pin.reports.error_charts import plot_model_errors
+
+    found = figures(result, robot)
+    labels = [f"{joint.name} [{'m' if joint.prismatic else 'rad'}]" for joint in robot.joints]
+    why = result.missing or "no closed loop was run"
+    plot_model_errors(result.errors, result.heat, folder / FILES[0], title=title, joints=labels, missing=why)
+    write_csv(folder / FILES[1], ("figure", "where", "value"), list(_rows(found, robot)))
+    text = json.dumps(facts | {"figures": found}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    write_whole(folder / FILES[2], text.encode())
+    return found
+
+
+def _rows(found: dict[str, Any], robot: Robot) -> Iterator[tuple[str, str, Any]]:
+    """Every figure as a row of the table: its name, where it holds, its value."""
+    for name, value in found["relative_error"].items():
+        yield f"{name}_error", "box", value
+    for region, kind in (("by_speed", "speed ×"), ("by_distance", "distance ×")):
+        for entry in found[region]:
+            for name, value in entry.items():
+                if name != "at":
+                    yield f"{name}_error", f"{kind} {entry['at']:g}", value
+    for name, value in (found["along_run"] or {}).items():
+        yield f"{name}_error", "closed loop", value
+    for name in ("torque_nmse", "eigenvalue_margin_kgm2", "energy_drift", "energy_drift_own", "energy_drift_floor",
+                 "scale_factor", "scale_error"):  # fmt: skip
+        yield name, "box", found[name]
+    for name, value in zip(("mass_ratio_least", "mass_ratio_most"), found["mass_ratio"], strict=True):
+        yield name, "box", value
+    for name in ("torque_rms_Nm", "torque_deviation_Nm"):
+        for joint, value in zip(robot.joint_names, found[name], strict=True):
+            yield name, joint, value
+    for name, value in (found["mismatch"] or {}).items():
+        if name == "rms_Nm":
+            for joint, torque in zip(robot.joint_names, value, strict=True):
+                yield "mismatch_rms_Nm", joint, torque
+        else:
+            yield f"mismatch_{name}", "closed loop", value

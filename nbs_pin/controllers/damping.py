@@ -1,0 +1,139 @@
+"""The damping matrix D(z2): positive definite for every parameter value."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import torch
+from array_api_compat import device
+from jaxtyping import Float
+from torch import nn
+
+from nbs_pin.base.arrays import Array, array_namespace, is_torch_array, matvec
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.controllers.gain import Gain, positive_definite, positive_scale
+from nbs_pin.kernels.layout import Packed, pack_damping
+
+DAMPINGS = ("bounded", "paper")
+
+
+class Damping(nn.Module):
+    """D(z) = D₀ + R T(Rz)ᵀT(Rz) R [N·m·s/rad], T lower triangular from two tanh networks (docs/theory.md §4).
+
+    form "bounded": D ⪰ D₀ for every parameter value.
+    form "paper": D = TᵀT with diagonal relu(·) + m, and no D₀. Positive definite, but not ⪰ m²I: T = [[1, 0], [1, 1]]
+    has m = 1 and λ_min(TᵀT) = 0.382.
+
+    floor: D₀ (n, n) symmetric positive definite, for "bounded" only, a `Gain` which training may change but never below
+    least_share of it. m: for "paper" only. scale: R, a diagonal scale (n,).
+    Raises ArgumentError for an unknown form, a floor that is missing, superfluous or not positive definite, a share
+    outside [0, 1), or m ≤ 0.
+    """
+
+    floor: Gain | None
+    scale: torch.Tensor
+
+    def __init__(
+        self,
+        nv: int,
+        *,
+        form: str = "bounded",
+        floor: Float[Array, "n n"] | None = None,
+        m: float = 0.001,
+        widths: tuple[int, ...] = (32, 32),
+        scale: Float[Array, " n"] | None = None,
+        gain: float = 0.2,
+        least_share: float = 0.5,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if form not in DAMPINGS:
+            raise ArgumentError(f"damping '{form}' is unknown; choose one of {', '.join(DAMPINGS)}.")
+        if (form == "bounded") != (floor is not None):
+            raise ArgumentError(
+                f"damping '{form}' was given the floor D₀ = {floor}; 'bounded' needs one, 'paper' has none."
+            )
+        if not m > 0.0:
+            raise ArgumentError(f"m is {m}; give a positive number, the smallest diagonal entry of T.")
+        self.form, self.m = form, m
+        d0 = None if floor is None else positive_definite("the floor D₀", floor)
+        self.floor = None if d0 is None else Gain(d0, least_share=least_share, name="the floor D₀")
+        self.register_buffer("scale", positive_scale("the scale R", scale, nv))
+        self._diagonal_index = np.arange(nv)
+        self._lower_index = np.tril_indices(nv, -1)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.diagonal = _FCNN(nv, widths, nv, gain)
+            self.lower = _FCNN(nv, widths, nv * (nv - 1) // 2, gain)
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return len(self.scale)
+
+    def factor(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """T at the scaled error x = Rz, lower triangular."""
+        xp = array_namespace(x)
+        diagonal = self.diagonal.output(x)
+        if self.form == "paper":
+            diagonal = xp.clip(diagonal, 0.0, math.inf) + self.m
+        t = xp.zeros((*x.shape, self.nv), dtype=x.dtype, device=device(x))
+        t[..., self._diagonal_index, self._diagonal_index] = diagonal
+        t[..., *self._lower_index] = self.lower.output(x)
+        return t
+
+    def matrix(self, z: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+        """D(z)."""
+        xp = array_namespace(z)
+        d0, r = self._constants(numpy=not is_torch_array(z))
+        t = self.factor(r * z) * r
+        return d0 + xp.matrix_transpose(t) @ t
+
+    def force(self, z: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """D(z) z [N·m]."""
+        d0, r = self._constants(numpy=not is_torch_array(z))
+        t = self.factor(r * z)
+        return matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
+
+    @property
+    def is_packable(self) -> bool:
+        """Whether all parts are the ones the kernels know, and not those of a subclass."""
+        return (type(self), type(self.diagonal), type(self.lower)) == (Damping, _FCNN, _FCNN)
+
+    def packed(self, *, numpy: bool = True) -> Packed:
+        """The weights as the compiled form of `force` takes them (`runtime/damping.py`).
+
+        numpy: True gives an array, False a tensor of the same numbers, differentiable in the parameters.
+        """
+        networks = self.diagonal.layers(numpy=numpy), self.lower.layers(numpy=numpy)
+        d0, r = self._constants(numpy=numpy)
+        return pack_damping(networks, self.form == "paper", self.m, r, d0)
+
+    def _constants(self, *, numpy: bool) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+        r = self.scale.numpy(force=True) if numpy else self.scale
+        zero = array_namespace(r).zeros((self.nv, self.nv), dtype=r.dtype, device=device(r))
+        return zero if self.floor is None else self.floor.like(r), r
+
+
+class _FCNN(nn.Module):
+    """Tanh hidden layers, linear output; starts like the authors', U(−gain, gain) and no bias (docs/theory.md §8)."""
+
+    def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, gain: float) -> None:
+        super().__init__()
+        sizes = (inputs, *widths, outputs)
+        self.depth = len(sizes) - 1
+        for i, (size, out) in enumerate(pairwise(sizes)):
+            weight = torch.empty(out, size, dtype=torch.float64).uniform_(-gain, gain)
+            self.register_parameter(f"w{i}", nn.Parameter(weight))
+            self.register_parameter(f"b{i}", nn.Parameter(torch.zeros(out, dtype=torch.float64)))
+
+    def layers(self, *, numpy: bool) -> list[tuple[Array, Array]]:
+        named = {k: p.numpy(force=True) if numpy else p for k, p in self._parameters.items() if p is not None}
+        return [(named[f"w{i}"], named[f"b{i}"]) for i in range(self.depth)]
+
+    def output(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
+        xp = array_namespace(x)
+        for i, (weight, bias) in enumerate(self.layers(numpy=not is_torch_array(x))):
+            x = x @ weight.T + bias
+            x = xp.tanh(x) if i < self.depth - 1 else x
+        return x

@@ -1,0 +1,114 @@
+"""The error potential Φ: strongly convex for every parameter value, with its minimum at zero."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+
+from nbs_pin.base.arrays import Array, array_namespace, is_torch_array, matvec
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.controllers.activations import Activation, SmoothedReLU, Squareplus
+from nbs_pin.controllers.convex import FICNN, convex_terms, rectified
+from nbs_pin.controllers.gain import Gain, positive_definite, positive_scale
+from nbs_pin.kernels.convex import subtract_tangent
+from nbs_pin.kernels.layout import Packed, pack_potential
+
+POTENTIALS = ("paper", "smooth")
+
+
+class Potential(nn.Module):
+    """Φ(z) = zᵀSz + ψ(z) [J], so that ∇²Φ ⪰ 2S everywhere (docs/theory.md §3).
+
+    form "paper": ψ(z) = f(Rz), f a FICNN without biases and with the smoothed ReLU, zero with zero gradient at 0; its
+    second derivative, and so the torque, jumps where a pre-activation crosses 0 or d.
+    form "smooth": the Bregman form ψ(z) = f(Rz) − f(0) − ∇f(0)ᵀRz of a smooth FICNN with biases; C^∞.
+
+    stiffness: S₀ (n, n) symmetric positive definite [J/rad²]; S is a `Gain`, which training may change but never
+    below least_share · S₀. scale: R, a diagonal input scale (n,), which brings errors of weak and strong joints to one
+    size; 1 is the paper's. Raises ArgumentError for an unknown form, an S₀ that is not symmetric positive definite, a
+    share outside [0, 1) or an R that is not positive.
+    """
+
+    scale: torch.Tensor
+
+    def __init__(
+        self,
+        stiffness: Float[Array, "n n"],
+        *,
+        form: str = "smooth",
+        widths: tuple[int, ...] = (32, 32, 32),
+        activation: Activation | None = None,
+        scale: Float[Array, " n"] | None = None,
+        least_share: float = 0.5,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if form not in POTENTIALS:
+            raise ArgumentError(f"potential '{form}' is unknown; choose one of {', '.join(POTENTIALS)}.")
+        s, nv = positive_definite("the stiffness S", stiffness), len(stiffness)
+        self.form = form
+        self.stiffness = Gain(s, least_share=least_share, name="the stiffness S")
+        self.register_buffer("scale", positive_scale("the input scale R", scale, nv))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.network = FICNN(
+                nv,
+                widths,
+                activation or (SmoothedReLU() if form == "paper" else Squareplus()),
+                biases=form == "smooth",
+                nonnegative=rectified if form == "paper" else abs,
+            )
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return len(self.scale)
+
+    @property
+    def modulus(self) -> float:
+        """μ = 2 λ_min(S) for the present S: Φ is μ-strongly convex [J/rad²]."""
+        return 2.0 * float(np.linalg.eigvalsh(self.stiffness.numpy())[0])
+
+    def terms(
+        self, z: Float[Array, "*batch n"], dz: Float[Array, "*batch n"]
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch n"], Float[Array, "*batch n"]]:
+        """Φ(z) [J], ∇Φ(z) [N·m] and ∇²Φ(z) dz, in the kind of z."""
+        xp = array_namespace(z)
+        s, r = self.stiffness.like(z), self.scale if is_torch_array(z) else self.scale.numpy(force=True)
+        value, gradient, product = self._psi(r * z, r * dz)
+        force, force_rate = 2.0 * matvec(s, z), 2.0 * matvec(s, dz)
+        return value + 0.5 * xp.sum(z * force, axis=-1), r * gradient + force, r * product + force_rate
+
+    @property
+    def is_packable(self) -> bool:
+        """Whether all parts are the ones the kernels know, and not those of a subclass."""
+        parts = (type(self), type(self.network), type(self.network.activation))
+        return parts[:2] == (Potential, FICNN) and parts[2] in (SmoothedReLU, Squareplus)
+
+    def packed(self, *, numpy: bool = True) -> Packed:
+        """The weights as the compiled form of `terms` takes them (`runtime/convex.py`).
+
+        numpy: True gives an array, False a tensor of the same numbers, differentiable in the parameters.
+        Raises ArgumentError when the activation has no compiled form.
+        """
+        activation = self.network.activation
+        if activation.kernel is None:
+            raise ArgumentError(f"{activation} has no compiled form; take SmoothedReLU or Squareplus.")
+        layers, r = self.network.layers(numpy=numpy), self.scale.numpy(force=True) if numpy else self.scale
+        tangent = None
+        if self.form == "smooth" and not numpy:
+            tangent = convex_terms(layers, activation, 0.0 * r, 0.0 * r)[:2]
+        packed = pack_potential(layers, activation.kernel, r, self.stiffness.like(r), tangent)
+        return subtract_tangent(packed) if self.form == "smooth" and numpy else packed
+
+    def _psi(
+        self, x: Float[Array, "*batch n"], dx: Float[Array, "*batch n"]
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch n"], Float[Array, "*batch n"]]:
+        if self.form == "paper":
+            return self.network.terms(x, dx)
+        xp = array_namespace(x)
+        zero = 0.0 * x
+        values, gradients, products = self.network.terms(xp.stack([x, zero]), xp.stack([dx, zero]))
+        gradient_0 = gradients[1]
+        psi = values[0] - values[1] - xp.sum(gradient_0 * x, axis=-1)
+        return psi, gradients[0] - gradient_0, products[0]

@@ -1,0 +1,40 @@
+"""What one unit of a network means in kg·m² and in joules."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import nn
+
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.controllers.gain import positive_scale
+
+
+class Scales(nn.Module):
+    """T̂ = T(q, Rv) + ½ε‖v‖² and V̂ = e V(q): of order one inside, of the arm's order outside.
+
+    epsilon: ε [kg·m²], a floor under every eigenvalue of M̂. inertia: R² (n,) [kg·m²], such as the deviation of the
+    torque over that of the acceleration. energy: e [J]; None and 1 change nothing. Raises ArgumentError unless all are
+    finite and positive.
+    """
+
+    root: torch.Tensor
+    epsilon: torch.Tensor
+    energy: torch.Tensor
+
+    def __init__(self, nv: int, epsilon: float, inertia: Sequence[float] | None, energy: float) -> None:
+        super().__init__()
+        given = None if inertia is None else np.array(inertia, dtype=float)
+        self.register_buffer("inertia", positive_scale("the scale of the inertia", given, nv))
+        self.register_buffer("root", self.inertia.sqrt(), persistent=False)
+        for name, value in (("epsilon", epsilon), ("energy", energy)):
+            if not 0.0 < value < float("inf"):
+                raise ArgumentError(f"{name} is {value}; give a finite number > 0.")
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+
+    inertia: torch.Tensor
+
+    @property
+    def floor(self) -> torch.Tensor:
+        """εI (n, n)."""
+        return self.epsilon * torch.eye(len(self.root), dtype=self.root.dtype, device=self.root.device)

@@ -1,0 +1,46 @@
+"""A Lagrangian without structure, the baseline: nothing makes its inertia positive definite."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+
+from nbs_pin.dynamics.features import JointFeatures
+from nbs_pin.dynamics.lagrangian_network import GeneralLagrangianNetwork, Tensor
+from nbs_pin.dynamics.scales import Scales
+from nbs_pin.dynamics.softplus_network import SoftplusNetwork
+
+
+class UnconstrainedLagrangian(GeneralLagrangianNetwork):
+    """L(q, v) = f(x(q), Rv) by one softplus network and ½ε‖v‖²; ∂²L/∂v² may be indefinite or singular.
+
+    Source: Cranmer et al. 2020, "Lagrangian Neural Networks", with sine and cosine of angles, and the paper's start.
+    Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
+    """
+
+    def __init__(
+        self,
+        prismatic: Sequence[bool],
+        *,
+        widths: Sequence[int] = (64, 64),
+        epsilon: float = 1e-6,
+        inertia: Sequence[float] | None = None,
+        energy: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.features = JointFeatures(prismatic)
+        self.nv = self.features.nv
+        self.scales = Scales(self.nv, epsilon, inertia, energy)
+        self.network = SoftplusNetwork(self.features.size + self.nv, widths, torch.Generator().manual_seed(seed))
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Sizes of the hidden layers."""
+        return self.network.widths
+
+    def lagrangian(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """L(q, v) [J]."""
+        s = self.scales
+        value = self.network(torch.cat([self.features(q), s.root * v], dim=-1))
+        return s.energy * value + 0.5 * s.epsilon * (v * v).sum(-1)

@@ -1,0 +1,245 @@
+"""Data to learn from, collected in MuJoCo: motions that excite an arm, motions that do not, and states at random."""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arrays import Array
+from nbs_pin.base.checks import positive, whole
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.progress import tracked
+from nbs_pin.controllers.controller import Controller, MemorylessController
+from nbs_pin.controllers.pd import PD
+from nbs_pin.dynamics.equations import inverse_dynamics
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.excitation import configuration_box, excitation, soft_pd, torque_limits, work
+from nbs_pin.identification.measurement import CLEAN_WINDOW, QUANTISED_WINDOW, Noise, derivative, quantised
+from nbs_pin.motions.references import DesiredMotion, Hold
+from nbs_pin.robots.robot import Robot
+from nbs_pin.simulation.mujoco_plant import MujocoPlant
+from nbs_pin.simulation.simulate import simulate
+
+Recipe: TypeAlias = Literal["excited", "reference", "passive", "uniform"]
+"""What `collect` knows."""
+Acceleration: TypeAlias = Literal["simulator", "differentiated"]
+"""Where v̇ comes from."""
+RECORD_STEP = 1e-3
+"""Control period, plant step and distance of the samples that derivatives are taken from [s]."""
+_TIMED = ("excited", "reference")
+_TRAJECTORIES = 20
+
+
+def collect(
+    robot: Robot,
+    recipe: str = "excited",
+    samples: int = 10_000,
+    seed: int = 0,
+    *,
+    noise: Noise | None = None,
+    acceleration: str | None = None,
+    friction: bool | JointFriction = False,
+    sampling: float | None = None,
+    duration: float = 3.0,
+    speed: float = 2.0,
+    progress: bool = False,
+) -> Dataset:
+    """Samples of the arm in MuJoCo, as an experimenter would record them.
+
+    recipe:
+      "excited"    random sums of sines in torque, 0.2 to 1.5 Hz, about a soft PD with gravity compensation; many
+                   trajectories of `duration` [s] that start anywhere in the joint ranges, torques inside the limits
+      "reference"  PD+ along `Sinusoid.for_robot` of random frequency and phase: data of an arm at its work
+      "passive"    one swing from rest at zero with no torque, a sample every 1 ms: the paper's data, which cannot tell
+                   M, G from c·M, c·G (docs/theory.md §6)
+      "uniform"    independent states: q uniform in the ranges, a turn at most, |v| ≤ `speed`, random torques inside the
+                   limits; no arm can be measured so, but nothing is left unexcited
+    samples: how many. seed: of everything random; the same seed gives the same data.
+    noise: what encoders and torque sensors do to the record.
+    acceleration: v̇ as the "simulator" knows it or "differentiated" from v (Savitzky–Golay); None is "simulator" unless
+    encoders round, which give both v and v̇ by differentiation. A derivative sees the torques held before and after its
+    instant, so τ is then their mean.
+    friction: True lets the friction of the URDF act, a `JointFriction` another (its transition is not used: MuJoCo's
+    joints stick). τ stays what the motors applied.
+    sampling: time between samples [s], a whole number of ms; None is 0.001 for "passive" and otherwise from 0.01 to
+    0.05, so that few samples still come from 20 trajectories: neighbours in time say the same.
+    speed: about how fast an excited joint moves [rad/s]; peaks stay near the velocity limit.
+    progress: show a progress bar when it takes longer than 2 s at a terminal.
+    Torque limits are the arm's; a joint without one is given what its heaviest posture needs, and 20 rad/s² on top.
+    Raises ArgumentError for an unknown recipe or settings that do not fit it, RobotError for an arm that MuJoCo cannot
+    build, and SimulationDiverged when the arm leaves the finite numbers.
+    """
+    noise = noise or Noise()
+    _check(recipe, samples, speed, noise, acceleration)
+    acting = JointFriction.of(robot) if friction is True else friction or None
+    interval = _interval(recipe, samples, sampling, duration)
+    stride = whole(interval, RECORD_STEP, "sampling", "step of the record")
+    counts = [samples] if recipe == "passive" else _shares(samples, int(duration / interval + 1e-9))
+    generator, differentiated = np.random.default_rng(seed), acceleration == "differentiated" or noise.encoder > 0.0
+    bench = _bench(recipe, robot, acting, speed)
+    if recipe == "uniform":
+        counts, columns = [1] * samples, _states(bench, samples, speed, generator)
+    else:
+        instruments = _Instruments(stride, noise, differentiated)
+        seen = [instruments.read(bench, generator, k) for k in tracked(counts, "collecting data", progress)]
+        columns = tuple(np.concatenate(parts) for parts in zip(*seen, strict=True))
+    t, q, v, a, tau = columns
+    about: dict[str, Any] = {
+        "recipe": recipe,
+        "seed": seed,
+        "noise": asdict(noise),
+        "acceleration": "differentiated" if differentiated else "simulator",
+        "friction": acting and {"viscous": acting.viscous.tolist(), "coulomb": acting.coulomb.tolist()},
+        "sampling": None if recipe == "uniform" else interval,
+        "speed": speed,
+        "robot": {"source": robot.source, "sha256": robot.sha256, "options": robot.options},
+    }
+    tau = tau + noise.torque * generator.standard_normal(tau.shape)
+    return Dataset(q, v, a, tau, t, np.repeat(np.arange(len(counts)), counts), *joint_tree(robot), robot.name, about)
+
+
+class _Idle(MemorylessController):
+    """No torque at all."""
+
+    def __init__(self, nv: int) -> None:
+        self._nv = nv
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self._nv
+
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+        """τ = 0 [N·m]."""
+        return 0.0 * q
+
+
+class _Record(NamedTuple):
+    """States `RECORD_STEP` apart, the torque held from each to the next, and the acceleration it begins with."""
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    tau: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Bench:
+    """The arm on the bench: what every trajectory of a collection shares."""
+
+    robot: Robot
+    plant: MujocoPlant
+    law: Controller
+    motion: Callable[[np.random.Generator], DesiredMotion]
+    """Draws what the law aims at in one trajectory."""
+    friction: JointFriction | None
+    limit: np.ndarray
+    """Largest torques (n,) [N·m]."""
+
+    def record(self, generator: np.random.Generator, rows: int) -> _Record:
+        """One trajectory from the start of its motion."""
+        motion, duration = self.motion(generator), max(rows - 1, 1) * RECORD_STEP
+        run = simulate(self.plant, self.law, motion, duration, RECORD_STEP, effort_limit=self.limit, lookahead=0.0)
+        t, q, v, tau = (x[:rows] for x in (run.t, run.q, run.v, run.tau))
+        return _Record(t, q, v, self.plant.acceleration(q, v, tau), tau)
+
+
+def _bench(recipe: str, robot: Robot, friction: JointFriction | None, speed: float) -> _Bench:
+    aims: dict[str, Callable[[np.random.Generator], DesiredMotion]] = {
+        "excited": partial(excitation, robot, speed=speed),
+        "reference": partial(work, robot),
+    }
+    law: Controller = _Idle(robot.nv)
+    if recipe == "excited":
+        law = soft_pd(robot, friction, period=RECORD_STEP)
+    elif recipe == "reference":
+        law = PD.for_robot(robot, friction=friction, period=RECORD_STEP)
+    plant = MujocoPlant(robot, joint_friction="drop" if friction is None else friction)
+    aim = aims.get(recipe, lambda _: Hold(np.zeros(robot.nv)))
+    return _Bench(robot, plant, law, aim, friction, torque_limits(robot))
+
+
+@dataclass(frozen=True)
+class _Instruments:
+    """How a record is read."""
+
+    stride: int
+    """Records from one sample to the next."""
+    noise: Noise
+    differentiated: bool
+
+    def read(self, bench: _Bench, generator: np.random.Generator, count: int) -> tuple[np.ndarray, ...]:
+        """t, q, v, v̇ and τ of `count` samples of one trajectory.
+
+        A derivative at the end of a record is a poor one: half a window more is recorded there, and left out.
+        """
+        window = QUANTISED_WINDOW if self.noise.encoder else CLEAN_WINDOW
+        margin = window // 2 if self.differentiated else 0
+        record = bench.record(generator, (count - 1) * self.stride + 1 + 2 * margin)
+        q, v, a, tau = quantised(record.q, self.noise.encoder, joint_tree(bench.robot)[1]), *record[2:]
+        if self.noise.encoder:
+            v, a = (derivative(q, RECORD_STEP, window, order) for order in (1, 2))
+        elif self.differentiated:
+            a = derivative(v, RECORD_STEP, window)
+        if self.differentiated:
+            tau = 0.5 * (tau + np.vstack((tau[:1], tau[:-1])))
+        rows = margin + self.stride * np.arange(count)
+        return tuple(x[rows] for x in (record.t, q, v, a, tau))
+
+
+def _states(bench: _Bench, samples: int, speed: float, generator: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """t, q, v, v̇ and τ of independent states; torques are drawn as accelerations, which suit heavy and light joints."""
+    shape = samples, bench.robot.nv
+    lower, upper = configuration_box(bench.robot)
+    q = lower + (upper - lower) * generator.random(shape)
+    v = np.minimum(speed, bench.robot.velocity_limit) * generator.uniform(-1.0, 1.0, shape)
+    wanted = 2.0 * speed * generator.standard_normal(shape)
+    tau = inverse_dynamics(PinocchioDynamics(bench.robot), q, v, wanted)
+    if bench.friction is not None:
+        tau = tau + bench.friction.torque(v)
+    tau = np.clip(tau, -bench.limit, bench.limit)
+    return np.zeros(samples), q, v, bench.plant.acceleration(q, v, tau), tau
+
+
+def _interval(recipe: str, samples: int, sampling: float | None, duration: float) -> float:
+    """Time between samples [s]: the one asked for, or the usual one."""
+    positive("duration", duration, "s")
+    if sampling is None:
+        spread = round(_TRAJECTORIES * duration / samples / RECORD_STEP)
+        sampling = RECORD_STEP * (1 if recipe == "passive" else min(max(spread, 10), 50))
+    if duration < sampling and recipe in _TIMED:
+        raise ArgumentError(f"a trajectory of {duration} s has no two samples {sampling:g} s apart; make it longer.")
+    return sampling
+
+
+def _shares(samples: int, longest: int) -> list[int]:
+    """How many samples each trajectory gives: nearly equal shares of at most `longest`, two or more if possible."""
+    count = min(max(math.ceil(samples / max(longest, 1)), 2), samples)
+    return np.diff(np.linspace(0, samples, count + 1).astype(int)).tolist()
+
+
+def _check(recipe: str, samples: int, speed: float, noise: Noise, acceleration: str | None) -> None:
+    if recipe not in get_args(Recipe):
+        raise ArgumentError(f"recipe '{recipe}' is unknown; give one of {', '.join(get_args(Recipe))}.")
+    if acceleration is not None and acceleration not in get_args(Acceleration):
+        raise ArgumentError(f"acceleration '{acceleration}' is unknown; give 'simulator' or 'differentiated'.")
+    if samples < 1 or samples != int(samples):
+        raise ArgumentError(f"samples is {samples}, expected a whole number ≥ 1; correct it.")
+    positive("speed", speed, "rad/s")
+    if noise.encoder > 0.0 and acceleration == "simulator":
+        raise ArgumentError(
+            "rounded encoders were asked for with the simulator's acceleration, which no arm with such encoders knows; "
+            "leave acceleration out."
+        )
+    if recipe == "uniform" and (noise.encoder > 0.0 or acceleration == "differentiated"):
+        raise ArgumentError(
+            "the recipe 'uniform' has single states and nothing to differentiate; give another recipe, or torque noise "
+            "alone."
+        )

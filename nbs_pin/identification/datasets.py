@@ -1,0 +1,214 @@
+"""Measured motions to learn from: states, accelerations and torques, sorted into trajectories."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from nbs_pin.base.checks import floats
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
+from nbs_pin.base.npz import read_npz, require, write_npz
+from nbs_pin.robots.robot import Robot
+
+DATASET_FORMAT = "nbs_pin dataset 1"
+"""What the `format` entry of a data file says."""
+_STATES = ("q", "v", "a", "tau")
+_KINDS: dict[tuple[str, ...], type] = {
+    (*_STATES, "t"): np.float64,
+    ("trajectory", "parents"): np.int64,
+    ("prismatic",): np.bool_,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Samples of an arm in motion; row k of every array belongs to one instant.
+
+    The samples of a trajectory are contiguous and in the order of time. Samples of one trajectory resemble each other,
+    so only whole trajectories are held out (`split`), and a claim counts them, not samples (docs/theory.md §6).
+    Lists and numbers of other kinds become arrays of float64, int64 and bool.
+    Raises ArgumentError for what is no array of such numbers, arrays that do not fit each other, numbers that are not
+    finite, a trajectory that is interrupted or runs backwards, and a tree whose parents do not come first.
+    """
+
+    q: Float[np.ndarray, "samples n"]
+    """Configuration [rad]."""
+    v: Float[np.ndarray, "samples n"]
+    """Velocity [rad/s]."""
+    a: Float[np.ndarray, "samples n"]
+    """Acceleration [rad/s²]."""
+    tau: Float[np.ndarray, "samples n"]
+    """Torque that the motors applied [N·m]: what friction took is still in it."""
+    t: Float[np.ndarray, " samples"]
+    """Time within the trajectory [s]."""
+    trajectory: Int[np.ndarray, " samples"]
+    """Number of the trajectory that the sample is of."""
+    parents: Int[np.ndarray, " n"]
+    """Tree of joints: 0 where the parent is the base, i + 1 where it is joint i; parents come first."""
+    prismatic: Bool[np.ndarray, " n"]
+    """True for joints that slide; their q is in [m], their torque a force [N]."""
+    robot: str = ""
+    """Name of the arm, for messages."""
+    about: Mapping[str, Any] = field(default_factory=dict)
+    """How the data came to be (recipe, seed, noise, friction, …), as JSON can store it."""
+
+    def __post_init__(self) -> None:
+        for names, kind in _KINDS.items():
+            for name in names:
+                object.__setattr__(self, name, _array(name, getattr(self, name), kind))
+        fault = _fault(self)
+        if fault:
+            raise ArgumentError(f"dataset{f' of {self.robot}' if self.robot else ''}: {fault}.")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __repr__(self) -> str:
+        of = f" of {self.robot}" if self.robot else ""
+        return f"Dataset({len(self)} samples{of}, {self.trajectories} trajectories, {self.nv} joints)"
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return int(self.q.shape[1])
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self)
+
+    @property
+    def trajectories(self) -> int:
+        """Number of trajectories."""
+        return int(np.unique(self.trajectory).size)
+
+    def split(self, share: float = 0.2, seed: int = 0) -> tuple["Dataset", "Dataset"]:
+        """Whole trajectories to learn from, and about `share` of them, at least one, held out; drawn with the seed.
+
+        Raises ArgumentError for a share outside (0, 1) and for one trajectory only, of which nothing can be held out.
+        """
+        if not 0.0 < share < 1.0:
+            raise ArgumentError(f"share is {share}, expected a number between 0 and 1; 0.2 is usual.")
+        ids = np.unique(self.trajectory)
+        if ids.size < 2:
+            raise ArgumentError(
+                f"{self!r} cannot be split: samples of one trajectory resemble each other; collect several."
+            )
+        count = int(np.clip(round(share * ids.size), 1, ids.size - 1))
+        held_out = np.isin(self.trajectory, np.random.default_rng(seed).permutation(ids)[:count])
+        return self.take(~held_out), self.take(held_out)
+
+    def take(self, rows: Any) -> "Dataset":
+        """The samples that numpy's index `rows` selects (a slice, a mask, or numbers in increasing order)."""
+        index = np.arange(len(self))[rows]
+        return replace(self, **{name: getattr(self, name)[index] for name in (*_STATES, "t", "trajectory")})
+
+    def save(self, path: str | Path) -> None:
+        """Write an npz file; missing folders are made, an older file is replaced whole or left alone.
+
+        Raises ArgumentError when `about` holds something JSON cannot say.
+        """
+        try:
+            about = json.dumps(dict(self.about), allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ArgumentError(f"about cannot be stored as JSON ({error}); keep numbers, text and lists.") from error
+        arrays = {entry.name: np.asarray(getattr(self, entry.name)) for entry in fields(self) if entry.name != "about"}
+        write_npz(path, {"format": np.array(DATASET_FORMAT), **arrays, "about": np.array(about)})
+
+
+def load_dataset(path: str | Path) -> Dataset:
+    """The data in the npz file that `Dataset.save` wrote; logs from elsewhere come through `load_log`.
+
+    Raises FileNotFoundError for no file and FileFormatError for one that is damaged, of another kind, lacks an array or
+    holds arrays that make no dataset.
+    """
+    data = read_npz(path)
+    require(data, path, {"format": "U"})
+    if str(data["format"]) != DATASET_FORMAT:
+        raise FileFormatError(f"{path}: format '{data['format']}', expected '{DATASET_FORMAT}'; collect it again.")
+    kinds = {**dict.fromkeys((*_STATES, "t"), "f"), "trajectory": "i", "parents": "i", "prismatic": "b"}
+    require(data, path, {**kinds, "robot": "U", "about": "U"})
+    arrays = {name: data[name].astype(float) if kind == "f" else data[name] for name, kind in kinds.items()}
+    fault = _shape_fault(arrays)
+    if fault:
+        raise FileFormatError(f"{path}: {fault}.")
+    try:
+        about = json.loads(str(data["about"]))
+        return Dataset(**arrays, robot=str(data["robot"]), about=about)
+    except (ArgumentError, json.JSONDecodeError) as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def joint_tree(robot: Robot) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Parents (0 for the base, i + 1 for joint i) and which joints slide: all that a `Dataset` says of an arm."""
+    parents = np.array(list(robot.model.parents)[1:], dtype=np.int64)
+    return parents, np.array([joint.prismatic for joint in robot.joints])
+
+
+def trajectory_slices(trajectory: Int[np.ndarray, " samples"]) -> list[slice]:
+    """The stretch of samples that each trajectory takes, in order."""
+    cuts = np.flatnonzero(np.diff(trajectory)) + 1
+    bounds = [0, *cuts.tolist(), len(trajectory)]
+    return [slice(begin, end) for begin, end in pairwise(bounds) if end > begin]
+
+
+def _fault(data: Dataset) -> str:
+    """What is wrong with a dataset and what to do, or an empty string."""
+    arrays = {name: getattr(data, name) for name in (*_STATES, "t", "trajectory", "parents", "prismatic")}
+    return _shape_fault(arrays) or _number_fault(arrays) or _order_fault(data) or _tree_fault(data)
+
+
+def _array(name: str, value: Any, kind: type) -> np.ndarray:
+    """The values as an array of that kind, itself where it is one; nothing is rounded to a whole number or a bool."""
+    numbers = floats(f"the dataset's {name}", value)
+    with np.errstate(invalid="ignore"):  # NaN as a whole number is refused below
+        array: np.ndarray = np.asarray(value).astype(kind, copy=False)
+    if kind is not np.float64 and not np.array_equal(array, numbers):
+        expected = "whole numbers" if kind is np.int64 else "true or false for every joint"
+        raise ArgumentError(f"the dataset's {name} is {value!s:.200}, expected {expected}; correct it.")
+    return array
+
+
+def _shape_fault(arrays: Mapping[str, np.ndarray]) -> str:
+    shape = arrays["q"].shape
+    if len(shape) != 2 or 0 in shape:
+        return f"q has shape {shape}, expected (samples, joints) with at least one of each; record some"
+    expected = dict.fromkeys(_STATES, shape) | dict.fromkeys(("t", "trajectory"), shape[:1])
+    for name, wanted in (expected | dict.fromkeys(("parents", "prismatic"), shape[1:])).items():
+        if arrays[name].shape != wanted:
+            return f"{name} has shape {arrays[name].shape}, expected {wanted} beside q of shape {shape}; match them"
+    return ""
+
+
+def _number_fault(arrays: Mapping[str, np.ndarray]) -> str:
+    for name in (*_STATES, "t"):
+        if not np.isfinite(arrays[name]).all():
+            at = np.argwhere(~np.isfinite(arrays[name]))[0]
+            joint = f", joint {at[1] + 1}" if at.size > 1 else ""
+            return f"{name} of sample {at[0] + 1}{joint} is {arrays[name][tuple(at)]}; leave that sample out"
+    return ""
+
+
+def _order_fault(data: Dataset) -> str:
+    stretches = trajectory_slices(data.trajectory)
+    if len(stretches) != data.trajectories:
+        return "the samples of a trajectory are interrupted by another's; sort them by trajectory"
+    same = np.diff(data.trajectory) == 0
+    backwards = same & ~(np.diff(data.t) > 0.0)
+    if backwards.any():
+        k = int(np.argmax(backwards)) + 1
+        return f"time must increase along a trajectory, but sample {k + 1} is not after sample {k}; sort them"
+    return ""
+
+
+def _tree_fault(data: Dataset) -> str:
+    wrong = ~((data.parents >= 0) & (data.parents <= np.arange(data.nv)))
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        return f"joint {i + 1} has parent {data.parents[i]}, expected 0 for the base to {i}; number parents first"
+    return ""

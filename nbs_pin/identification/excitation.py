@@ -1,0 +1,95 @@
+"""Motions and states that make an arm show its dynamics, inside its ranges, speeds and torques."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.records import Reference
+from nbs_pin.controllers.gains import effective_inertia, largest_inertia, sample_configurations
+from nbs_pin.controllers.pd import PD
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.motions.references import Sinusoid
+from nbs_pin.robots.robot import Robot
+
+_BAND = (0.2, 1.5)  # [Hz]; what the window of a quantised record lets through without loss
+_TONES = 6
+_LOOP = 6.0  # [rad/s]; soft, so that the torques move the arm, and the arm itself
+_DAMPING = 1.4  # 2ζ
+_HEADROOM = 20.0  # [rad/s²]
+
+
+@dataclass(frozen=True, eq=False)
+class Multisine:
+    """q = offset + Σ_k amplitude_k sin(frequency_k t + phase_k), per joint; arrays of shape (tones, n)."""
+
+    amplitude: Float[np.ndarray, "tones n"]
+    """[rad]."""
+    frequency: Float[np.ndarray, "tones n"]
+    """[rad/s]."""
+    phase: Float[np.ndarray, "tones n"]
+    """[rad]."""
+    offset: Float[np.ndarray, " n"]
+    """[rad]."""
+
+    def __call__(self, t: Any) -> Reference:
+        """Motion at t [s]."""
+        A, w = self.amplitude, self.frequency
+        angle = w * np.asarray(t, dtype=float)[..., None, None] + self.phase
+        sine, cosine = np.sin(angle), np.cos(angle)
+        q, v, a = (term.sum(axis=-2) for term in (A * sine, A * w * cosine, -A * w**2 * sine))
+        return Reference(self.offset + q, v, a)
+
+
+def soft_pd(robot: Robot, friction: JointFriction | None = None, *, period: float) -> PD:
+    """The PD with gravity compensation that torques excite the arm about: 6 rad/s, what a sampled loop can damp.
+
+    Aiming it at a motion x adds the torque K_p x + K_d ẋ to a PD that holds the arm: sines give sines. friction: fed
+    forward at ẋ. period [s].
+    """
+    model = PinocchioDynamics(robot)
+    # A light joint is thrown about by its neighbours' accelerations: it gets gains for all the inertia in its row of M.
+    inertia = np.abs(model.mass_matrix(sample_configurations(robot))).sum(axis=-1).max(axis=0)
+    kd = np.minimum(_DAMPING * _LOOP * inertia, 0.25 * effective_inertia(robot, model) / period)
+    return PD(model, feedforward="gravity", kp=_LOOP * kd / _DAMPING, kd=kd, friction=friction)
+
+
+def excitation(robot: Robot, generator: np.random.Generator, speed: float) -> Multisine:
+    """What `soft_pd` is aimed at: sines of 0.2 to 1.5 Hz with about equal speeds, somewhere in the joint ranges.
+
+    Their RMS speed is 0.6·`speed` [rad/s], at most 0.35 of the velocity limit, so that peaks stay near it; the sum of
+    their amplitudes keeps the aim inside the range.
+    """
+    n, (lower, upper), band = robot.nv, configuration_box(robot), np.log(_BAND)
+    frequency = 2.0 * np.pi * np.exp(generator.uniform(band[0], band[1], (_TONES, n)))
+    amplitude = generator.uniform(0.3, 1.0, (_TONES, n)) / frequency
+    rms = np.sqrt(0.5 * ((amplitude * frequency) ** 2).sum(axis=0))
+    amplitude *= np.minimum(0.6 * speed, 0.35 * robot.velocity_limit) / rms
+    amplitude *= np.minimum(1.0, 0.35 * (upper - lower) / amplitude.sum(axis=0))
+    swing = amplitude.sum(axis=0)
+    offset = generator.uniform(lower + swing, upper - swing)
+    return Multisine(amplitude, frequency, generator.uniform(-np.pi, np.pi, (_TONES, n)), offset)
+
+
+def work(robot: Robot, generator: np.random.Generator) -> Sinusoid:
+    """A motion of an arm at its work: `Sinusoid.for_robot` at 0.5 to 4 rad/s, any phase."""
+    frequency = float(np.exp(generator.uniform(np.log(0.5), np.log(4.0))))
+    usual = Sinusoid.for_robot(robot, frequency)
+    return Sinusoid(usual.amplitude, usual.frequency, generator.uniform(-np.pi, np.pi, robot.nv), usual.offset)
+
+
+def configuration_box(robot: Robot) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """(lower, upper) of the configurations to learn from [rad, m]: the joint ranges, of turning joints one turn."""
+    return robot.one_turn_range
+
+
+def torque_limits(robot: Robot) -> Float[np.ndarray, " n"]:
+    """Largest torques of an experiment [N·m]: the arm's own, else what gravity asks at most and 20 rad/s² on top."""
+    if np.isfinite(robot.effort_limit).all():
+        return robot.effort_limit
+    model = PinocchioDynamics(robot)
+    heaviest = np.abs(model.gravity(sample_configurations(robot))).max(axis=0)
+    usable = heaviest + _HEADROOM * largest_inertia(robot, model)
+    return np.where(np.isfinite(robot.effort_limit), robot.effort_limit, usable)

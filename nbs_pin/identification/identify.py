@@ -1,0 +1,230 @@
+"""Inertias and friction of an arm whose geometry is known, from its motions.
+
+The torque is linear in them (`regressor`). Only some directions of the inertial parameters, the base parameters, reach
+it; the others are free, and are chosen such that every body could exist (`consistent_fit`).
+"""
+
+import time
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.checks import positive
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.identified import IdentifiedDynamics
+from nbs_pin.dynamics.pseudo_inertia import PARAMETERS_OF_COORDINATES, coordinates, inertial_parameters
+from nbs_pin.identification.consistent_fit import ConsistentFit, consistent_fit, in_factors
+from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.regressor import (
+    Expected,
+    Geometry,
+    RobotGeometry,
+    Scalars,
+    expectation,
+    joint_triangles,
+    torque_size,
+    triangle,
+)
+from nbs_pin.robots.robot import Robot
+
+_EXACT = 1e-11
+"""Least noise that data are credited with, as a share of the largest torque: above rounding, below any sensor."""
+_NEGLIGIBLE = 1e-6
+"""Share of the largest singular value below which a direction is none that the arm's torque depends on."""
+_RANDOM_STATES = 80
+"""Random states that show which directions the torque depends on: six equations for each of a joint's 13 unknowns."""
+_ROUNDS = 6
+"""How often noise and weighted least squares are found from one another."""
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationReport:
+    """How an arm was identified, and what its data cannot say."""
+
+    samples: int
+    """Number of samples."""
+    seconds: float
+    """What it took [s]."""
+    noise: Float[np.ndarray, " n"]
+    """Estimated standard deviation of the torque residual per joint [N·m]: the weights are its inverse."""
+    train_nmse: float
+    """Mean squared residual over torque variance, its mean over the joints whose torque varies."""
+    base_parameters: int
+    """Directions in the parameters that the arm's torque can depend on, friction included."""
+    excited: int
+    """How many of them the data say better than what was expected before any data."""
+    condition: float
+    """Largest over smallest singular value of the weighted regressor on the base parameters, in expected units."""
+    unexcited: tuple[str, ...]
+    """The other directions, least excited first: combinations of parameters that stay about as expected."""
+    steps: int
+    """Newton steps."""
+
+
+def identify(
+    data: Dataset,
+    robot: Robot,
+    *,
+    friction: bool = False,
+    rotor_inertia: bool = False,
+    transition: float = 0.01,
+    regularisation: float = 0.3,
+) -> IdentifiedDynamics:
+    """The arm with those inertias, and friction if wanted, that explain the data best among all that can exist.
+
+    Geometry and gravity are the robot's; its inertias are not looked at. Least squares weighted by each joint's noise,
+    which is estimated from the residual, then the same over physically consistent bodies (`consistent_fit`). Clean data
+    give M, C and G to rounding.
+
+    friction: also find viscous and Coulomb coefficients ≥ 0 of every joint (`IdentifiedDynamics.friction`), for the
+    speed `transition` [rad/s] at which `JointFriction` turns. rotor_inertia: also find rotor inertias ≥ 0, which no
+    URDF states. regularisation: γ, how many measurements the expected inertias are worth (homogeneous balls along the
+    links, tapering, of masses that make torques of the recorded size); it matters where the data say little. `report`
+    of the result is an `IdentificationReport`. Raises ArgumentError for data of another arm, for fewer than two
+    equations per base parameter, for an arm that neither moves nor carries weight, and for data without torque, which
+    inertias of every scale explain.
+    """
+    positive("transition", transition, "rad/s")
+    positive("regularisation", regularisation, "measurements")
+    _check_arm(data, robot)
+    scalars = Scalars(friction, rotor_inertia, transition)
+    bodies = explain(RobotGeometry(robot), data, scalars, regularisation)
+    parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
+    rotors = bodies.scalars[-1] if rotor_inertia else None
+    return IdentifiedDynamics(robot, parameters, bodies.friction(scalars), rotors, bodies.report)
+
+
+class Bodies(NamedTuple):
+    """What moves an arm of known geometry as its data say."""
+
+    factors: Float[np.ndarray, "n 4 4"]
+    """Lower triangular L of the pseudo-inertias LLᵀ ≻ 0."""
+    scalars: Float[np.ndarray, "kinds n"]
+    """The unknowns of `Scalars`, all > 0."""
+    expected: Expected
+    """What was expected of them."""
+    report: IdentificationReport
+
+    def friction(self, scalars: Scalars) -> JointFriction | None:
+        """The friction among the scalars, if there was any to find."""
+        return JointFriction(self.scalars[0], self.scalars[1], scalars.transition) if scalars.friction else None
+
+
+def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation: float, others: int = 0) -> Bodies:
+    """The physically consistent bodies, friction and rotors that explain the data best, for that geometry.
+
+    others: numbers of the geometry that were fitted to the same data, which count where the noise is estimated.
+    Raises ArgumentError as `identify` does.
+    """
+    start = time.perf_counter()
+    triangles = joint_triangles(geometry, data, scalars)
+    expected = expectation(geometry, data, scalars, triangles)
+    equations = expected.in_units(triangles)
+    base = _base_directions(geometry, data, scalars, expected)
+    noise = _noise(equations, base.shape[1] + others, len(data))
+    design, target = _weighted(equations, noise)
+    fit = consistent_fit(design, target, data.nv, regularisation)
+    weak, values = _unexcited(design, base)
+    report = IdentificationReport(
+        samples=len(data),
+        seconds=time.perf_counter() - start,
+        noise=noise,
+        train_nmse=_nmse(equations, fit, data),
+        base_parameters=base.shape[1],
+        excited=base.shape[1] - len(weak),
+        condition=float(values[0] / values[-1]) if values[-1] > 0.0 else np.inf,
+        unexcited=tuple(_direction(x, expected, scalars.names(geometry.names)) for x in weak),
+        steps=fit.steps,
+    )
+    found = (fit.scalars * expected.scalars).reshape(-1, data.nv)
+    return Bodies(expected.bodies @ fit.factors, found, expected, report)
+
+
+def _check_arm(data: Dataset, robot: Robot) -> None:
+    """Raise ArgumentError unless the data have the joints of the robot, and torque."""
+    parents, prismatic = joint_tree(robot)
+    if not (np.array_equal(parents, data.parents) and np.array_equal(prismatic, data.prismatic)):
+        raise ArgumentError(
+            f"{data!r} does not fit {robot!r}: number, kinds or order of the joints differ; give the arm they are of."
+        )
+    if not data.tau.any():
+        raise ArgumentError(
+            f"{data!r} has no torque: inertias of every scale explain such a motion; record one with motors on."
+        )
+
+
+def _base_directions(
+    geometry: Geometry, data: Dataset, scalars: Scalars, expected: Expected
+) -> Float[np.ndarray, "unknowns base"]:
+    """An orthonormal basis of the directions that the torque can depend on, from random states as fast as the data."""
+    rng, size = np.random.default_rng(0), (_RANDOM_STATES, data.nv)
+    speed, rate = (max(float(np.abs(x).max()), 1.0) for x in (data.v, data.a))
+    v, a, order = speed * rng.normal(size=size), rate * rng.normal(size=size), np.arange(_RANDOM_STATES)
+    q = rng.uniform(-np.pi, np.pi, size)
+    states = replace(data, q=q, v=v, a=a, tau=0.0 * q, t=order.astype(float), trajectory=order)
+    rows = expected.in_units(joint_triangles(geometry, states, scalars))[:, :, :-1]
+    rows = rows / np.linalg.norm(rows, axis=(1, 2), keepdims=True)
+    _, values, directions = np.linalg.svd(rows.reshape(-1, rows.shape[-1]), full_matrices=False)
+    return directions[values > _NEGLIGIBLE * values[0]].T
+
+
+def _noise(equations: np.ndarray, base: int, samples: int) -> Float[np.ndarray, " n"]:
+    """Standard deviation of the residual per joint [N·m], from the least squares that it weights in turn.
+
+    Raises ArgumentError for fewer than two equations per unknown, whose residual says nothing.
+    """
+    n = len(equations)
+    if samples * n < 2 * base:
+        raise ArgumentError(
+            f"{samples} samples of {n} joints are too few for {base} base parameters; give {-(-2 * base // n)} or more."
+        )
+    noise = torque_size(equations, samples)
+    least = _EXACT * noise.max()
+    for _ in range(_ROUNDS):
+        design, target = _weighted(equations, noise)
+        solution = np.linalg.lstsq(design, target, rcond=1e-10)[0]
+        residual = np.linalg.norm(equations @ np.append(solution, -1.0), axis=1)
+        noise = np.maximum(residual / np.sqrt(samples - base / n), least)
+    return noise
+
+
+def _weighted(equations: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Design and target of all joints in units of the noise, as one triangle."""
+    rows = (equations / noise[:, None, None]).reshape(-1, equations.shape[-1])
+    compressed = triangle(rows)
+    return compressed[:, :-1], compressed[:, -1]
+
+
+def _unexcited(design: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The base directions that the data say less of than was expected before, the least first; all singular values.
+
+    A direction with singular value 1 has a standard error as large as what is expected of it.
+    """
+    _, values, directions = np.linalg.svd(design @ base)
+    return (base @ directions[values <= 1.0].T).T[::-1], values
+
+
+def _direction(direction: np.ndarray, expected: Expected, names: list[str]) -> str:
+    """The direction's largest parts, each parameter in units of what its body may have of it."""
+    n = len(expected.bodies)
+    matrices = in_factors(np.eye(10 * n), expected.bodies).reshape(n, 10, 10 * n)
+    moved = matrices @ direction[: 10 * n] @ PARAMETERS_OF_COORDINATES.T
+    mass = np.square(expected.bodies[:, 3]).sum(axis=1)
+    spread = np.square(expected.bodies[:, :3]).sum(axis=(1, 2))
+    units = np.column_stack([mass, *[np.sqrt(mass * spread)] * 3, *[spread] * 6])
+    parts = np.concatenate([(moved / units).ravel(), direction[10 * n :]])
+    parts /= np.linalg.norm(parts)
+    largest = [k for k in np.argsort(-np.abs(parts))[:4] if abs(parts[k]) > 0.2]
+    return " ".join(f"{parts[k]:+.2f} {names[k]}" for k in largest)
+
+
+def _nmse(equations: np.ndarray, fit: ConsistentFit, data: Dataset) -> float:
+    """Mean squared residual over variance, mean over the joints whose torque varies."""
+    bodies = coordinates(fit.factors @ fit.factors.swapaxes(1, 2)).ravel()
+    squares = np.square(equations @ np.concatenate([bodies, fit.scalars, [-1.0]])).sum(axis=1) / len(data)
+    variance = data.tau.var(axis=0)
+    varies = variance > 1e-12 * max(variance.max(), np.square(data.tau).max())
+    return float((squares[varies] / variance[varies]).mean()) if varies.any() else 0.0

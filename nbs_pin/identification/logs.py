@@ -1,0 +1,209 @@
+"""Logs from elsewhere as datasets, with units and derivatives checked against each other."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
+from nbs_pin.base.npz import read_npz
+from nbs_pin.identification.compatibility import arm_fault
+from nbs_pin.identification.datasets import DATASET_FORMAT, Dataset, joint_tree, load_dataset, trajectory_slices
+from nbs_pin.identification.log_files import Columns, columns_of_arrays, columns_of_csv
+from nbs_pin.identification.measurement import ORDER, derivative
+from nbs_pin.robots.robot import Robot
+
+_SPAN = 0.05  # [s] over which derivatives are integrated for comparison, so that the noise of sensors averages out
+_DISAGREES = 0.3  # share of the RMS change that a stated derivative may miss
+_STILL = 1e-3  # [rad, rad/s]; a joint that changes less is not judged
+_TURNS = 4.0 * np.pi  # [rad]; radians of an arm seldom reach it, degrees soon do
+_OFTEN = 0.05  # share of the samples that tells degrees from an outlier
+_EVEN = 1e-3  # share of a step by which evenly spaced samples may be off
+
+
+def load_log(
+    path: str | Path,
+    *,
+    robot: Robot | None = None,
+    degrees: bool | None = None,
+    window: float = 0.1,
+    prismatic: Sequence[bool] | None = None,
+) -> Dataset:
+    """The measurements in a CSV or NPZ file, joints in the order of the arm.
+
+    CSV: a header with `t` [s], per joint `q_NAME` [rad], `tau_NAME` [N·m] and, if logged, `v_NAME` [rad/s] and
+    `a_NAME` [rad/s²] (NAME a joint's name; or q1 … qn, tau1 … taun in the arm's order), and `trajectory`, a whole
+    number, where there are several. NPZ: arrays `t` (rows,), `q`, `tau`, `v`, `a` (rows, n), `trajectory` (rows,) and
+    `joint_names` (n,) likewise; a recorded run and a dataset are such files.
+    What is not logged is differentiated over `window` [s] (Savitzky–Golay), for which samples must be evenly spaced;
+    half a window is then left out at both ends of each trajectory.
+    degrees: True converts angles, False believes that they are radians, None refuses what looks like degrees.
+    robot: gives names, tree and ranges of the joints; without it, a serial arm of which `prismatic` says what slides.
+    Warns of a single trajectory and of a log without torque, from which no model can be had (docs/theory.md §6).
+    Raises FileNotFoundError for no file and FileFormatError naming file, row or column and remedy for a missing column,
+    a number that is none, time that does not increase, v that is not dq/dt, a that is not dv/dt, degrees, and a dataset
+    of another arm than `robot` (`same_arm.py`).
+    """
+    path = Path(path)
+    names = None if robot is None else robot.joint_names
+    if path.suffix.lower() == ".npz":
+        stored = read_npz(path)
+        if str(stored.get("format", "")) == DATASET_FORMAT:
+            return _of_arm(path, load_dataset(path), robot)
+        columns = columns_of_arrays(path, stored, names)
+    elif path.suffix.lower() == ".csv":
+        columns = columns_of_csv(path, names)
+    else:
+        raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv or .npz; convert it.")
+    tree = _serial(columns.q.shape[1], prismatic) if robot is None else joint_tree(robot)
+    columns = _in_radians(path, columns, tree[1], degrees, robot)
+    data = _dataset(path, columns, tree, window, "" if robot is None else robot.name)
+    _check_derivatives(path, data)
+    _warn(path, data)
+    return data
+
+
+def _of_arm(path: Path, data: Dataset, robot: Robot | None) -> Dataset:
+    """The data, once they may be of the arm."""
+    fault = "" if robot is None else arm_fault(data, robot)
+    if fault:
+        raise FileFormatError(f"{path}: {fault}.")
+    return data
+
+
+def _serial(n: int, prismatic: Sequence[bool] | None) -> tuple[np.ndarray, np.ndarray]:
+    """The tree of joints in a row."""
+    slides = np.zeros(n, dtype=bool) if prismatic is None else np.array(list(prismatic), dtype=bool)
+    if slides.shape != (n,):
+        raise ArgumentError(f"prismatic has {slides.size} entries and the log {n} joints; give one for each.")
+    return np.arange(n, dtype=np.int64), slides
+
+
+def _in_radians(
+    path: Path, columns: Columns, prismatic: Bool[np.ndarray, " n"], degrees: bool | None, robot: Robot | None
+) -> Columns:
+    """The columns with every angle in radians; sliding joints stay as they are."""
+    if degrees is None:
+        beyond = np.abs(columns.q) > _TURNS
+        if robot is not None:  # a joint with a range gives degrees away sooner
+            beyond |= (columns.q < robot.lower - np.pi) | (columns.q > robot.upper + np.pi)
+        far = beyond.mean(axis=0) > _OFTEN
+        if (far & ~prismatic).any():
+            joint = int(np.argmax(far & ~prismatic))
+            raise FileFormatError(
+                f"{path}: q of joint {joint + 1} reaches {np.abs(columns.q[:, joint]).max():.4g}, which looks like "
+                "degrees; give degrees=True, or degrees=False if the joint turns so far."
+            )
+    if not degrees:
+        return columns
+    unit = np.where(prismatic, 1.0, np.pi / 180.0)
+    v, a = (None if x is None else x * unit for x in (columns.v, columns.a))
+    return columns._replace(q=columns.q * unit, v=v, a=a)
+
+
+def _dataset(path: Path, columns: Columns, tree: tuple[np.ndarray, np.ndarray], window: float, robot: str) -> Dataset:
+    """The samples, with v and a differentiated where the log has none."""
+    derived = [name for name in "va" if getattr(columns, name) is None]
+    blank = np.zeros_like(columns.q)
+    v, a = (blank if x is None else x for x in (columns.v, columns.a))
+    about = {"log": str(path), "differentiated": derived}
+    try:
+        logged = Dataset(columns.q, v, a, columns.tau, columns.t, columns.trajectory, *tree, robot, about)
+    except ArgumentError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    if not derived:
+        return logged
+    stretches = [_Stretch.of(path, columns, rows, window) for rows in trajectory_slices(columns.trajectory)]
+    v, a = (np.concatenate([getattr(stretch, name) for stretch in stretches]) for name in "va")
+    whole = Dataset(columns.q, v, a, columns.tau, columns.t, columns.trajectory, *tree, robot, about)
+    return whole.take(np.concatenate([stretch.kept for stretch in stretches]))
+
+
+class _Stretch(NamedTuple):
+    """One trajectory with both derivatives, and the rows that are half a window away from its ends."""
+
+    v: np.ndarray
+    a: np.ndarray
+    kept: np.ndarray
+
+    @classmethod
+    def of(cls, path: Path, columns: Columns, rows: slice, window: float) -> "_Stretch":
+        at, steps = f"{path}: from row {rows.start + 1}", np.diff(columns.t[rows])
+        step = float(np.median(steps)) if steps.size else 1.0
+        if np.abs(steps - step).max(initial=0.0) > _EVEN * step:
+            raise FileFormatError(
+                f"{at}, samples are not evenly spaced, so they cannot be differentiated; log v and a, or resample them."
+            )
+        half = max(round(0.5 * window / step), ORDER // 2 + 1)
+        length = 2 * half + 1
+        if rows.stop - rows.start < length:
+            raise FileFormatError(
+                f"{at}, a trajectory of {rows.stop - rows.start} samples is too short to be differentiated over "
+                f"{length}; give a shorter window, or longer trajectories."
+            )
+        if columns.v is None:
+            v, a = (derivative(columns.q[rows], step, length, order) for order in (1, 2))
+        else:
+            v, a = columns.v[rows], derivative(columns.v[rows], step, length)
+        a = a if columns.a is None else columns.a[rows]
+        return cls(v, a, np.arange(rows.start + half, rows.stop - half))
+
+
+def _check_derivatives(path: Path, data: Dataset) -> None:
+    """Raise FileFormatError where v is not dq/dt or a is not dv/dt."""
+    for name, of in (("v", "q"), ("a", "v")):
+        change, stated = _changes(data, getattr(data, of), getattr(data, name))
+        size = _rms(np.vstack((change, stated)))
+        missed = np.where(size > _STILL, _rms(change - stated) / np.maximum(size, _STILL), 0.0)
+        if missed.max() > _DISAGREES:
+            joint = int(np.argmax(missed))
+            said = stated[:, joint]
+            ratio = float(change[:, joint] @ said / max(said @ said, np.finfo(float).tiny))
+            raise FileFormatError(
+                f"{path}: {name} of joint {joint + 1} is not the derivative of {of}, which changes {ratio:.3g} times "
+                f"as much as {name} says; {_remedy(ratio, name, of)}."
+            )
+
+
+def _changes(
+    data: Dataset, x: Float[np.ndarray, "samples n"], rate: Float[np.ndarray, "samples n"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How much x changes over `_SPAN`, and the integral of its stated rate (trapezoids), of all trajectories."""
+    changes, integrals = [np.zeros((1, data.nv))], [np.zeros((1, data.nv))]
+    for rows in trajectory_slices(data.trajectory):
+        t, y, dy = data.t[rows], x[rows], rate[rows]
+        if len(t) > 1:
+            lag = min(max(1, round(_SPAN / float(np.median(np.diff(t))))), len(t) - 1)
+            areas = 0.5 * (dy[1:] + dy[:-1]) * np.diff(t)[:, None]
+            total = np.vstack((np.zeros(data.nv), np.cumsum(areas, axis=0)))
+            changes.append(y[lag:] - y[:-lag])
+            integrals.append(total[lag:] - total[:-lag])
+    return np.concatenate(changes), np.concatenate(integrals)
+
+
+def _remedy(ratio: float, name: str, of: str) -> str:
+    known = {np.pi / 180.0: f"convert {name} from degrees", 180.0 / np.pi: f"convert {of} from degrees"}
+    known[-1.0] = f"one of their signs is turned round, so correct {name}"
+    near = [remedy for factor, remedy in known.items() if abs(ratio / factor - 1.0) < 0.1]
+    return near[0] if near else f"correct its unit or the order of the columns, or leave {name} out"
+
+
+def _warn(path: Path, data: Dataset) -> None:
+    if data.trajectories == 1:
+        warnings.warn(
+            f"{path} is one trajectory: nothing can be held out, and what fits it may fit no other; log several, "
+            "numbered in a column 'trajectory'.",
+            stacklevel=3,
+        )
+    if not data.tau.any():
+        warnings.warn(
+            f"{path} has no torque but zero, which cannot tell a model from its multiples; log motions under torque.",
+            stacklevel=3,
+        )
+
+
+def _rms(x: np.ndarray) -> np.ndarray:
+    return np.sqrt((x**2).mean(axis=0))

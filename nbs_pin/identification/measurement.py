@@ -1,0 +1,55 @@
+"""What a measurement does to a motion: encoder steps, torque noise, and derivatives from sampled numbers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nbs_pin.base.exceptions import ArgumentError
+
+CLEAN_WINDOW, QUANTISED_WINDOW = 11, 101
+"""Samples that a derivative is taken over: of numbers that are exact, and of those an encoder rounds."""
+ORDER = 5
+"""Degree of the polynomial fitted to each window."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Errors of the instruments: encoders that round, and a torque measurement with white Gaussian noise."""
+
+    encoder: float = 0.0
+    """Step of the encoders as a share of a turn (or of 1 m on a sliding joint), such as 2**-16; 0 for none."""
+    torque: float = 0.0
+    """Standard deviation of the torque noise [N·m]."""
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.encoder < 0.5 and 0.0 <= self.torque < np.inf):
+            raise ArgumentError(
+                f"Noise was given encoder = {self.encoder} of a turn and torque = {self.torque} N·m, expected a share "
+                "in [0, 0.5) and a finite number ≥ 0; correct them."
+            )
+
+
+def quantised(
+    q: Float[np.ndarray, "samples n"], encoder: float, prismatic: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, "samples n"]:
+    """Q rounded to whole steps of the encoder [rad, m]; 0 leaves it as it is."""
+    if encoder == 0.0:
+        return q
+    step = encoder * np.where(prismatic, 1.0, 2.0 * np.pi)
+    return step * np.round(q / step)
+
+
+def derivative(
+    x: Float[np.ndarray, "samples n"], step: float, window: int, order: int = 1
+) -> Float[np.ndarray, "samples n"]:
+    """The first or second derivative of samples `step` [s] apart (Savitzky and Golay 1964).
+
+    A polynomial of degree `ORDER` is fitted to `window` samples (odd) about each, or at either end to the last window.
+    Raises ArgumentError when there are fewer samples than that.
+    """
+    from scipy.signal import savgol_filter
+
+    if len(x) < window:
+        raise ArgumentError(f"{len(x)} samples are too few to differentiate over {window}; record a longer motion.")
+    return savgol_filter(x, window, min(ORDER, window - 2), deriv=order, delta=step, axis=0)

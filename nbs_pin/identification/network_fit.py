@@ -1,0 +1,245 @@
+"""How Lagrangian networks are fitted: Levenberg–Marquardt where they are small, Adam and L-BFGS where they are not."""
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias, cast, get_args
+
+import torch
+from jaxtyping import Int
+
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.progress import tracked
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
+from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.network_equations import Equation, Equations, Loss, Theta, first_friction
+
+FitOptimiser: TypeAlias = Literal["lm", "adam", "lbfgs"]
+"""Levenberg–Marquardt, first on a random part of the samples, then on all; Adam on small batches, its step falling
+along a cosine; or L-BFGS on all samples after a quarter of the iterations with Adam.
+
+While its normal equations are small, one iteration of "lm" is worth hundreds of the others (docs/theory.md §6)."""
+ITERATIONS: dict[str, int] = {"lm": 30, "adam": 300, "lbfgs": 400}
+"""Iterations of each unless others are asked for: steps of LM and L-BFGS, passes over the data of Adam."""
+LARGEST_FOR_LM = 3500
+"""Parameters beyond which "lm" is no longer the default: its work per sample grows with their square."""
+_COARSE_EQUATIONS, _COARSE_STEPS, _COARSE_ENOUGH = 5, 25, 3e-3  # residuals per parameter, steps, nMSE
+_STARTS, _STUCK = 3, 0.05  # a start that ends its coarse part above this nMSE leads nowhere
+_PATIENCE, _SLOW = 0.2, 0.03  # a share of the iterations, and the least gain in so many of them
+_BATCH, _BATCHES, _RATE, _LBFGS_SHARE = 256, 16, 3e-3, 0.75  # samples of a batch at most, batches at least
+_LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e8
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkFit:
+    """A fitted network and how it came about."""
+
+    network: LagrangianNetwork
+    friction: JointFriction | None
+    parameters: int
+    """Numbers that were learned."""
+    history: list[float]
+    """Normalised mean squared residual of the samples learned from: untrained, and after every iteration."""
+    held_out: list[float]
+    """The same of the samples held out, empty when there are none; the network is that of the least."""
+    evaluations: int
+    """How often the residuals of a sample were computed or differentiated, divided by the number of samples."""
+    stopped: str
+    """"converged", "iterations", "held out" (no better any more) or "interrupted"."""
+
+
+@dataclass(eq=False)
+class _Search:
+    """One start: the best parameters so far, and what they are judged by."""
+
+    equations: Equations
+    held_out: Equations | None
+    best: Theta
+    train: list[float] = field(default_factory=list)
+    checked: list[float] = field(default_factory=list)
+    least: float = math.inf
+    since: int = 0
+    work: float = 0.0
+
+    def record(self, theta: Theta) -> float:
+        """Take note of an iteration; returns its cost."""
+        self.train.append(self.equations.cost(theta))
+        self.work += 1.0
+        judged = self.train[-1]
+        if self.held_out is not None:
+            judged = self.held_out.cost(theta)
+            self.checked.append(judged)
+        self.since += 1
+        if judged < self.least:
+            self.best, self.least, self.since = theta, judged, 0
+        return self.train[-1]
+
+    def label(self) -> str:
+        """What the progress bar says."""
+        return f"fitting, nMSE {self.train[-1]:.2e}"
+
+    def run(self, steps: Iterator[Theta], count: int, progress: bool, enough: float = 0.0) -> str:
+        """Take up to `count` steps, until one costs no more than `enough`; returns why it ended."""
+        patience = max(3, round(_PATIENCE * count))
+        try:
+            for _ in tracked(range(count), self.label, progress):
+                theta = next(steps, None)
+                if theta is None:
+                    return "converged"
+                cost = self.record(theta)
+                before = self.train[-1 - patience] if len(self.train) > patience else math.inf
+                if cost <= enough or cost > (1.0 - _SLOW) * before:
+                    return "converged"
+                if self.checked and self.since >= patience:
+                    return "held out"
+        except KeyboardInterrupt:
+            return "interrupted"
+        return "iterations"
+
+
+def fit_network(
+    make: Callable[[int], LagrangianNetwork],
+    data: Dataset,
+    held_out: Dataset | None = None,
+    *,
+    seed: int = 0,
+    loss: Loss | str = "torque",
+    optimiser: FitOptimiser | str | None = None,
+    iterations: int | None = None,
+    friction: bool = False,
+    transition: float = 0.01,
+    progress: bool = False,
+) -> NetworkFit:
+    """The network with the least mean of (residual/deviation)² over samples and joints.
+
+    make: an untrained network for a seed; "lm" begins anew with the next one, twice at most, when a start leads
+    nowhere. held_out: samples that choose the iteration, which keeps a wide network from learning noise; None takes the
+    best on the data. loss, optimiser, iterations: see `Loss`, `FitOptimiser` and `ITERATIONS`; None takes "lm" up to
+    `LARGEST_FOR_LM` parameters and "lbfgs" beyond. friction: learn viscous and Coulomb friction beside it, with the
+    `transition` of `JointFriction` [rad/s]. Ctrl-C ends it and keeps the best. Raises ArgumentError for an unknown name
+    or a number out of range, and for data without torque unless the loss is that of the acceleration.
+    """
+    if loss not in get_args(Loss):
+        raise ArgumentError(f"loss '{loss}' is unknown; choose one of {', '.join(get_args(Loss))}.")
+    if loss == "torque" and not data.tau.any():
+        raise ArgumentError("the data have no torque, which M̂ = 0 explains; record some, or take loss='acceleration'.")
+
+    def begin(start: int) -> _Search:
+        begun = first_friction(data) if friction else None
+        equation = Equation(copy.deepcopy(make(start)).requires_grad_(True), cast(Loss, loss), begun, transition)
+        equations = Equations.of(equation, data)
+        checked = None if held_out is None else Equations.of(equation, held_out, equations.unit)
+        search = _Search(equations, checked, equations.theta)
+        search.record(search.best)
+        return search
+
+    found = begin(seed)
+    name = optimiser or ("lm" if len(found.best) <= LARGEST_FOR_LM else "lbfgs")
+    if name not in ITERATIONS:
+        raise ArgumentError(f"optimiser '{name}' is unknown; choose one of {', '.join(ITERATIONS)}.")
+    count = ITERATIONS[name] if iterations is None else iterations
+    if count < 1:
+        raise ArgumentError(f"iterations is {count}, expected a whole number ≥ 1; {ITERATIONS[name]} is usual.")
+    if name == "lm":
+        found, stopped = _marquardt_starts(begin, found, seed, count, progress)
+    else:
+        steps = _adam(found, found.best, count if name == "adam" else count - round(_LBFGS_SHARE * count), seed)
+        stopped = found.run(_adam_then_lbfgs(found, steps) if name == "lbfgs" else steps, count, progress)
+    found.equations.write(found.best)
+    equation = found.equations.equation
+    equation.requires_grad_(False)
+    count, work = len(found.best), round(found.work)
+    return NetworkFit(equation.network, equation.friction(), count, found.train, found.checked, work, stopped)
+
+
+def _marquardt_starts(
+    begin: Callable[[int], _Search], found: _Search, seed: int, count: int, progress: bool
+) -> tuple[_Search, str]:
+    """Levenberg–Marquardt from up to three starts on a part of the samples, and from the best one on all."""
+    samples, joints = len(found.equations), len(found.equations.unit)
+    part = min(samples, -(-_COARSE_EQUATIONS * len(found.best) // joints))
+    rows = torch.randperm(samples, generator=torch.Generator().manual_seed(seed))[:part].sort().values
+    tried: list[_Search] = []
+    for start in range(_STARTS):
+        search = begin(seed + 7919 * start) if start else found
+        tried.append(search)
+        steps = _marquardt(search, search.best, rows)
+        if search.run(steps, min(count, _COARSE_STEPS), progress, _COARSE_ENOUGH) == "interrupted":
+            return min(tried, key=lambda s: s.least), "interrupted"
+        if search.least < _STUCK:
+            break
+    best = min(tried, key=lambda s: s.least)
+    best.work = sum(s.work for s in tried)
+    best.since = 0
+    left = max(1, count + 1 - len(best.train))
+    return best, best.run(_marquardt(best, best.best, torch.arange(samples)), left, progress)
+
+
+def _marquardt(search: _Search, theta: Theta, rows: Int[torch.Tensor, " m"], damping: float = 1e-3) -> Iterator[Theta]:
+    """Steps −(JᵀJ + λI)⁻¹Jᵀr, λ in units of the mean diagonal: down when a step lowers the cost, up until one does."""
+    equations, share = search.equations, len(rows) / len(search.equations)
+    cost = equations.cost(theta, rows)
+    while damping < _MOST_DAMPING:
+        matrix, slope = equations.normal(theta, rows)
+        search.work += 2.0 * share
+        level, diagonal = float(matrix.diagonal().mean()), matrix.diagonal().clone()
+        while damping < _MOST_DAMPING:
+            matrix.diagonal().copy_(diagonal + damping * level)
+            factor, failed = torch.linalg.cholesky_ex(matrix)
+            trial = theta if int(failed) else theta - torch.cholesky_solve(slope[:, None], factor)[:, 0]
+            reached = math.inf if int(failed) else equations.cost(trial, rows)
+            search.work += share
+            if reached < cost:
+                damping = max(_LEAST_DAMPING, damping / (4.0 if reached < 0.8 * cost else 2.0))
+                theta, cost = trial, reached
+                yield theta
+                break
+            damping *= 4.0
+
+
+def _adam(search: _Search, theta: Theta, epochs: int, seed: int) -> Iterator[Theta]:
+    """Passes over the samples in small batches."""
+    equations, generator = search.equations, torch.Generator().manual_seed(seed)
+    moving, batch = theta.clone().requires_grad_(True), min(_BATCH, -(-len(equations) // _BATCHES))
+    optimiser = torch.optim.Adam([moving], lr=_RATE)
+    for epoch in range(epochs):
+        for group in optimiser.param_groups:
+            group["lr"] = _RATE * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * epoch / epochs)))
+        for rows in torch.split(torch.randperm(len(equations), generator=generator), batch):
+            optimiser.zero_grad()
+            equations.residual(moving, rows).square().mean().backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+        search.work += 2.0
+        yield moving.detach().clone()
+
+
+def _adam_then_lbfgs(search: _Search, adam: Iterator[Theta]) -> Iterator[Theta]:
+    """L-BFGS with a strong Wolfe line search, from where Adam ends, as long as it lowers the cost."""
+    theta = search.best
+    for theta in adam:
+        yield theta
+    moving = theta.clone().requires_grad_(True)
+    optimiser = torch.optim.LBFGS(
+        [moving],
+        max_iter=1,
+        history_size=50,
+        line_search_fn="strong_wolfe",
+        tolerance_grad=0.0,
+        tolerance_change=1e-16,
+    )
+
+    def closure() -> torch.Tensor:
+        optimiser.zero_grad()
+        cost = search.equations.residual(moving).square().mean()
+        cost.backward()  # type: ignore[no-untyped-call]
+        search.work += 2.0
+        return cost
+
+    while True:
+        before = moving.detach().clone()
+        optimiser.step(closure)  # type: ignore[no-untyped-call]
+        if torch.equal(moving.detach(), before) or not bool(torch.isfinite(moving).all()):
+            return
+        yield moving.detach().clone()

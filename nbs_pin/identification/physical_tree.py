@@ -1,0 +1,147 @@
+"""A rigid tree whose bodies exist, as a point of a descent: the last step of learning a chain.
+
+Placements and bodies together minimise the squared residuals, in units of the noise, plus what `consistent_fit` adds:
+2γ Σᵢ (tr Xᵢ − log det Xᵢ) + 2γ Σₖ (yₖ − log yₖ), for bodies and friction in units of what is expected. The bodies step
+along X = L exp(S) Lᵀ and y exp(s), where they stay positive; the added term counts with the Hessian 2γ, which it has
+along L(1 + S)Lᵀ and y(1 + s).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from nbs_pin.dynamics.pseudo_inertia import BASIS, coordinates, symmetric
+from nbs_pin.identification.levenberg_marquardt import Normal
+from nbs_pin.identification.regressor import Expected
+from nbs_pin.identification.tree_search import JOINT, PLACE, Measured, TreeGuess
+
+FREE, PARALLEL, RIGHT = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class PhysicalTree:
+    """Placements from `guess`, whose own bodies and friction are not looked at, and physical bodies and friction."""
+
+    guess: TreeGuess
+    factors: Float[np.ndarray, "n 4 4"]
+    """L of the pseudo-inertias LLᵀ, in any order of columns."""
+    drag: Float[np.ndarray, "kinds n"]
+    """Friction coefficients and rotor inertias > 0."""
+    expected: Expected
+    strength: float
+    """γ."""
+    angles: tuple[int, ...] = ()
+    """FREE, PARALLEL or RIGHT: what the axis of each joint is held to make with its parent's; empty holds none."""
+
+    def whole(self) -> TreeGuess:
+        """The tree that the kernels see."""
+        return replace(self.guess, bodies=self.factors @ self.factors.swapaxes(1, 2), drag=self.drag)
+
+    def cost(self, data: Measured) -> float:
+        """The objective per residual."""
+        local, share = self._in_units(), self.drag / self._usual()
+        _, logarithm = np.linalg.slogdet(local)
+        divergence = np.square(local).sum() - 2.0 * logarithm.sum() - 4.0 * len(local)
+        divergence += (share - np.log(share) - 1.0).sum()
+        return self.whole().cost(data) + 2.0 * self.strength * float(divergence) / data.q.size
+
+    def normal(self, data: Measured) -> Normal:
+        """The same with its normal equations in the steps of `moved`."""
+        plain, chart, free = self.whole().normal(data), self._chart(), self._free()
+        local, weight = self._in_units(), self.strength / data.q.size
+        bodies = coordinates(local.swapaxes(1, 2) @ local - np.eye(4))
+        slope = self._step(bodies, self.drag / self._usual() - 1.0)
+        added = self._step(np.ones_like(bodies), np.ones_like(self.drag))
+        gradient = chart.T @ plain.gradient - weight * slope
+        hessian = chart.T @ plain.hessian @ chart + weight * np.diag(added)
+        return Normal(self.cost(data), free.T @ gradient, free.T @ hessian @ free)
+
+    def moved(self, step: Float[np.ndarray, " parameters"]) -> "PhysicalTree":
+        """The tree a step away, in the order of `TreeGuess.moved` without the directions that `angles` forbid."""
+        n, whole = len(self.factors), self._free() @ step
+        inner = 3 + JOINT * n - PLACE
+        bodies = np.concatenate([np.zeros(PLACE), whole[3:inner]]).reshape(n, JOINT)[:, PLACE:]
+        guess = self.guess.moved(whole)
+        return replace(
+            self,
+            guess=replace(guess, rotations=_held(guess.rotations, self.angles)),
+            factors=self.factors @ expm(0.5 * symmetric(bodies)),
+            drag=self.drag * np.exp(whole[inner:].reshape(self.drag.shape)),
+        )
+
+    def at_right_angles(self, data: Measured, errors: float) -> "PhysicalTree":
+        """The tree with every axis parallel or perpendicular to its parent's that is so within as many standard errors.
+
+        They are from the curvature at this tree, which should be a minimum.
+        """
+        tree = replace(self, angles=())
+        information = data.q.size * tree.normal(data).hessian
+        covariance = np.linalg.pinv(information, hermitian=True)
+        angles = [FREE]
+        for i, rotation in enumerate(self.guess.rotations[1:], start=1):
+            parallel = abs(rotation[2, 2]) > np.sqrt(0.5)
+            rows = [0, 1] if parallel else [2]
+            at = JOINT * i + 3 - PLACE
+            slope = np.column_stack([-rotation[rows, 1], rotation[rows, 0]])  # of column z with a turn about x and y
+            spread = slope @ covariance[at : at + 2, at : at + 2] @ slope.T
+            off = rotation[rows, 2]
+            near = off @ np.linalg.solve(spread, off) < errors**2
+            angles.append((PARALLEL if parallel else RIGHT) if near else FREE)
+        rotations = _held(self.guess.rotations, tuple(angles))
+        return replace(self, guess=replace(self.guess, rotations=rotations), angles=tuple(angles))
+
+    def _in_units(self) -> np.ndarray:
+        return np.linalg.solve(self.expected.bodies, self.factors)
+
+    def _usual(self) -> np.ndarray:
+        return self.expected.scalars.reshape(self.drag.shape)
+
+    def _step(self, bodies: np.ndarray, drag: np.ndarray) -> np.ndarray:
+        """Parts of a step in one vector, zero for gravity and placements; joint 0 has no place."""
+        joints = np.hstack([np.zeros((len(bodies), PLACE)), bodies])
+        return np.concatenate([np.zeros(3), joints.ravel()[PLACE:], drag.ravel()])
+
+    def _free(self) -> np.ndarray:
+        """The directions of a step that keep the angles."""
+        size = 3 + JOINT * len(self.factors) - PLACE + self.drag.size
+        columns, keep = np.eye(size), np.ones(size, dtype=bool)
+        for i in np.flatnonzero(self.angles):
+            at = JOINT * i + 3 - PLACE
+            if self.angles[i] == PARALLEL:
+                keep[at : at + 2] = False
+            else:  # turning about the parent's axis, which is the third row, leaves a right angle right
+                columns[at : at + 2, at] = self.guess.rotations[i, 2, :2]
+                keep[at + 1] = False
+        return columns[:, keep]
+
+    def _chart(self) -> np.ndarray:
+        """Derivative of the parameters of `TreeGuess` with respect to a step."""
+        n, kinds = len(self.factors), self.drag.size
+        size = 3 + JOINT * n - PLACE + kinds
+        chart = np.eye(size)
+        maps = coordinates(np.einsum("nij,kjl,nml->nkim", self.factors, BASIS, self.factors)).swapaxes(1, 2)
+        for i in range(n):
+            body = slice(3 + JOINT * i, 3 + JOINT * i + 10)
+            chart[body, body] = maps[i]
+        chart[size - kinds :, size - kinds :] = np.diag(self.drag.ravel())
+        return chart
+
+
+def _held(rotations: Float[np.ndarray, "n 3 3"], angles: tuple[int, ...]) -> Float[np.ndarray, "n 3 3"]:
+    """The rotations, turned by as little as puts their z axes along or across the parent's."""
+    held = rotations.copy()
+    for i in np.flatnonzero(angles):
+        z = rotations[i, :, 2]
+        if angles[i] == PARALLEL:
+            target = np.array([0.0, 0.0, np.sign(z[2])])
+        else:
+            target = np.array([z[0], z[1], 0.0]) / np.hypot(z[0], z[1])
+        cross = np.cross(z, target)
+        length = np.linalg.norm(cross)
+        if length > 0.0:
+            angle = np.arctan2(length, z @ target)
+            held[i] = Rotation.from_rotvec(angle / length * cross).as_matrix() @ rotations[i]
+    return held

@@ -1,0 +1,1 @@
+"""Bounds of the inertia matrix over all poses."""

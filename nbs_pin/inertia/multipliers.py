@@ -1,0 +1,198 @@
+"""The extreme eigenvalues of the inertia matrix over all poses, from what poses cannot change (docs/certificates.md).
+
+The kinetic energy is a constant quadratic form of the bodies' twists, each in its own frame. A joint that turns about z
+takes its parent's twist (v, ω), placed at the joint, to the body's: v_z is kept, ω_z gains q̇, and the turn of the other
+components keeps ‖v_⊥‖², ‖ω_⊥‖², v_⊥·ω_⊥ and z·(v_⊥×ω_⊥). A joint that slides by s keeps ω, adds q̇ to v_z and s ω×z to
+v_⊥. These are linear and quadratic conditions without q. So energy − a q̇ᵀWq̇ + Σ h·(what is zero) ⪰ 0 on all twists
+proves aW ⪯ M(q) everywhere, whatever the multipliers h, and so from above; a semidefinite program, solved by clarabel,
+finds good ones, and what it finds is checked here.
+"""
+
+from dataclasses import dataclass
+
+import clarabel
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import sparse
+
+from nbs_pin.inertia.rigid_tree import RigidTree, cross
+from nbs_pin.inertia.rounding import least_eigenvalue
+
+REACH = 1e4
+"""Multipliers are kept below this, for forms and energy of size 1: larger ones gain nothing and cost digits."""
+MARGINS = (1e-7, 1e-6, 1e-5)
+"""How positive the matrix is asked to be, for energy of size 1, one after the other, until one solution is proved."""
+NOTHING = 1e-10
+"""Entries below this are zeros for the solver, which splits the matrix at them, though not for the proof."""
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """A quadratic form of all motions, and a bound on the sums of absolute values behind each of its entries."""
+
+    matrix: Float[np.ndarray, "m m"]
+    size: Float[np.ndarray, "m m"]
+    positive: bool = False
+    """Whether the form is ≤ 0 and not 0 on the arm's motions, so that its multiplier must be ≥ 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Twists that the linear conditions allow, in coordinates x, and what is known of them in every pose."""
+
+    energy: Form
+    """2T, rotors included."""
+    moving: list[int]
+    """Where q̇ is in x."""
+    conditions: list[Form]
+
+    @classmethod
+    def of(cls, tree: RigidTree) -> "Motions":
+        """The motions of a tree in any pose."""
+        free = [_free(tree, i) for i in range(tree.nv)]
+        starts = np.cumsum([0, *(len(rows) for rows in free)])
+        moving = [int(start) - 1 for start in starts[1:]]
+        own, sums, conditions = np.zeros((2, tree.nv, 6, starts[-1])), np.zeros((starts[-1],) * 2), []
+        energy = np.zeros_like(sums)
+        for i, p in enumerate(tree.parents.tolist()):
+            placed = _placed(tree, i)
+            # own[0] are the twists and own[1] the sums of absolute values behind them.
+            seen = np.stack([placed @ own[0, p], np.abs(placed) @ own[1, p]])
+            own[:, i] = seen
+            for row, column in zip(free[i], range(starts[i], starts[i + 1]), strict=True):
+                if column != moving[i]:
+                    own[:, i, row] = 0.0
+                own[:, i, row, column] = 1.0
+            inertia = tree.spatial_inertia(i)
+            energy += own[0, i].T @ inertia @ own[0, i]
+            sums += own[1, i].T @ np.abs(inertia) @ own[1, i]
+            for matrix in (energy, sums):
+                matrix[moving[i], moving[i]] += tree.armature[i]
+            conditions += _conditions(tree, i, own[:, i], seen)
+        return cls(Form(energy, sums), moving, conditions)
+
+
+def least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"] | None = None) -> float:
+    """At most min_q λ_min(W^-½ M(q) W^-½), nearly that, W = I if not given; 0 where no multipliers are found."""
+    return max(0.0, _extreme(tree, np.eye(tree.nv) if weight is None else weight, 1.0))
+
+
+def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> float:
+    """At least max_q λ_max(W^-½ M(q) W^-½), nearly that; inf where no multipliers are found."""
+    least = -_extreme(tree, weight, -1.0)
+    return least if least > 0.0 else np.inf
+
+
+def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> float:
+    """The greatest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf where none is."""
+    motions = Motions.of(tree)
+    m = len(motions.energy.matrix)
+    diagonal = np.abs(np.diag(motions.energy.matrix))
+    scale = 1.0 / np.sqrt(diagonal + 1e-3 * diagonal.mean())
+    scales = scale * scale[:, None]
+    rated = np.zeros((m, m))
+    rated[np.ix_(motions.moving, motions.moving)] = -weight
+    rated *= scales
+    unit = 1.0 / float(np.linalg.norm(rated, 2))
+    forms = [form.matrix * scales for form in motions.conditions]
+    norms = np.array([max(float(np.linalg.norm(form)), 1e-300) for form in forms])
+    terms = np.array([unit * rated, *(form / norm for form, norm in zip(forms, norms, strict=True))])
+    positive = np.array([False, *(form.positive for form in motions.conditions)])
+    constant, best = sign * motions.energy.matrix * scales, -np.inf
+    for margin in MARGINS:
+        y, solved = maximise(constant - margin * np.eye(m), terms, positive)
+        sums = motions.energy.size + np.abs(y[0]) * unit * np.abs(rated) / scales
+        for h, norm, form in zip(y[1:], norms, motions.conditions, strict=True):
+            sums = sums + abs(h) / norm * form.size
+        slack = 16.0 * (m + tree.nv) * np.finfo(float).eps * float(np.linalg.norm(sums * scales, 2))
+        if least_eigenvalue(constant + np.tensordot(y, terms, 1)) > slack:
+            best = max(best, float(y[0]) * unit)
+            if solved:
+                break
+    return best
+
+
+def maximise(
+    constant: Float[np.ndarray, "m m"], terms: Float[np.ndarray, "k m m"], positive: Bool[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " k"], bool]:
+    """Maximise y[0] subject to A₀ + Σ y_i A_i ⪰ 0, |y_i| ≤ REACH for i > 0: y, and whether the solver is content.
+
+    Of y only this is certain: its numbers are finite, and ≥ 0 where `positive`.
+    """
+    k, m = len(terms), len(constant)
+    column, row = np.tril_indices(m)  # The upper triangle, column by column.
+    flat = np.concatenate([constant[None], terms])[:, row, column] * np.where(row == column, 1.0, np.sqrt(2.0))
+    flat[np.abs(flat) < NOTHING] = 0.0
+    ones = np.eye(k)
+    sides = np.concatenate([-flat[1:].T, -ones[positive], ones[1:], -ones[1:]])
+    limits = np.concatenate([flat[0], np.zeros(positive.sum()), np.full(2 * k - 2, REACH)])
+    cones = [clarabel.PSDTriangleConeT(m), clarabel.NonnegativeConeT(len(limits) - len(row))]
+    nothing, matrix = sparse.csc_array((k, k)), sparse.csc_array(sides)
+    found = clarabel.DefaultSolver(nothing, -ones[0], matrix, limits, cones, _settings()).solve()
+    y = np.nan_to_num(np.array(found.x), posinf=0.0, neginf=0.0)
+    return np.where(positive, np.maximum(y, 0.0), y), found.status == clarabel.SolverStatus.Solved
+
+
+def _settings() -> clarabel.DefaultSettings:
+    """Silent, on one thread, and to more digits than clarabel asks for, since y[0] may be small."""
+    settings = clarabel.DefaultSettings()
+    settings.verbose, settings.max_threads = False, 1
+    settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = 1e-12, 1e-7, 1e-9
+    return settings
+
+
+def _placed(tree: RigidTree, i: int) -> Float[np.ndarray, "6 6"]:
+    """The parent's twist as that of frame i at q_i = 0; 0 on the base."""
+    placed = np.zeros((6, 6))
+    if tree.parents[i] >= 0:
+        back = tree.rotation[i].T
+        placed[:3, :3] = placed[3:, 3:] = back
+        placed[:3, 3:] = -back @ cross(tree.position[i])
+    return placed
+
+
+def _free(tree: RigidTree, i: int) -> list[int]:
+    """Components of the twist (v, ω) that the parent's twist does not fix linearly, the one that q̇ moves last."""
+    if tree.prismatic[i]:
+        return [2] if tree.absent[i] else [0, 1, 2]
+    return [5] if tree.parents[i] < 0 else [0, 1, 3, 4, 5]
+
+
+def _conditions(
+    tree: RigidTree, i: int, own: Float[np.ndarray, "2 6 m"], seen: Float[np.ndarray, "2 6 m"]
+) -> list[Form]:
+    """Quadratic conditions at joint i between its twist and its parent's; [0] are the twists, [1] the sums behind."""
+    if tree.absent[i]:
+        return []
+    if not tree.prismatic[i]:
+        pairs = [(0, 0, 1, 1, 1.0), (3, 3, 4, 4, 1.0), (0, 3, 1, 4, 1.0), (0, 4, 1, 3, -1.0)]
+        return [
+            Form(
+                _pair(own[0], *pair) - _pair(seen[0], *pair),
+                _pair(own[1], *pair[:4], 1.0) + _pair(seen[1], *pair[:4], 1.0),
+            )
+            for pair in pairs
+        ]
+    return _sliding_conditions(tree, i, own, seen)
+
+
+def _sliding_conditions(
+    tree: RigidTree, i: int, own: Float[np.ndarray, "2 6 m"], seen: Float[np.ndarray, "2 6 m"]
+) -> list[Form]:
+    """v_⊥ gains s g with g = ω×z: it is parallel to g, and (s − lower)(s − upper)‖g‖² ≤ 0 where travel has ends."""
+    gain, sums = own[0, :2] - seen[0, :2], own[1, :2] + seen[1, :2]
+    g, size = np.array([seen[0, 4], -seen[0, 3]]), seen[1, [4, 3]]
+    rows, totals = np.vstack([gain, g]), np.vstack([sums, size])
+    forms = [Form(_pair(rows, 0, 3, 1, 2, -1.0), _pair(totals, 0, 3, 1, 2, 1.0))]
+    low, high = float(tree.lower[i]), float(tree.upper[i])
+    if np.isfinite([low, high]).all():
+        within = (gain - low * g).T @ (gain - high * g)
+        most = (sums + abs(low) * size).T @ (sums + abs(high) * size)
+        forms.append(Form(0.5 * (within + within.T), 0.5 * (most + most.T), positive=True))
+    return forms
+
+
+def _pair(rows: Float[np.ndarray, "c m"], a: int, b: int, c: int, d: int, sign: float) -> Float[np.ndarray, "m m"]:
+    """The quadratic form x_a x_b + sign·x_c x_d of rows of x."""
+    form = np.outer(rows[a], rows[b]) + sign * np.outer(rows[c], rows[d])
+    return 0.5 * (form + form.T)

@@ -1,0 +1,1 @@
+"""Machine code of laws, models and rollouts."""

@@ -1,1 +1,0 @@
-"""Controllers trained through the closed loop; torch is at home here."""

@@ -1,0 +1,188 @@
+"""Desired motions: callables ref(t) -> Reference(q, v, a) whose v and a are the exact derivatives of q.
+
+t is a time [s], giving shapes (n,), or an array of times, giving shapes (..., n). Any callable like that will do for
+`simulate`; motions from files are in `reference_files.py`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import pinocchio as pin
+
+from nbs_pin.base.checks import PerJoint, floats, per_joint, positive
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
+from nbs_pin.robots.robot import Robot
+
+DesiredMotion: TypeAlias = Callable[[Any], Reference]
+"""ref(t) -> Reference, of a time [s] (shapes (n,)) or of an array of times (shapes (..., n))."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sinusoid:
+    """q = offset + amplitude·sin(frequency·t + phase), per joint.
+
+    amplitude, offset [rad]; frequency [rad/s]; phase [rad]. The longest list says how many joints move, a number
+    beside it serves them all; numbers alone make the motion of one joint.
+    """
+
+    amplitude: PerJoint
+    frequency: PerJoint
+    phase: PerJoint = 0.0
+    offset: PerJoint = 0.0
+
+    def __post_init__(self) -> None:
+        names = ("amplitude", "frequency", "phase", "offset")
+        per_joint(self, *names)
+        fields = np.broadcast_arrays(*(np.atleast_1d(getattr(self, name)) for name in names))
+        for name, value in zip(names, fields, strict=True):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def for_robot(cls, robot: Robot, frequency: float = 1.0, amplitude: float = 0.5) -> "Sinusoid":
+        """A motion the arm can follow: neighbouring joints a quarter period apart, about a posture it can hold.
+
+        frequency [rad/s]. amplitude: at most this [rad], a quarter of the joint's range, and half its velocity limit.
+        Raises ArgumentError when a number is not positive.
+        """
+        positive("frequency", frequency, "rad/s")
+        positive("amplitude", amplitude, "rad")
+        span = np.minimum(robot.upper - robot.lower, 2.0 * np.pi)
+        reach = np.minimum.reduce([np.full(robot.nv, amplitude), 0.25 * span, 0.5 * robot.velocity_limit / frequency])
+        return cls(reach, frequency, 0.5 * np.pi * (np.arange(robot.nv) % 2), resting_posture(robot))
+
+    def __call__(self, t: Any) -> Reference:
+        """Desired motion at t [s]."""
+        A, w = self.amplitude, self.frequency
+        angle = w * np.asarray(t, dtype=float)[..., None] + self.phase
+        sine, cosine = np.sin(angle), np.cos(angle)
+        return Reference(self.offset + A * sine, A * w * cosine, -A * w**2 * sine)
+
+
+def resting_posture(robot: Robot) -> np.ndarray:
+    """The middle of the joint ranges [rad], or the posture nearest to it that needs at most half the effort limits.
+
+    Among postures within a quarter of each range of the middle; where none is so light, the lightest.
+    """
+    lower, upper = robot.sampling_range
+    middle, data = 0.5 * (lower + upper), robot.model.createData()
+    inner = np.random.default_rng(0).uniform(-0.25, 0.25, (2000, robot.nv)) * (upper - lower)
+    postures = middle + inner[np.argsort(np.linalg.norm(inner, axis=-1))]
+    postures = np.concatenate([middle[None], postures])
+    effort = [np.abs(pin.computeGeneralizedGravity(robot.model, data, q)) / robot.effort_limit for q in postures]
+    load = np.max(effort, axis=-1)
+    return postures[np.argmax(load <= max(0.5, load.min()))]
+
+
+def paper_reference(n: int) -> Sinusoid:
+    """The paper's q_d = [sin 0.1t, cos 0.1t, sin 0.1t, …] for n joints [rad]."""
+    if n < 1:
+        raise ArgumentError(f"n is {n}, expected at least one joint.")
+    return Sinusoid(amplitude=np.ones(n), frequency=0.1, phase=0.5 * np.pi * (np.arange(n) % 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """q constant [rad], one number per joint (a number alone: one joint), v = a = 0."""
+
+    q: PerJoint
+
+    def __post_init__(self) -> None:
+        per_joint(self, "q")
+
+    def __call__(self, t: Any) -> Reference:
+        """Desired motion at t [s]."""
+        q = np.atleast_1d(self.q)
+        zero = np.zeros((*np.shape(t), q.size))
+        return Reference(zero + q, zero, zero.copy())
+
+
+@dataclass(frozen=True, eq=False)
+class MinimumJerk:
+    """From waypoint to waypoint, resting at each: quintics 10s³ − 15s⁴ + 6s⁵, the motions of least squared jerk.
+
+    waypoints (k, n) [rad] are reached at times (k,) [s], which increase. q is held before the first and after the last.
+    v is at most 1.875 and a at most 5.774 times the mean speed Δq/T of a segment, and Δq/T².
+    """
+
+    waypoints: Any
+    times: Any
+
+    def __post_init__(self) -> None:
+        waypoints, times = floats("waypoints", self.waypoints), floats("times", self.times)
+        if waypoints.ndim != 2 or times.shape != waypoints.shape[:1] or times.size < 2 or waypoints.shape[1] == 0:
+            raise ArgumentError(
+                f"MinimumJerk was given waypoints of shape {waypoints.shape} at times of shape {times.shape}, "
+                "expected (k, n) and (k,) with k ≥ 2; give one time per waypoint."
+            )
+        if not (np.isfinite(waypoints).all() and np.isfinite(times).all()):
+            raise ArgumentError(
+                "MinimumJerk's waypoints and times must be finite numbers; correct the one that is not."
+            )
+        if not (np.diff(times) > 0.0).all():
+            k = int(np.argmin(np.diff(times) > 0.0))
+            raise ArgumentError(f"times must increase, but times[{k + 1}] = {times[k + 1]} ≤ {times[k]}; correct them.")
+        object.__setattr__(self, "waypoints", waypoints)
+        object.__setattr__(self, "times", times)
+
+    def __call__(self, t: Any) -> Reference:
+        """Desired motion at t [s]."""
+        t = np.asarray(t, dtype=float)
+        k = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, self.times.size - 2)
+        duration = (self.times[k + 1] - self.times[k])[..., None]
+        s = np.clip((t - self.times[k])[..., None] / duration, 0.0, 1.0)
+        start, delta = self.waypoints[k], self.waypoints[k + 1] - self.waypoints[k]
+        return Reference(
+            start + delta * (s**3 * (10.0 - 15.0 * s + 6.0 * s**2)),
+            delta / duration * (30.0 * (s * (1.0 - s)) ** 2),
+            delta / duration**2 * (60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)),
+        )
+
+
+def check_reference(reference: DesiredMotion, robot: Robot, duration: float, *, samples: int = 2001) -> None:
+    """Refuse a motion that the arm cannot follow, before it starts.
+
+    Position and velocity limits, and the torque M a + C v + G against the effort limits (`Robot.with_effort_limit`
+    sets others), at `samples` times over `duration` [s]. Joint friction is not counted.
+    Raises ArgumentError naming the joint, the time, the value, the limit and the remedy.
+    """
+    positive("duration", duration, "s")
+    t = np.linspace(0.0, duration, samples)
+    desired = Reference(*(floats(f"the reference's {name}", x) for name, x in zip("qva", reference(t), strict=True)))
+    for name, x in desired._asdict().items():
+        if x.ndim and x.shape[-1] != robot.nv:
+            raise ArgumentError(
+                f"the reference has {x.shape[-1]} joints, {robot.name} has {robot.nv}; give one motion per joint."
+            )
+        if x.shape != (samples, robot.nv):
+            raise ArgumentError(
+                f"the reference at {samples} times gave {name} of shape {x.shape}, expected ({samples}, {robot.nv}); "
+                "let it take arrays of times."
+            )
+    degrees = " (are these degrees?)" if np.median(np.max(np.abs(desired.q), axis=-1)) > 2.0 * np.pi else ""
+    speed, effort = robot.velocity_limit, robot.effort_limit
+    _check_range(robot, t, "position", desired.q, robot.lower, robot.upper, f"stay inside{degrees}")
+    _check_range(robot, t, "velocity", desired.v, -speed, speed, "slow it down")
+    data = robot.model.createData()
+    tau = np.array([pin.rnea(robot.model, data, *row) for row in zip(*desired, strict=True)])
+    _check_range(robot, t, "torque", tau, -effort, effort, "slow it down, choose another posture or raise the limit")
+
+
+_UNITS = {"position": ("rad", "m"), "velocity": ("rad/s", "m/s"), "torque": ("N·m", "N")}
+
+
+def _check_range(
+    robot: Robot, t: np.ndarray, what: str, x: np.ndarray, lower: np.ndarray, upper: np.ndarray, remedy: str
+) -> None:
+    inside = (x >= lower) & (x <= upper)
+    if inside.all():
+        return
+    k, i = np.argwhere(~inside)[0]
+    joint = robot.joints[i]
+    unit = _UNITS[what][joint.prismatic]
+    raise ArgumentError(
+        f"the reference needs the {what} {x[k, i]:.6g} {unit} of joint '{joint.name}' at t = {t[k]:.4g} s, "
+        f"outside [{lower[i]:.6g}, {upper[i]:.6g}]; {remedy}."
+    )

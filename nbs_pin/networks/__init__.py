@@ -1,1 +1,0 @@
-"""Neural networks with structure; torch only, and no knowledge of robots."""

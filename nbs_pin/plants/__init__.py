@@ -1,1 +1,0 @@
-"""What a controller acts on: the truth of a simulation."""

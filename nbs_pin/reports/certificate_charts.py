@@ -1,0 +1,217 @@
+"""Pictures of certificates: what was promised beside what happened, in the style of `plotting`."""
+
+import textwrap
+from pathlib import Path
+from textwrap import fill
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+from nbs_pin.base.claims import Assumption
+from nbs_pin.certificates.attack import Attack
+from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.monitor import Monitored
+from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture, stretches, thin
+from nbs_pin.robots.robot import configuration_difference
+
+_INK, _NOTE, _VIOLET = "#1d2733", "#5d6b7a", "#7a4fa3"
+_DASHED, _DOTTED = (0, (5, 3)), (0, (1, 2))
+_DECADES = 12  # of V, at most
+_TERMS = {
+    "potential": ("−∇ΦᵀΛ∇Φ", TORQUE),
+    "damping": ("−z2ᵀ(ωM + D)z2", ACTUAL),
+    "disturbance": ("z2ᵀτ_d", REFERENCE),
+    "held": ("z2ᵀ(held − law)", _VIOLET),
+    "saturation": ("z2ᵀ(cut torque)", SATURATED),
+}
+
+
+def plot_monitor(monitored: Monitored, path: str | Path) -> Path:
+    """Draws what a certificate promised of a run and what happened, and writes the picture (PNG); returns its path.
+
+    V against its promise on a logarithmic scale; ‖z1‖ against its bound, and the |z1_i| that went furthest beyond its
+    own; V̇ and each of its terms; and when each assumption failed. Stretches in which the torque was cut are shaded, and
+    where a promise was broken is marked.
+    """
+    rows = max(len(monitored.failures), 1)
+    with picture(path, 11.0, 8.2 + 0.34 * rows) as figure:
+        heights = [2.6, 1.8, 3.0, 0.35 + 0.34 * rows]
+        storage, error, terms, flags = figure.subplots(4, 1, sharex=True, height_ratios=heights)
+        _draw_storage(storage, monitored)
+        _draw_error(error, monitored)
+        _draw_terms(terms, monitored)
+        _draw_flags(flags, monitored)
+        for axes in (storage, error, terms):
+            _shade(axes, monitored)
+        flags.set(xlabel="time [s]", xlim=(monitored.t[0], monitored.t[-1]))
+        colour = TORQUE if monitored.is_kept else ERROR
+        verdict = monitored.verdict
+        figure.suptitle(verdict[0].upper() + verdict[1:], x=0.008, ha="left", fontsize=10.5, color=colour, wrap=True)
+    return Path(path)
+
+
+def plot_certificate(certificate: Certificate, attack: Attack | None, path: str | Path) -> Path:
+    """Draws the bounds and the worst motion an adversary found, and writes the picture (PNG); returns its path.
+
+    With an attack: ‖z1(t)‖ of its worst motion below its bound, the bound that the paper prints, and how the attack got
+    there; always: each joint's bound, beside the worst that was found of it. The title says how the bounds are known,
+    or which conditions make them void.
+    """
+    with picture(path, 11.0, 4.6) if attack is not None else picture(path, 6.4, 4.2) as figure:
+        if attack is None:
+            _draw_joints(figure.add_subplot(), certificate, None)
+        else:
+            motion, joints = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
+            _draw_attack(motion, certificate, attack)
+            _draw_joints(joints, certificate, attack)
+        colour = ERROR if certificate.void else _INK
+        title = _standing(certificate, 70 if attack is None else 120)
+        figure.suptitle(title, x=0.008, ha="left", fontsize=11, fontweight="bold", color=colour)
+    return Path(path)
+
+
+def _standing(certificate: Certificate, width: int) -> str:
+    """The arm, the disturbance and how the bounds are known; below them, in lines of the width, why they are void."""
+    arm = "" if certificate.robot is None else _plain(certificate.robot.name) + ", "
+    title = f"{arm}{certificate.admissible}: {certificate.label}"
+    if not certificate.void:
+        return title
+    failed = f"bounds not promised, as this does not hold here: {'; '.join(certificate.void)}"
+    return "\n".join([title, *textwrap.wrap(_plain(failed), width)])
+
+
+def _draw_storage(axes: Axes, seen: Monitored) -> None:
+    values = np.concatenate([seen.storage, seen.promise])
+    top = values.max() if values.max() > 0.0 else 1.0
+    low = max(values[values > 0.0].min(initial=top), top * 10.0**-_DECADES)
+    axes.fill_between(*thin(seen.t, seen.promise), low * 1e-3, color=LIMIT, alpha=0.12, linewidth=0)
+    axes.plot(*thin(seen.t, seen.promise), color=LIMIT, linestyle=_DASHED, label="promised: at most V(0) exp(−ct) + V∞")
+    axes.plot(*thin(seen.t, np.where(seen.storage > 0.0, seen.storage, np.nan)), color=ACTUAL, label="V")
+    _mark(axes, seen, "V", seen.storage)
+    axes.set(yscale="log", ylim=(0.5 * low, 3.0 * top))
+    axes.yaxis.set_major_locator(LogLocator(numticks=7))
+    axes.yaxis.set_minor_locator(NullLocator())
+    _title(axes, "storage function [J]")
+
+
+def _draw_error(axes: Axes, seen: Monitored) -> None:
+    axes.plot(
+        *thin(seen.t, seen.error_bound), color=LIMIT, linestyle=_DASHED, label=f"bound, {_ends(seen.error_bound)}"
+    )
+    axes.plot(*thin(seen.t, seen.error), color=ERROR, label=f"‖z1‖, at most {seen.error.max():.3g} rad")
+    _mark(axes, seen, "‖z1‖", seen.error)
+    names = [f"|z1| of {name}" for name in seen.joint_names]
+    i = int((seen.joint_errors - seen.joint_bounds).max(axis=0).argmax())
+    if names[i] in seen.excesses:
+        axes.plot(*thin(seen.t, seen.joint_errors[:, i]), color=_VIOLET, linewidth=1.0, label=_plain(names[i]))
+        axes.plot(*thin(seen.t, seen.joint_bounds[:, i]), color=_VIOLET, linewidth=1.0, linestyle=_DASHED)
+    axes.set_ylim(0.0, 1.15 * max(float(seen.error_bound.max()), float(seen.error.max()), 1e-12))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    _title(axes, "tracking error [rad]")
+
+
+def _draw_terms(axes: Axes, seen: Monitored) -> None:
+    middle = 0.5 * (seen.t[1:] + seen.t[:-1])
+    for name, (label, colour) in _TERMS.items():
+        values = getattr(seen.balance, name)
+        if values.any():
+            axes.plot(*thin(middle, values), color=colour, linewidth=1.0, label=label)
+    axes.plot(*thin(middle, seen.balance.change), color=_INK, linewidth=1.0, linestyle=_DOTTED, label="V̇")
+    axes.axhline(0.0, color=LIMIT, linewidth=0.7)
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    _title(axes, "rate of V and its terms [W]")
+
+
+def _draw_flags(axes: Axes, seen: Monitored) -> None:
+    """A line per assumption that failed, drawn while it did."""
+    names = list(seen.failures)
+    for k, name in enumerate(names):
+        bars = [(seen.t[begin], seen.t[end] - seen.t[begin]) for begin, end in stretches(seen.failures[name])]
+        axes.broken_barh(bars, (k - 0.35, 0.7), color=SATURATED if name is Assumption.EFFORT else ERROR, linewidth=0)
+    axes.set_yticks(range(len(names)), [fill(name, 26) for name in names])
+    axes.set_ylim(max(len(names), 1) - 0.5, -0.5)
+    axes.grid(visible=False, axis="y")
+    if not names:
+        axes.annotate("none", (0.5, 0.5), xycoords="axes fraction", ha="center", va="center", color=_NOTE)
+    axes.set_title("assumptions that failed", loc="left", color=_INK)
+
+
+def _draw_attack(axes: Axes, certificate: Certificate, attack: Attack) -> None:
+    run = attack.run
+    z1 = configuration_difference(run.q, run.q_ref, run.continuous)
+    axes.plot(*thin(run.t, np.linalg.norm(z1, axis=-1)), color=ERROR, label=f"worst found, {attack.error:.3g}")
+    bounds = [(certificate.error, _INK, _DASHED, f"certified, {certificate.error:.3g}")]
+    # For gains shaped by the inertia it is the certified one, and one line is enough.
+    if abs(certificate.printed_error - certificate.error) > 0.01 * certificate.error:
+        printed = f"printed in the paper, {certificate.printed_error:.3g}"
+        bounds.append((certificate.printed_error, REFERENCE, _DOTTED, printed))
+    for value, colour, style, label in bounds:
+        axes.axhline(value, color=colour, linestyle=style, label=label)
+    axes.set(xlabel="time [s]", xlim=(0.0, run.t[-1]), ylim=(0.0, 1.35 * max(certificate.error, attack.error)))
+    ratio = f": certified ÷ found = {certificate.error / attack.error:.2f}" if attack.error > 0.0 else ""
+    unit = ", ".join(dict.fromkeys(certificate.joint_units))
+    axes.set_title(f"‖z1‖ [{unit}], {attack.found_by}{ratio}", loc="left", color=_INK)
+    axes.legend(frameon=False, loc="upper left", ncols=1)
+
+
+def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) -> None:
+    """A bar per joint up to its bound, and a bar within it up to what was found."""
+    bounds, units = certificate.joint_errors, certificate.joint_units
+    at, mixed = np.arange(len(bounds)), len(set(units)) > 1
+    axes.barh(at, bounds, height=0.7, color=LIMIT, alpha=0.35, label="certified")
+    found = np.zeros(len(at)) if attack is None else attack.joint_errors
+    axes.barh(at, found, height=0.38, color=ERROR, label="worst found")
+    for y, bound, end, unit in zip(at.tolist(), bounds.tolist(), np.maximum(bounds, found), units, strict=True):
+        text = f" {bound:.3g}{' ' + unit if mixed else ''}"
+        axes.annotate(text, (end, y), va="center", fontsize=7.5, color=_NOTE)
+    axes.set_yticks(at, [_plain(name) for name in certificate.joint_names])
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set_xlim(0.0, 1.18 * float(max(bounds.max(), found.max())) or 1.0)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    title = f"|z1| of each joint [{', '.join(dict.fromkeys(units))}]"
+    if attack is not None:
+        _title(axes, title)
+        return
+    axes.set_title(title, loc="left", color=_INK)
+    if not bounds.any():
+        axes.set_xticks([0.0])
+        axes.annotate("every bound is 0: nothing disturbs", (0.5, 0.5), xycoords="axes fraction", ha="center",
+                      va="center", color=_NOTE)  # fmt: skip
+
+
+def _shade(axes: Axes, seen: Monitored) -> None:
+    bars = [(seen.t[begin], seen.t[end] - seen.t[begin]) for begin, end in stretches(seen.saturated)]
+    axes.broken_barh(bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=SATURATED, alpha=0.3, linewidth=0)
+
+
+def _ends(values: np.ndarray) -> str:
+    first, last = (f"{x:.3g}" for x in values[[0, -1]].tolist())
+    return f"{first} rad" if first == last else f"{first} to {last} rad"
+
+
+def _mark(axes: Axes, seen: Monitored, name: str, values: np.ndarray) -> None:
+    """Where the quantity of that name went beyond its bound."""
+    if name in seen.excesses:
+        where = np.where(seen.excesses[name], values, np.nan)
+        label = "promise broken" if name == next(iter(seen.excesses)) else None
+        axes.plot(*thin(seen.t, where), color=ERROR, linewidth=2.2, label=label)
+
+
+def _title(axes: Axes, title: str) -> None:
+    axes.set_title(title, loc="left", color=_INK)
+    axes.legend(
+        frameon=False,
+        ncols=6,
+        handlelength=1.4,
+        columnspacing=1.2,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.1,
+    )
+
+
+def _plain(text: str) -> str:
+    """Text in which no dollar begins a formula."""
+    return text.replace("$", r"\$")

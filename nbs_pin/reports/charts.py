@@ -1,0 +1,197 @@
+"""Charts of studies: curves over many runs, in the style of `plotting`."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+from nbs_pin.base.records import Run
+from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
+from nbs_pin.simulation.metrics import PAPER_THRESHOLD, squared_error
+
+FAR = 1000.0
+"""‖z1‖ beyond which a motion is not drawn [rad]."""
+
+
+def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]], path: str | Path) -> Path:
+    """Draws cost [µs] against number of joints, a line per series, and writes the picture (PNG); returns its path."""
+    with picture(path, 6.4, 4.0) as figure:
+        axes = figure.add_subplot()
+        for (name, values), colour in zip(series.items(), (ACTUAL, REFERENCE, TORQUE, ERROR), strict=False):
+            axes.plot(joints, values, "o-", color=colour, markersize=3.5, label=name)
+        axes.set(xlabel="joints", ylabel="one control step, median [µs]", xlim=(0, None), ylim=(0, None))
+        axes.legend(frameon=False, loc="upper left")
+    return Path(path)
+
+
+def plot_training(
+    history: Float[np.ndarray, " epochs"],
+    held_out: Float[np.ndarray, " checked"],
+    best_epoch: int,
+    before: Run,
+    after: Run,
+    path: str | Path,
+) -> Path:
+    """Draws what training changed and writes the picture (PNG); returns its path.
+
+    Left: mean cost of the training and the held-out motions by epoch (`Training`), the best epoch marked. Right:
+    ‖z1‖ over time of the same motions under the controller before and after, their median, and the worst, at each time;
+    a line ends where its motion leaves `FAR` or the finite numbers.
+    """
+    with picture(path, 11.0, 4.2) as figure:
+        costs, errors = figure.subplots(1, 2)
+        _draw_costs(costs, history, held_out, best_epoch)
+        _draw_errors(errors, {"before": before, "after": after})
+    return Path(path)
+
+
+def _draw_costs(
+    axes: Axes, history: Float[np.ndarray, " epochs"], held_out: Float[np.ndarray, " checked"], best: int
+) -> None:
+    for name, values, colour in (("training", history, ACTUAL), ("held out", held_out, REFERENCE)):
+        axes.plot(values, color=colour, label=name)
+    chosen, colour = (held_out, REFERENCE) if held_out.size else (history, ACTUAL)
+    lowered = f"best, {1.0 - chosen[best] / chosen[0]:.0%} lower"
+    axes.plot(best, chosen[best], "o", color=colour, markersize=5, clip_on=False, label=lowered)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(MaxNLocator(6))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set(xlabel="epoch", xlim=(0, max(len(history) - 1, 1)))
+    axes.set_title("mean cost of a motion", loc="left")
+    axes.legend(frameon=False)
+
+
+def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
+    for (name, run), colour in zip(runs.items(), (LIMIT, ACTUAL), strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):  # of motions that diverge
+            size = np.sqrt(squared_error(run)).reshape(len(run.t), -1)
+            size = np.where(size <= FAR, size, np.inf)
+            median, worst = (np.where(np.isfinite(x), x, np.nan) for x in (np.median(size, axis=1), size.max(axis=1)))
+        axes.plot(run.t, median, color=colour, linewidth=1.8, label=f"{name}, median")
+        axes.plot(run.t, worst, color=colour, linewidth=1.0, linestyle=(0, (4, 2)), label=f"{name}, worst")
+        axes.fill_between(run.t, median, worst, color=colour, alpha=0.12, linewidth=0)
+    mark = float(np.sqrt(PAPER_THRESHOLD))
+    axes.axhline(mark, color=ERROR, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.annotate("converged", (1.0, mark), xycoords=("axes fraction", "data"), ha="right", va="bottom", color=ERROR)
+    axes.set_yscale("log")
+    axes.set(xlabel="time [s]", xlim=(0.0, run.t[-1]))
+    axes.set_title(f"‖error‖ of {size.shape[1]} fresh motions [rad]", loc="left")
+    axes.legend(frameon=False)
+
+
+def plot_comparison(rows: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
+    """Draws the convergence times of the fair comparison and writes the picture (PNG); returns its path.
+
+    rows: those of `studies.fair.Row` as dictionaries. A panel per arm and period, all with one time axis; per law, a
+    dot at the median of its starts for each reference and a line to the worst one. What does not converge ends in an
+    arrow at the right edge.
+    """
+    panels = list(dict.fromkeys((row["arm"], row["period_s"]) for row in rows))
+    times = np.array([[row["convergence_time_median_s"], row["convergence_time_worst_s"]] for row in rows])
+    seen = times[np.isfinite(times) & (times > 0.0)]
+    limits = 0.85 * seen.min(initial=1.0), 1.5 * seen.max(initial=1.0)
+    with picture(path, 11.0, 0.6 + 2.6 * math.ceil(len(panels) / 2)) as figure:
+        grid = figure.subplots(math.ceil(len(panels) / 2), min(2, len(panels)), squeeze=False).ravel()
+        for axes, panel in zip(grid, panels, strict=False):
+            _draw_comparison(axes, [row for row in rows if (row["arm"], row["period_s"]) == panel], limits)
+            axes.set_title(f"{panel[0]}, control at {1000 * panel[1]:g} ms", loc="left")
+        for axes in grid[-2:]:
+            axes.set_xlabel("time of convergence [s]: median (dot) to worst start (bar), never (arrow)")
+        handles, labels = grid[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), frameon=False)
+    return Path(path)
+
+
+def _draw_comparison(axes: Axes, rows: Sequence[Mapping[str, Any]], limits: tuple[float, float]) -> None:
+    laws = list(dict.fromkeys(row["law"] for row in rows))
+    frequencies = list(dict.fromkeys(row["frequency_rad_per_s"] for row in rows))
+    edge = limits[1] / 1.08
+    for k, (frequency, colour) in enumerate(zip(frequencies, (TORQUE, ACTUAL, ERROR), strict=False)):
+        chosen = [row for row in rows if row["frequency_rad_per_s"] == frequency]
+        for row in chosen:
+            y = laws.index(row["law"]) + 0.24 * (k - 0.5 * (len(frequencies) - 1))
+            median, worst = row["convergence_time_median_s"], row["convergence_time_worst_s"]
+            axes.plot([min(median, edge), min(worst, edge)], [y, y], color=colour, linewidth=1.0, alpha=0.6)
+            axes.plot(min(worst, edge), y, "|" if math.isfinite(worst) else ">", color=colour, markersize=5)
+            if math.isfinite(median):
+                axes.plot(median, y, "o", color=colour, markersize=4.5)
+        axes.plot([], [], "o-", color=colour, markersize=4.5, linewidth=1.0, label=f"ω = {frequency:g} rad/s")
+    axes.set_xscale("log")
+    axes.set(xlim=limits, ylim=(len(laws) - 0.5, -0.5))
+    axes.set_yticks(range(len(laws)), laws)
+    axes.grid(False, axis="y")
+    for boundary in range(1, len(laws)):
+        axes.axhline(boundary - 0.5, color=LIMIT, linewidth=0.4, alpha=0.5)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+
+
+def plot_motions(columns: Mapping[str, Mapping[str, Sequence[Run]]], path: str | Path, *, until: float) -> Path:
+    """Draws two-joint motions side by side and writes the picture (PNG); returns its path.
+
+    columns: title -> label -> runs, each with any batch of starts; a colour per label, joint 1 solid, joint 2 dashed.
+    Rows: angles and tracking errors up to the time `until` [s], then ‖z1‖² over all of it, both axes logarithmic.
+    """
+    with picture(path, 1.2 + 4.2 * max(len(columns), 1.6), 8.4) as figure:
+        grid = figure.subplots(3, len(columns), squeeze=False, sharey="row")
+        for axes, (title, runs) in zip(grid.T, columns.items(), strict=True):
+            for (label, several), colour in zip(runs.items(), (ACTUAL, ERROR, TORQUE, REFERENCE), strict=False):
+                _draw_motions(axes, several, colour, label, until)
+            axes[0].set_title(title, loc="left")
+            axes[0].legend(frameon=False, loc="best")
+        for axes, name in zip(grid[:, 0], ("angles [rad]", "tracking errors z1 [rad]", "‖z1‖² [rad²]"), strict=True):
+            axes.set_ylabel(name)
+    return Path(path)
+
+
+def _draw_motions(axes: np.ndarray, runs: Sequence[Run], colour: str, label: str, until: float) -> None:
+    """A column of `plot_motions`: the motions of one colour."""
+    angles, errors, squares = axes
+    for run in runs:
+        shown, starts = run.t <= until, run.q.reshape(len(run.t), -1, run.nv)
+        z1 = starts - run.q_ref.reshape(starts.shape)
+        width = 1.2 if starts.shape[1] * len(runs) == 1 else 0.7
+        for joint, style in ((0, "-"), (1, "--")):
+            angles.plot(run.t[shown], starts[shown, :, joint], style, color=colour, linewidth=width)
+            errors.plot(run.t[shown], z1[shown, :, joint], style, color=colour, linewidth=width)
+            wanted = run.q_ref.reshape(starts.shape)[shown, 0, joint]
+            angles.plot(run.t[shown], wanted, style, color="#1d2733", linewidth=0.9, zorder=3)
+        squares.loglog(run.t[1:], (z1**2).sum(-1)[1:], color=colour, linewidth=width)
+    angles.plot([], [], color=colour, label=label)
+    squares.axhline(PAPER_THRESHOLD, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
+    for panel, end in ((angles, until), (errors, until), (squares, None)):
+        panel.set(xlabel="time [s]", xlim=(run.period if end is None else 0.0, end))
+
+
+def plot_bounds(
+    alpha: Float[np.ndarray, " alphas"],
+    panels: Mapping[str, Mapping[str, Float[np.ndarray, " alphas"]]],
+    path: str | Path,
+) -> Path:
+    """Draws ‖z1‖² [rad²] against α, a panel per title, and writes the picture (PNG); returns its path.
+
+    panels: title -> name -> values; a name that speaks of a bound is a line, every other one a row of dots.
+    """
+    with picture(path, 5.6 * len(panels), 4.6) as figure:
+        grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+        for axes, (title, series) in zip(grid, panels.items(), strict=True):
+            bounds = iter((LIMIT, REFERENCE))
+            measured = iter((ACTUAL, TORQUE, SATURATED, ERROR))
+            for name, values in series.items():
+                if "bound" in name:
+                    axes.plot(alpha, values, color=next(bounds), linewidth=1.8, label=name)
+                else:
+                    axes.plot(alpha, values, "o", color=next(measured), markersize=3.2, label=name)
+            axes.set_yscale("log")
+            axes.set(xlabel="α", xlim=(0.0, 1.02 * float(alpha.max())))
+            axes.set_title(title, loc="left")
+            axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
+        grid[0].set_ylabel("‖z1‖² [rad²]")
+    return Path(path)

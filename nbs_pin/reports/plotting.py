@@ -1,0 +1,169 @@
+"""Figures of runs, and the style of every picture; drawn without any global plotting state."""
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.files import write_whole
+from nbs_pin.base.records import Run
+from nbs_pin.robots.robot import configuration_difference
+from nbs_pin.simulation.metrics import saturated_fraction
+
+ACTUAL, REFERENCE, ERROR = "#1f5fbf", "#ff8c1a", "#b3261e"
+TORQUE, LIMIT, SATURATED = "#22734d", "#8a8f98", "#f6c945"
+MAX_POINTS = 4000
+"""More rows than this are thinned, keeping every stretch's extremes."""
+
+_STYLE: Any = {
+    "font.size": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#9aa3ad",
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.color": "#e6eaee",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.2,
+    "lines.solid_capstyle": "round",
+    "xtick.color": "#4a5562",
+    "ytick.color": "#4a5562",
+}
+
+
+@contextmanager
+def picture(path: str | Path, width: float, height: float, dpi: int = 120) -> Iterator[Figure]:
+    """An empty figure of that size [inch] in the style of every picture, written to the path (PNG) when the block ends.
+
+    Written whole or, when drawing fails, not at all; raises OSError when it cannot be written.
+    """
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png")
+    write_whole(path, buffer.getvalue())
+
+
+def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
+    """Draws how each joint followed its reference and writes the picture (PNG); returns its path.
+
+    A row per joint: actual against desired position, |error| on a logarithmic scale (wrapped on continuous joints),
+    and applied torque with the effort limits; stretches where the asked torque was cut off are shaded.
+    start: which start of a batched run to draw. Raises ArgumentError when it does not exist.
+    """
+    starts = int(np.prod(run.q.shape[1:-1], dtype=int))
+    if not 0 <= start < starts:
+        raise ArgumentError(f"start={start} does not exist: the run has starts 0 to {starts - 1}.")
+    q, q_ref, tau, asked = (
+        np.array(x.reshape(len(run.t), starts, run.nv)[:, start]) for x in (run.q, run.q_ref, run.tau, run.tau_command)
+    )
+    error = np.abs(configuration_difference(q, q_ref, run.continuous))
+    cut = np.abs(asked) > run.effort_limit
+    tau[-1], cut[-1] = np.nan, False  # asked for, never applied
+    fraction = float(np.ravel(saturated_fraction(run))[start])
+    with picture(path, 13.0, 1.15 + 1.5 * run.nv) as figure:
+        grid = figure.subplots(run.nv, 3, sharex=True, squeeze=False)
+        for joint, (position_axes, error_axes, torque_axes) in enumerate(grid):
+            _draw_position(position_axes, run.t, q[:, joint], q_ref[:, joint])
+            _draw_error(error_axes, run.t, error[:, joint])
+            _draw_torque(torque_axes, run.t, tau[:, joint], float(run.effort_limit[joint]), cut[:, joint])
+            position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color="#1d2733")
+        _dress(figure, grid, run, fraction)
+    return Path(path)
+
+
+def _draw_position(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarray, " rows"],
+                   q_ref: Float[np.ndarray, " rows"]) -> None:  # fmt: skip
+    axes.plot(*thin(t, q_ref), color=REFERENCE, linewidth=2.6, alpha=0.75)
+    axes.plot(*thin(t, q), color=ACTUAL)
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+
+
+def _draw_error(axes: Axes, t: Float[np.ndarray, " rows"], error: Float[np.ndarray, " rows"]) -> None:
+    """|error| over at most nine decades; exact zeros fall off the scale."""
+    finite = error[np.isfinite(error) & (error > 0.0)]
+    top = 10.0 ** np.ceil(np.log10(finite.max())) if len(finite) else 1.0
+    low = max(10.0 ** np.floor(np.log10(np.percentile(finite, 0.5))) if len(finite) else 0.1, 1e-9 * top)
+    axes.set_yscale("log")
+    axes.set_ylim(min(low, 0.1 * top), top)
+    axes.plot(*thin(t, np.where(error > 0.0, error, np.nan)), color=ERROR, linewidth=1.0)
+    axes.yaxis.set_major_locator(LogLocator(numticks=5))
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
+def _draw_torque(axes: Axes, t: Float[np.ndarray, " rows"], tau: Float[np.ndarray, " rows"], limit: float,
+                 cut: Bool[np.ndarray, " rows"]) -> None:  # fmt: skip
+    """Torque, its limits where they are within sight, and the stretches where it was cut off."""
+    bars = [(t[begin], t[min(end, len(t) - 1)] - t[begin]) for begin, end in stretches(cut)]
+    axes.broken_barh(bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=SATURATED, alpha=0.45, linewidth=0)
+    axes.plot(*thin(t, tau), color=TORQUE, linewidth=1.0)
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    peak = np.nanmax(np.abs(tau), initial=0.0)
+    if not np.isfinite(limit):
+        note = "no limit"
+    elif peak > 0.25 * limit:
+        note = f"limit ±{limit:g}"
+        for side in (-limit, limit):
+            axes.axhline(side, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
+        axes.set_ylim(-1.15 * limit, 1.15 * limit)
+    else:
+        note = f"limit ±{limit:g} (peak {peak / limit:.0%})"
+    axes.annotate(note, (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color="#5d6b7a")
+
+
+def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
+    """Titles, the legend and the time axis."""
+    for axes, title in zip(grid[0], ("position [rad]", "|error| [rad]", "torque [N·m]"), strict=True):
+        axes.set_title(title, loc="left", fontsize=9.5, color="#1d2733", pad=9)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+        axes.set_xlim(run.t[0], run.t[-1] if run.t[-1] > run.t[0] else run.t[0] + 1.0)
+    named = [str(run.info[key]).partition("(")[0] for key in ("controller", "plant") if run.info.get(key)]
+    title = " · ".join([_short(run.robot.rsplit("/", 1)[-1]) or f"{run.nv} joints", *map(_short, named)])
+    figure.suptitle(title, x=0.008, ha="left", fontsize=12, fontweight="bold", color="#1d2733")
+    handles = [
+        figure.axes[0].plot([], [], color=ACTUAL, label="actual")[0],
+        figure.axes[0].plot([], [], color=REFERENCE, linewidth=2.6, alpha=0.75, label="reference")[0],
+        figure.axes[2].axvspan(np.nan, np.nan, color=SATURATED, alpha=0.45, label=f"saturated ({cut:.2%} of the time)"),
+    ]
+    figure.legend(handles=handles, loc="outside upper right", ncols=3, frameon=False)
+
+
+def thin(t: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tuple[np.ndarray, np.ndarray]:
+    """The curve with at most MAX_POINTS points: least and greatest of every stretch, so that no spike is lost."""
+    if len(t) <= MAX_POINTS:
+        return t, y
+    width = -(-2 * len(t) // MAX_POINTS)
+    rows = np.arange(len(t))
+    padded = np.pad(rows, (0, -len(t) % width), mode="edge").reshape(-1, width)
+    values = y[padded]
+    least = np.where(np.isfinite(values), values, np.inf).argmin(axis=1)
+    most = np.where(np.isfinite(values), values, -np.inf).argmax(axis=1)
+    every = np.arange(len(padded))
+    picked = np.unique(np.concatenate([padded[every, least], padded[every, most], rows[[0, -1]]]))
+    return t[picked], y[picked]
+
+
+def stretches(flags: Bool[np.ndarray, " rows"]) -> list[tuple[int, int]]:
+    """Half-open ranges of rows where the flag holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
+
+
+def _short(text: str, width: int = 28) -> str:
+    """The text cut to the width, with no letter that matplotlib would read as mathematics."""
+    return (text if len(text) <= width else text[: width - 1] + "…").replace("$", r"\$")

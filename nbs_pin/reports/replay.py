@@ -1,0 +1,200 @@
+"""Runs in the browser: one self-contained page with the arm and a translucent reference arm.
+
+The page carries meshcat's viewer, the arm as meshcat commands that are handled in order, and the poses of its bodies
+by Pinocchio's forward kinematics; a small script of ours (`replay_page.html`) moves them. No server is started, and
+the page's own security policy forbids it every connection.
+"""
+
+import base64
+import html
+import importlib.resources
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import umsgpack  # type: ignore[import-untyped]
+from jaxtyping import Float, Int
+from meshcat.commands import SetObject, SetTransform
+from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry
+from meshcat.path import Path as ScenePath
+
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.files import write_whole
+from nbs_pin.base.records import Run
+from nbs_pin.robots.robot import Robot, configuration_difference, load_robot
+from nbs_pin.robots.visuals import Visual, link_visuals, tip
+
+FRAME_RATE = 50.0
+"""Frames per second of run time [1/s]; the page interpolates between them."""
+MAX_FRAMES = 12_000
+"""Longer runs get fewer frames per second, to keep the page small."""
+
+
+def replay(
+    run: Run,
+    path: str | Path,
+    robot: Robot | None = None,
+    *,
+    start: int = 0,
+    package_dirs: Iterable[str | Path] = (),
+) -> Path:
+    """Writes a page that plays `run` in any browser without a network; returns its path.
+
+    robot: the arm to draw; None loads the one the run names. start: which start of a batched run to show.
+    package_dirs: further folders that meshes may be read from. A mesh that cannot be drawn is named in a warning.
+    Raises ArgumentError when the run names no robot, when that robot is no longer the one that ran, when `robot` has
+    other joints, when `start` does not exist, or when the run is not finite.
+    """
+    robot = _robot_of(run) if robot is None else robot
+    if robot.joint_names != run.joint_names:
+        raise ArgumentError(
+            f"the run moves joints {', '.join(run.joint_names)} but {robot.name} has {', '.join(robot.joint_names)}: "
+            "give the robot that ran."
+        )
+    rows = _frame_rows(run.t)
+    q, q_ref = (_one_start(array, start)[rows] for array in (run.q, run.q_ref))
+    if not (np.isfinite(q).all() and np.isfinite(q_ref).all()):
+        raise ArgumentError("the run has configurations that are not finite: show the part before it diverged.")
+    poses = np.stack([body_poses(robot, q), body_poses(robot, q_ref)], axis=1)
+    visuals = link_visuals(robot, package_dirs)
+    joint, point = tip(robot)
+    data = {
+        "name": robot.name,
+        "notes": _notes(run),
+        "joints": [{"name": joint.name, "unit": "m" if joint.prismatic else "rad"} for joint in robot.joints],
+        "bodies": [_body_node(body)[1] for body in range(robot.model.njoints)],
+        "links": {
+            frame.name: (frame.parentJoint, frame.placement.homogeneous.T.ravel().tolist())
+            for frame in robot.model.frames
+            if frame.type == pin.FrameType.BODY
+        },
+        "tip": {"body": joint, "point": point.tolist()},
+        "view": _view(robot, visuals, poses),
+        "commands": [base64.b64encode(umsgpack.packb(command)).decode() for command in _commands(robot, visuals)],
+        "times": _encoded(run.t[rows], np.float64),
+        "poses": _encoded(poses, np.float32),
+        "position": _encoded(q, np.float32),
+        "error": _encoded(configuration_difference(q, q_ref, run.continuous), np.float32),
+    }
+    return write_whole(path, _page(robot.name, data).encode())
+
+
+def body_poses(robot: Robot, q: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows bodies 7"]:
+    """Poses of the fixed base and of the body behind each joint, in the base frame: (x, y, z [m], qx, qy, qz, qw)."""
+    data = robot.model.createData()
+    poses = np.empty((len(q), robot.model.njoints, 7))
+    for row, configuration in enumerate(q):
+        pin.forwardKinematics(robot.model, data, configuration)
+        poses[row] = [pin.SE3ToXYZQUAT(placement) for placement in data.oMi]
+    return poses
+
+
+def _robot_of(run: Run) -> Robot:
+    """The robot a run names, if it is still the one that ran."""
+    if not run.robot:
+        raise ArgumentError("the run names no robot: give it as replay(run, path, robot=load_robot(…)).")
+    unknown = run.robot_options.keys() - {"gravity", "lock", "zero_limits"}
+    if unknown:
+        raise ArgumentError(f"the run loads its robot with {', '.join(sorted(unknown))}, unknown here: give robot=….")
+    robot = load_robot(run.robot, **run.robot_options)
+    if robot.sha256 != run.robot_sha256:
+        raise ArgumentError(
+            f"'{run.robot}' is not the arm that ran (description or gravity differ: {robot.sha256[:12]} now, "
+            f"{run.robot_sha256[:12] or 'nothing'} in the run): give the robot that ran as robot=…."
+        )
+    return robot
+
+
+def _one_start(array: Float[np.ndarray, "rows *batch n"], start: int) -> Float[np.ndarray, "rows n"]:
+    starts = array.reshape(array.shape[0], -1, array.shape[-1])
+    if not 0 <= start < starts.shape[1]:
+        raise ArgumentError(f"start={start} does not exist: the run has starts 0 to {starts.shape[1] - 1}.")
+    return starts[:, start]
+
+
+def _frame_rows(t: Float[np.ndarray, " rows"]) -> Int[np.ndarray, " frames"]:
+    """Rows to show, nearest to an even clock, the last included: every frame is a state the run recorded."""
+    count = min(int((t[-1] - t[0]) * FRAME_RATE) + 2, MAX_FRAMES)
+    after = np.searchsorted(t, np.linspace(t[0], t[-1], count) - 1e-9 * (t[-1] - t[0]))
+    return np.unique(np.minimum(after, len(t) - 1))
+
+
+def _notes(run: Run) -> str:
+    """What the run's notes say of controller and plant, in one line."""
+    return " · ".join(str(run.info[key]) for key in ("controller", "plant", "reference") if run.info.get(key))
+
+
+def _body_node(body: int) -> tuple[str, str]:
+    return "actual", f"body{body}"
+
+
+def _commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]:
+    """The commands for meshcat that build the arm: a node per body, under it a node per shape."""
+    commands = [SetTransform(np.eye(4), ScenePath(_body_node(body))) for body in range(robot.model.njoints)]
+    for index, visual in enumerate(visuals):
+        frame = robot.model.frames[robot.model.getFrameId(visual.link, pin.FrameType.BODY)]
+        node = ScenePath((*_body_node(frame.parentJoint), f"shape{index}"))
+        geometry = TriangularMeshGeometry(visual.vertices.astype(np.float32), visual.faces.astype(np.uint32))
+        commands += [
+            SetObject(geometry, _material(visual), node),
+            SetTransform(frame.placement.homogeneous @ visual.placement, node),
+        ]
+    return [command.lower() for command in commands]
+
+
+def _material(visual: Visual) -> MeshPhongMaterial:
+    red, green, blue = (round(255 * min(max(channel, 0.0), 1.0)) for channel in visual.color[:3])
+    return MeshPhongMaterial(
+        color=(red << 16) + (green << 8) + blue, opacity=visual.color[3], specular=0x2A2A2A, shininess=38
+    )
+
+
+def _view(robot: Robot, visuals: tuple[Visual, ...], poses: Float[np.ndarray, "frames 2 bodies 7"]) -> dict[str, Any]:
+    """Where to look so that the whole motion of both arms is in the picture, and how wide the grid's cells are [m]."""
+    picked = poses[np.unique(np.linspace(0, len(poses) - 1, 40).astype(int))].reshape(-1, *poses.shape[2:])
+    points = [np.zeros((1, 3))]
+    for visual in visuals:
+        frame = robot.model.frames[robot.model.getFrameId(visual.link, pin.FrameType.BODY)]
+        box = np.array(np.meshgrid(*np.stack([visual.vertices.min(0), visual.vertices.max(0)], axis=1))).reshape(3, -1)
+        placement = frame.placement.homogeneous @ visual.placement
+        corners = placement[:3, :3] @ box + placement[:3, 3:]
+        for pose in picked[:, frame.parentJoint]:
+            points.append(np.asarray(pin.XYZQUATToSE3(pose).rotation @ corners).T + pose[:3])
+    cloud = np.concatenate(points)
+    target = 0.5 * (cloud.min(axis=0) + cloud.max(axis=0))
+    radius = max(float(np.linalg.norm(cloud - target, axis=1).max()), 1e-2)
+    spread, axes = np.linalg.eigh(np.cov(cloud[:, :2], rowvar=False))
+    across = axes[:, 0] * (-1.0 if axes[1, 0] > 0.0 else 1.0)
+    flat = spread[0] < 0.1 * spread[1]
+    direction = np.array([*(across if flat else (0.65, -0.76)), 0.3])
+    cell = min((10.0**k * digit for k in range(-4, 4) for digit in (1.0, 2.0, 5.0)), key=lambda c: abs(c - radius / 5))
+    outward = np.random.default_rng(0).normal(size=(160, 3))
+    return {
+        "cloud": cloud[np.unique((cloud @ outward.T).argmax(axis=0))].tolist(),
+        "target": target.tolist(),
+        "radius": radius,
+        "direction": (direction / np.linalg.norm(direction)).tolist(),
+        "cell": float(f"{cell:.1g}"),
+    }
+
+
+def _encoded(array: np.ndarray, dtype: type[np.floating[Any]]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
+
+
+def _page(name: str, data: dict[str, Any]) -> str:
+    """The template with its four holes filled in one pass, so that no content is read as a hole."""
+    viewer = importlib.resources.files("meshcat") / "viewer" / "dist"
+    holes = {
+        "title": html.escape(f"{name} – replay"),
+        "licence": html.escape((viewer / "main.min.js.LICENSE.txt").read_text(encoding="utf-8")),
+        "meshcat": (viewer / "main.min.js").read_text(encoding="utf-8"),
+        # "<" would let a name end the script element
+        "data": json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
+    }
+    template = (importlib.resources.files("nbs_pin") / "replay_page.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda hole: holes[hole[1]], template)

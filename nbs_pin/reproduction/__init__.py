@@ -1,0 +1,1 @@
+"""The paper and the studies of this package, run again."""

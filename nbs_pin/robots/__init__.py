@@ -1,0 +1,1 @@
+"""Descriptions of arms: URDF, checks, drawings."""

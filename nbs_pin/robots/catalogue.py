@@ -1,0 +1,82 @@
+"""The arms that `load_robot` knows by name."""
+
+import difflib
+import importlib.metadata
+from dataclasses import dataclass
+from pathlib import Path
+
+from nbs_pin.base.exceptions import RobotError, RobotNotFound
+from nbs_pin.robots.urdf_checks import ZeroLimits
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where an arm's file is and how it is to be read."""
+
+    name: str
+    path: Path
+    lock: tuple[str, ...] = ()
+    gravity: float = 9.81
+    zero_limits: ZeroLimits = "refuse"
+
+
+_BUNDLED = {"two_link": 9.8, "three_link": 9.81}
+_FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+_EXAMPLES: dict[str, tuple[str, tuple[str, ...], ZeroLimits]] = {
+    "panda": ("panda_description/urdf/panda.urdf", _FINGERS, "refuse"),
+    "ur3": ("ur_description/urdf/ur3_robot.urdf", (), "refuse"),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", (), "refuse"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", (), "refuse"),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", (), "refuse"),
+    "z1": ("z1_description/urdf/z1.urdf", (), "refuse"),
+    "kinova": ("kinova_description/robots/kinova.urdf", (), "refuse"),
+    "so100": ("so_arm_description/urdf/so100.urdf", (), "refuse"),
+    "so101": ("so_arm_description/urdf/so101.urdf", (), "refuse"),
+    "talos_left_arm": ("talos_data/robots/talos_left_arm.urdf", (), "refuse"),
+    "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", (), "unlimited"),
+}
+_SUFFIXES = (".urdf", ".xacro")
+ROBOT_NAMES: tuple[str, ...] = (*_BUNDLED, *_EXAMPLES)
+"""Every name `load_robot` knows."""
+
+
+def example_robot_share() -> Path:
+    """The `share` folder of the installed example-robot-data, whose meshes are `package://example-robot-data/…`."""
+    share = importlib.metadata.distribution("example-robot-data").locate_file("cmeel.prefix/share")
+    return Path(str(share))
+
+
+def find(name_or_path: str) -> Entry:
+    """The catalogue's entry for a name, or a plain entry for a path.
+
+    Raises RobotNotFound for neither, with the names that come close, and RobotError for a path that may not be read.
+    """
+    if name_or_path in _BUNDLED:
+        folder = Path(__file__).parent.parent / "_urdf"
+        folder = folder if folder.is_dir() else Path(__file__).parent.parent.parent / "urdf"
+        return Entry(name_or_path, folder / f"{name_or_path}.urdf", gravity=_BUNDLED[name_or_path])
+    if name_or_path in _EXAMPLES:
+        path, lock, zero_limits = _EXAMPLES[name_or_path]
+        robots = example_robot_share() / "example-robot-data" / "robots"
+        return Entry(name_or_path, robots / path, lock, zero_limits=zero_limits)
+    try:
+        return _entry_of_file(Path(name_or_path).expanduser())
+    except OSError as error:
+        if isinstance(error, RobotNotFound):
+            raise
+        raise RobotError(f"cannot read '{name_or_path:.200}': {error.strerror}; check the path.") from error
+
+
+def _entry_of_file(path: Path) -> Entry:
+    """A plain entry for a file; raises RobotNotFound, with what could have been meant, when there is none."""
+    if path.is_file():
+        return Entry("", path.resolve())
+    names = ", ".join(ROBOT_NAMES)
+    if path.is_dir():
+        inside = ", ".join(sorted(file.name for file in path.iterdir() if file.suffix in _SUFFIXES)[:10])
+        raise RobotNotFound(f"'{path}' is a directory; give one file in it ({inside or 'no .urdf lies here'}).")
+    if path.suffix in _SUFFIXES or len(path.parts) > 1:
+        raise RobotNotFound(f"no file '{path}' (seen from {Path.cwd()}); give a file or one of {names}.")
+    near = difflib.get_close_matches(path.name, ROBOT_NAMES)
+    hint = f" did you mean {' or '.join(near)}?" if near else ""
+    raise RobotNotFound(f"no robot '{path}':{hint} give a file or one of {names}.")

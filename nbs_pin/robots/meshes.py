@@ -1,0 +1,129 @@
+"""Mesh files of a robot's drawing, read with suspicion and cut into parts of one colour.
+
+Meshes are never needed for the dynamics; a file that cannot be drawn raises `MeshError` and is left to the caller.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from nbs_pin.base.exceptions import RobotError
+from nbs_pin.robots.catalogue import example_robot_share
+
+SUFFIXES = (".stl", ".obj", ".dae")
+MAX_BYTES = 50_000_000
+MAX_FACES = 1_000_000
+MAX_COLORS = 32
+CREASE = np.radians(40.0)
+"""Edges sharper than this are drawn sharp [rad]."""
+
+Color = tuple[float, float, float, float]
+"""Red, green, blue, opacity, each in [0, 1]."""
+
+
+class MeshError(RobotError):
+    """A mesh that will not be drawn; says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Triangles of one colour; None where the file states none."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    color: Color | None
+
+
+def find_mesh(uri: str, urdf: Path, package_dirs: tuple[Path, ...] = ()) -> Path:
+    """The file a URDF means by `uri`, confined to the folders that belong to the robot.
+
+    These are the URDF's own folder, the ROS package around it (the nearest folder with a `package.xml`),
+    example-robot-data, and `package_dirs`. Raises MeshError for any other scheme, suffix or place, or no file.
+    """
+    scheme, _, rest = uri.rpartition("://")
+    package = next((folder for folder in urdf.parents if (folder / "package.xml").is_file()), urdf.parent)
+    roots = [folder.resolve() for folder in (urdf.parent, package, example_robot_share(), *package_dirs)]
+    if scheme not in ("", "file", "package"):
+        raise MeshError(f"mesh '{uri}' is not a file on this machine: give a relative or package:// path.")
+    if Path(rest).suffix.lower() not in SUFFIXES:
+        raise MeshError(f"mesh '{uri}' is of an unknown kind: give one of {', '.join(SUFFIXES)}.")
+    candidates = [urdf.parent / unquote(rest)]
+    if scheme == "package":
+        name, _, inner = unquote(rest).partition("/")
+        candidates = [root / name / inner for root in roots] + [root / inner for root in roots if root.name == name]
+    inside = [path.resolve() for path in candidates if any(path.resolve().is_relative_to(root) for root in roots)]
+    if not inside:
+        raise MeshError(f"mesh '{uri}' leaves the robot's folder {roots[0]}: name its folder in package_dirs.")
+    found = next((path for path in inside if path.is_file()), None)
+    if found is None:
+        raise MeshError(f"mesh '{uri}' was not found at {inside[0]}: check the path or give package_dirs.")
+    return found
+
+
+def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
+    """The parts of a mesh file, scaled, sharp edges split so that smooth shading looks right.
+
+    Raises MeshError for a file that is too large, unreadable, empty or not finite.
+    """
+    if path.stat().st_size > MAX_BYTES:
+        raise MeshError(f"mesh {path} has {path.stat().st_size} bytes, at most {MAX_BYTES} are drawn: simplify it.")
+    try:
+        scene = trimesh.load_scene(path, resolver=_Beside(str(path)))
+    except Exception as error:  # parsers of foreign files raise whatever they trip over
+        raise MeshError(f"mesh {path} cannot be read ({type(error).__name__}: {error}): export it anew.") from error
+    meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
+    count = sum(len(mesh.faces) for mesh in meshes)
+    if not 0 < count <= MAX_FACES:
+        raise MeshError(f"mesh {path} has {count} faces, between 1 and {MAX_FACES} are drawn: repair or simplify it.")
+    if not all(np.isfinite(mesh.vertices).all() for mesh in meshes):
+        raise MeshError(f"mesh {path} has vertices that are not finite: export it anew.")
+    pieces: dict[Color | None, list[trimesh.Trimesh]] = {}
+    for mesh in meshes:
+        for color, faces in _by_color(mesh):
+            pieces.setdefault(color, []).append(trimesh.Trimesh(mesh.vertices, faces, process=False))
+    return tuple(shaded(trimesh.util.concatenate(group), color, scale) for color, group in pieces.items())
+
+
+def shaded(mesh: Any, color: Color | None, scale: Float[np.ndarray, "3"] | None = None) -> Part:
+    """A trimesh as a part: vertices merged, then split along creases."""
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    mesh.merge_vertices()
+    mesh = trimesh.graph.smooth_shade(mesh, angle=CREASE, facet_minarea=None)
+    vertices = np.asarray(mesh.vertices, dtype=float) * (1.0 if scale is None else scale)
+    mirrored = scale is not None and np.prod(scale) < 0.0
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    return Part(vertices, faces[:, ::-1] if mirrored else faces, color)
+
+
+class _Beside(trimesh.resolvers.FilePathResolver):
+    """Lets an OBJ read the material file beside it, and nothing else."""
+
+    def get(self, name: str) -> bytes:
+        path = (Path(self.parent) / name).resolve()
+        if path.parent != Path(self.parent).resolve() or path.suffix.lower() != ".mtl":
+            raise FileNotFoundError(f"{name} is not a material file beside the mesh.")
+        return path.read_bytes()
+
+
+def _by_color(mesh: Any) -> list[tuple[Color | None, Int[np.ndarray, "f 3"]]]:
+    """The faces of a mesh by colour, None where the file gave none."""
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    visual = mesh.visual
+    if visual.kind is None or len(faces) == 0:
+        return [(None, faces)]
+    if visual.kind == "texture":
+        return [(_color(visual.material.main_color), faces)]
+    colors, index = np.unique(visual.face_colors, axis=0, return_inverse=True)
+    if len(colors) > MAX_COLORS:
+        return [(_color(visual.main_color), faces)]
+    return [(_color(color), faces[index.ravel() == k]) for k, color in enumerate(colors)]
+
+
+def _color(rgba: Any) -> Color:
+    red, green, blue, alpha = (float(channel) / 255.0 for channel in rgba)
+    return red, green, blue, alpha

@@ -1,0 +1,241 @@
+"""A robot arm: one validated URDF, read once, and what Pinocchio makes of it."""
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from array_api_compat import device
+from jaxtyping import Bool, Float
+
+from nbs_pin.base.arrays import Array, array_namespace
+from nbs_pin.base.checks import PerJoint, floats
+from nbs_pin.base.exceptions import ArgumentError, RobotError
+from nbs_pin.robots.catalogue import find
+from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
+from nbs_pin.robots.urdf_checks import ZERO_LIMITS
+
+_SINGULAR = 1e-10
+"""Smallest eigenvalue of M scaled to a unit diagonal that still counts as positive."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Robot:
+    """A fixed-base arm with nq = nv = n joints.
+
+    A `continuous` joint is an unbounded revolute joint whose tracking error is wrapped (`difference`); locked joints
+    are fixed. `urdf` is the one description that Pinocchio, MuJoCo and the drawings are built from.
+    """
+
+    name: str
+    source: str
+    """A catalogue name, or the full path of the file."""
+    urdf: Urdf
+    model: pin.Model
+    gravity_vector: Float[np.ndarray, "3"]
+    """Gravitational acceleration in the base frame [m/s²]."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """What `load_robot` was told beside the source, as JSON can store it: load_robot(source, **options) is this arm."""
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return int(self.model.nv)
+
+    def __repr__(self) -> str:
+        return f"Robot({self.name!r}, {self.nv} joints)"
+
+    @cached_property
+    def joints(self) -> tuple[JointData, ...]:
+        """The moving joints, in Pinocchio's order."""
+        by_name = {joint.name: joint for joint in self.urdf.joints}
+        return tuple(by_name[name] for name in self.model.names[1:])
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the moving joints, in Pinocchio's order."""
+        return tuple(self.model.names[1:])
+
+    @property
+    def effort_limit(self) -> Float[np.ndarray, " n"]:
+        """Largest |τ| [N·m, N for a prismatic joint], inf where none is stated."""
+        return np.array([joint.effort for joint in self.joints])
+
+    @property
+    def velocity_limit(self) -> Float[np.ndarray, " n"]:
+        """Largest |v| [rad/s, m/s], inf where none is stated."""
+        return np.array([joint.velocity for joint in self.joints])
+
+    @property
+    def lower(self) -> Float[np.ndarray, " n"]:
+        """Lower position limit [rad, m], −inf on continuous joints."""
+        return np.array([joint.lower for joint in self.joints])
+
+    @property
+    def upper(self) -> Float[np.ndarray, " n"]:
+        """Upper position limit [rad, m], inf on continuous joints."""
+        return np.array([joint.upper for joint in self.joints])
+
+    @property
+    def sampling_range(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """(lower, upper) to draw configurations from [rad, m]: the position limits, ∓π where there is none."""
+        lower, upper = self.lower, self.upper
+        return np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
+
+    @property
+    def one_turn_range(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """(lower, upper) of all configurations worth telling apart [rad, m]: `sampling_range`, of a joint that turns
+        one turn about its middle at most; a joint that slides keeps its limits, however long.
+        """
+        lower, upper = self.sampling_range
+        prismatic = np.array([joint.prismatic for joint in self.joints])
+        longer, middle = ~prismatic & (upper - lower > 2.0 * np.pi), 0.5 * (lower + upper)
+        return np.where(longer, middle - np.pi, lower), np.where(longer, middle + np.pi, upper)
+
+    @property
+    def damping(self) -> Float[np.ndarray, " n"]:
+        """Viscous joint friction of the URDF [N·m·s/rad]."""
+        return np.array([joint.damping for joint in self.joints])
+
+    @property
+    def friction(self) -> Float[np.ndarray, " n"]:
+        """Coulomb joint friction of the URDF [N·m]."""
+        return np.array([joint.friction for joint in self.joints])
+
+    @property
+    def continuous(self) -> Bool[np.ndarray, " n"]:
+        """True where the error wraps to (−π, π]."""
+        return np.array([joint.continuous for joint in self.joints])
+
+    @property
+    def sha256(self) -> str:
+        """Fingerprint of links, joints, stated limits and gravity: equal for equal dynamics, however they are drawn."""
+        return hashlib.sha256(self.urdf.without_geometry() + self.gravity_vector.tobytes()).hexdigest()
+
+    def difference(self, q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
+        return configuration_difference(q, q_ref, self.continuous)
+
+    def with_effort_limit(self, limit: PerJoint) -> "Robot":
+        """The same arm with other effort limits [N·m, N for a prismatic joint]: one or one per joint, inf for none.
+
+        Its description and fingerprint stay those of the file. Raises ArgumentError unless the limits are > 0.
+        """
+        effort = floats("effort limit", limit)
+        if effort.shape not in ((), (self.nv,)) or not (effort > 0.0).all():
+            raise ArgumentError(
+                f"effort limit is {limit}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means no limit."
+            )
+        by_name = dict(zip(self.joint_names, np.full(self.nv, effort).tolist(), strict=True))
+        joints = tuple(replace(joint, effort=by_name[joint.name]) for joint in self.urdf.joints)
+        urdf = replace(self.urdf, joints=joints)
+        return replace(self, urdf=urdf, model=_with_limits(self.model.copy(), urdf))
+
+
+def configuration_difference(
+    q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"], continuous: Bool[np.ndarray, " n"] | None
+) -> Float[Array, "*batch n"]:
+    """Q ⊖ q_ref [rad]: plain subtraction, wrapped to (−π, π] where `continuous` is true (None: nowhere).
+
+    The wrap makes every law that uses it discontinuous at |z1_i| = π (docs/theory.md §1).
+    """
+    z1 = q - q_ref
+    if continuous is None or not continuous.any():
+        return z1
+    xp = array_namespace(z1)
+    turns = xp.ceil((z1 - np.pi) / (2.0 * np.pi))
+    return z1 - 2.0 * np.pi * turns * xp.asarray(continuous.astype(float), dtype=z1.dtype, device=device(z1))
+
+
+def load_robot(
+    name_or_path: str | Path,
+    *,
+    gravity: float | Iterable[float] | None = None,
+    lock: Iterable[str] | None = None,
+    zero_limits: str | None = None,
+) -> Robot:
+    """The arm of a bundled URDF, of example-robot-data by short name, or of a `.urdf` or `.xacro` file.
+
+    gravity: downward acceleration [m/s²] or a vector in the base frame; None takes the catalogue's, else 9.81.
+    lock: joints to fix at zero; None takes the catalogue's list.
+    zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range at zero, or read such zeros as
+    "unlimited", as files do that leave their limits open; None takes the catalogue's, else "refuse".
+    Raises RobotNotFound for a name or path that leads nowhere, RobotError for a description that would give a wrong
+    model, ArgumentError for a gravity or zero_limits that is none, and MissingExtra for a `.xacro` without the `xacro`
+    extra.
+    """
+    entry = find(str(name_or_path))
+    zeros = entry.zero_limits if zero_limits is None else zero_limits
+    if zeros not in ZERO_LIMITS:
+        raise ArgumentError(f"zero_limits is {zero_limits!r}; give {' or '.join(ZERO_LIMITS)}.")
+    names = entry.lock if lock is None else lock
+    locked = (names,) if isinstance(names, str) else tuple(names)
+    urdf = read_urdf(entry.path, lock=locked, zero_limits=zeros)
+    vector = _gravity_vector(entry.gravity if gravity is None else gravity)
+    model = _build_model(urdf)
+    model.gravity.linear = vector
+    told = {"gravity": gravity, "lock": lock, "zero_limits": zero_limits}
+    stored = {"gravity": vector.tolist(), "lock": list(locked), "zero_limits": zero_limits}
+    options = {key: stored[key] for key, value in told.items() if value is not None}
+    robot = Robot(entry.name or urdf.name, entry.name or str(entry.path), urdf, model, vector, options)
+    _check_mass_matrix(robot)
+    return robot
+
+
+def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
+    """The gravity vector in the base frame [m/s²]; raises ArgumentError unless it is one or three finite numbers."""
+    message = f"gravity is {gravity!r}, expected one finite number (downward) or three; give e.g. 9.81."
+    try:
+        vector = np.array(list(gravity) if isinstance(gravity, Iterable) else gravity, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(message) from error
+    if vector.shape not in ((), (3,)) or not np.isfinite(vector).all():
+        raise ArgumentError(message)
+    return np.array([0.0, 0.0, -float(vector)]) if vector.ndim == 0 else vector
+
+
+def _build_model(urdf: Urdf) -> pin.Model:
+    """Pinocchio's model of the arm, with our limits; raises RobotError when it cannot be built."""
+    try:
+        model = pin.buildModelFromXML(urdf.without_geometry().decode())
+    except (ValueError, RuntimeError) as error:
+        raise RobotError(f"{urdf.path}: Pinocchio cannot build it ({error}); simplify the file.") from error
+    return _with_limits(model, urdf)
+
+
+def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
+    """The model, carrying the limits of `urdf.joints`."""
+    by_name = {joint.name: joint for joint in urdf.joints}
+    joints = [by_name[name] for name in model.names[1:]]
+    effort, velocity = (np.array([getattr(joint, key) for joint in joints]) for key in ("effort", "velocity"))
+    model.lowerPositionLimit = np.array([joint.lower for joint in joints])
+    model.upperPositionLimit = np.array([joint.upper for joint in joints])
+    model.lowerEffortLimit, model.upperEffortLimit = -effort, effort
+    model.lowerVelocityLimit, model.upperVelocityLimit = -velocity, velocity
+    return model
+
+
+def _check_mass_matrix(robot: Robot) -> None:
+    """Raise RobotError unless M(q) ≻ 0 at zero and at five seeded configurations within the limits.
+
+    The test is on M scaled to a unit diagonal, so that grams beside tonnes and metres beside radians do not matter.
+    """
+    model, data = robot.model, robot.model.createData()
+    low, high = robot.sampling_range
+    for q in (np.clip(0.0, low, high), *np.random.default_rng(0).uniform(low, high, (5, robot.nv))):
+        mass = pin.crba(model, data, q)
+        inertia = np.diag(mass)
+        weakest = int(np.argmin(inertia))
+        if np.isfinite(mass).all() and inertia[weakest] > 0.0:
+            values, vectors = np.linalg.eigh(mass / np.sqrt(inertia) / np.sqrt(inertia)[:, None])
+            if values[0] > _SINGULAR:
+                continue
+            weakest = int(np.argmax(np.abs(vectors[:, 0])))
+        raise RobotError(
+            f"{robot.urdf.path}: joint '{model.names[1 + weakest]}': M(q) is not finite and positive definite at "
+            f"q = {np.round(q, 3).tolist()}; give the links behind it inertia about its axis."
+        )

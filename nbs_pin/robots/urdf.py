@@ -1,0 +1,98 @@
+"""A URDF file read once, checked, and brought to the form that every engine is given."""
+
+import math
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+
+from nbs_pin.robots.urdf_checks import (
+    Joint,
+    Limits,
+    ZeroLimits,
+    check_axis,
+    check_bodies,
+    check_tree,
+    read_friction,
+    read_limits,
+)
+from nbs_pin.robots.urdf_source import read_source
+
+_UNLIMITED = 1e9
+"""How an absent limit is written into the XML: no engine reads "inf"."""
+_DYNAMIC = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "dynamics")}
+
+
+@dataclass(frozen=True)
+class JointData:
+    """One moving joint as the URDF states it; SI units, inf where the file states no limit."""
+
+    name: str
+    continuous: bool
+    prismatic: bool
+    lower: float
+    upper: float
+    effort: float
+    velocity: float
+    damping: float
+    friction: float
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A checked description: `xml` has locked joints fixed and continuous joints as unbounded revolute ones.
+
+    Every number of the dynamics stands in `xml` in its shortest exact form, absent limits as ±1e9; drawings, materials
+    and transmissions are as the file has them, unchecked.
+    """
+
+    name: str
+    path: Path
+    xml: bytes
+    joints: tuple[JointData, ...]
+
+    def without_geometry(self) -> bytes:
+        """The dynamics alone: links with inertias and joints, no visual, collision, material or extension."""
+        source = ET.fromstring(self.xml)
+        robot = ET.Element("robot", {"name": self.name})
+        for part in source:
+            if part.tag in _DYNAMIC:
+                copy = ET.SubElement(robot, part.tag, part.attrib)
+                copy.extend(_bare(child) for child in part if child.tag in _DYNAMIC[part.tag])
+        return ET.tostring(robot)
+
+
+def read_urdf(path: Path, *, lock: tuple[str, ...] = (), zero_limits: ZeroLimits = "refuse") -> Urdf:
+    """The checked description in the `.urdf` or `.xacro` file `path`, with the joints in `lock` fixed at zero.
+
+    An arm without a name, which drawing tools refuse, takes its file's.
+    zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range, or read zeros as "unlimited".
+    Raises RobotError, naming file, line, element, value and remedy, for a description that would give a wrong model,
+    RobotNotFound for a path without a file, MissingExtra for a `.xacro` file without the `xacro` extra.
+    """
+    robot = read_source(path)
+    robot.element.set("name", robot.element.get("name", path.stem))
+    joints = check_tree(robot, lock)
+    check_bodies(robot, joints)
+    moving = tuple(_settle(joint, zero_limits) for joint in joints if joint.moves)
+    return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving)
+
+
+def _settle(joint: Joint, zero_limits: ZeroLimits) -> JointData:
+    """The data of a moving joint, written back into its element as a revolute or prismatic joint with all limits."""
+    check_axis(joint)
+    limits = read_limits(joint, zero_limits)
+    damping, friction = read_friction(joint)
+    element = joint.node.element
+    stated = element.find("limit")
+    stated = ET.SubElement(element, "limit") if stated is None else stated
+    for key, value in zip(Limits._fields, limits, strict=True):
+        stated.set(key, repr(value if math.isfinite(value) else math.copysign(_UNLIMITED, value)))
+    element.set("type", "prismatic" if joint.kind == "prismatic" else "revolute")
+    return JointData(joint.name, joint.kind == "continuous", joint.kind == "prismatic", *limits, damping, friction)
+
+
+def _bare(element: ET.Element) -> ET.Element:
+    """A copy without the file's spaces, so that equal dynamics give equal bytes."""
+    copy = ET.Element(element.tag, element.attrib)
+    copy.extend(_bare(child) for child in element)
+    return copy

@@ -1,0 +1,206 @@
+"""What a URDF says beyond the dynamics: the shapes and colours of its links, mimic joints and transmissions.
+
+Pinocchio drops these; yourdfpy reads them here, from bytes that were validated before, and never the dynamics.
+"""
+
+import io
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import trimesh
+import yourdfpy
+from jaxtyping import Float, Int
+from lxml import etree
+
+from nbs_pin.base.exceptions import RobotError
+from nbs_pin.robots.meshes import Color, MeshError, Part, find_mesh, read_mesh, shaded
+from nbs_pin.robots.robot import Robot
+
+STEEL: Color = (0.35, 0.45, 0.60, 1.0)
+BRASS: Color = (0.80, 0.60, 0.25, 1.0)
+GREY: Color = (0.70, 0.72, 0.75, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Visual:
+    """Triangles of one colour fixed to a link."""
+
+    link: str
+    placement: Float[np.ndarray, "4 4"]
+    """Pose of the shape in the link's frame."""
+    vertices: Float[np.ndarray, "v 3"]
+    """Corners [m]."""
+    faces: Int[np.ndarray, "f 3"]
+    """Indices of three corners each, counter-clockwise from outside."""
+    color: Color
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """`joint` is geared to `source`: q = multiplier · q_source + offset."""
+
+    joint: str
+    source: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Transmission:
+    """A gearbox between an actuator and joints; `reduction` is motor turns per joint turn."""
+
+    name: str
+    joints: tuple[str, ...]
+    reduction: float
+
+
+@dataclass(frozen=True)
+class Couplings:
+    """Mimic joints and transmissions of a description."""
+
+    mimics: tuple[Mimic, ...]
+    transmissions: tuple[Transmission, ...]
+
+
+def read_couplings(robot: Robot) -> Couplings:
+    """The mimic joints and transmissions that the URDF states; locked joints have lost theirs."""
+    description, root = _parse(robot)
+    mimics = tuple(
+        Mimic(joint.name, joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
+        for joint in description.robot.joints
+        if joint.mimic is not None
+    )
+    transmissions = tuple(
+        Transmission(
+            element.get("name", ""),
+            tuple(joint.get("name", "") for joint in element.iterfind("joint")),
+            float(element.findtext(".//mechanicalReduction", "1")),
+        )
+        for element in root.iterfind("transmission")
+    )
+    return Couplings(mimics, transmissions)
+
+
+def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple[Visual, ...]:
+    """The shapes of all links, ready to draw; rigid bodies without any get capsules from joint to joint.
+
+    package_dirs: further folders that meshes may be read from. A mesh that cannot be drawn is named in a warning.
+    Raises RobotError where a visual element is malformed.
+    """
+    description, _ = _parse(robot)
+    materials = {material.name: material.color for material in description.robot.materials if material.color}
+    folders = tuple(Path(folder) for folder in package_dirs)
+    visuals: list[Visual] = []
+    bare: set[str] = set()
+    for link in description.robot.links:
+        for visual in link.visuals:
+            try:
+                parts = _parts(visual.geometry, robot.urdf.path, folders)
+            except MeshError as error:
+                warnings.warn(f"link '{link.name}' is drawn as a capsule: {error}", stacklevel=2)
+                bare.add(link.name)
+                continue
+            placement = np.eye(4) if visual.origin is None else np.asarray(visual.origin, dtype=float)
+            stated = _stated_color(visual.material, materials)
+            visuals += [
+                Visual(link.name, placement, part.vertices, part.faces, part.color or stated or GREY) for part in parts
+            ]
+    return (*visuals, *_capsules(robot, {visual.link for visual in visuals}, bare))
+
+
+def tip(robot: Robot) -> tuple[int, Float[np.ndarray, "3"]]:
+    """The last joint and, in its frame, where the arm ends [m]: its farthest link frame, else its centre of mass."""
+    last = robot.model.njoints - 1
+    frames = [frame for frame in robot.model.frames if frame.type == pin.FrameType.BODY and frame.parentJoint == last]
+    return last, _far_end(robot.model.inertias[last].lever, frames)
+
+
+def _parse(robot: Robot) -> tuple[yourdfpy.URDF, Any]:
+    """The description for yourdfpy, stripped of what is not drawn, and its lxml root."""
+    try:
+        root = etree.fromstring(robot.urdf.xml, etree.XMLParser(resolve_entities=False, no_network=True))
+    except etree.XMLSyntaxError as error:  # yourdfpy would guess instead
+        raise RobotError(f"{robot.urdf.path} is not well-formed XML ({error}): correct it.") from error
+    for link in root.iterfind("link"):
+        for child in [*link.iterfind("collision"), *link.iterfind("inertial")]:
+            link.remove(child)
+        for visual in link.findall("visual"):
+            shape = next(iter(visual.find("geometry") if visual.find("geometry") is not None else ()), None)
+            if shape is None or shape.tag not in ("box", "cylinder", "sphere", "mesh"):
+                kind = "no geometry" if shape is None else f"geometry '{shape.tag}'"
+                warnings.warn(f"link '{link.get('name')}' has a visual with {kind}: it is not drawn.", stacklevel=3)
+                link.remove(visual)
+    try:
+        return yourdfpy.URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False), root
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        message = f"{robot.urdf.path}: a visual, mimic or limit element is malformed ({error}): correct it."
+        raise RobotError(message) from error
+
+
+def _parts(geometry: Any, urdf: Path, package_dirs: tuple[Path, ...]) -> tuple[Part, ...]:
+    """A URDF geometry as triangles."""
+    if geometry.mesh is not None:
+        scale = np.ones(3) if geometry.mesh.scale is None else np.broadcast_to(geometry.mesh.scale, (3,)).astype(float)
+        return read_mesh(find_mesh(geometry.mesh.filename, urdf, package_dirs), scale)
+    if geometry.box is not None:
+        return (shaded(trimesh.creation.box(geometry.box.size), None),)
+    if geometry.cylinder is not None:
+        shape = trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=48)
+        return (shaded(shape, None),)
+    return (shaded(trimesh.creation.uv_sphere(geometry.sphere.radius, count=[24, 48]), None),)
+
+
+def _stated_color(material: Any, named: dict[str, Any]) -> Color | None:
+    """The colour a visual's material states, itself or by name."""
+    if material is None:
+        return None
+    color = material.color or named.get(material.name)
+    if color is None:
+        return None
+    red, green, blue, alpha = (float(channel) for channel in color.rgba)
+    return red, green, blue, alpha
+
+
+def _capsules(robot: Robot, drawn: set[str], bare: set[str]) -> list[Visual]:
+    """Capsules for the rigid bodies of which nothing was drawn, or a part could not be."""
+    model = robot.model
+    frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
+    reach = sum(float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements)
+    radius = max(0.04 * reach, 1e-2)
+    capsules: list[Visual] = []
+    for joint in range(model.njoints):
+        body = [frame for frame in frames if frame.parentJoint == joint]
+        names = {frame.name for frame in body}
+        if not body or (names & drawn and not names & bare):
+            continue
+        to_link = body[0].placement.inverse().homogeneous
+        ends = [model.jointPlacements[child].translation for child in range(1, model.njoints)
+                if model.parents[child] == joint]  # fmt: skip
+        ends = ends or [_far_end(model.inertias[joint].lever, body)]
+        shapes = [(trimesh.creation.icosphere(subdivisions=3, radius=1.25 * radius), BRASS)]
+        shapes += [(_capsule(np.asarray(end), radius), STEEL) for end in ends if np.linalg.norm(end) > radius]
+        for shape, color in shapes:
+            part = shaded(shape, color)
+            capsules.append(Visual(body[0].name, to_link, part.vertices, part.faces, color))
+    return capsules
+
+
+def _far_end(lever: Float[np.ndarray, "3"], body: list[Any]) -> Float[np.ndarray, "3"]:
+    """The body's farthest link frame, or its centre of mass where all frames sit in the joint."""
+    points = [np.asarray(frame.placement.translation) for frame in body]
+    far = max(points, key=lambda point: float(np.linalg.norm(point)))
+    return far if np.linalg.norm(far) > 1e-3 else np.asarray(lever)
+
+
+def _capsule(end: Float[np.ndarray, "3"], radius: float) -> trimesh.Trimesh:
+    """A capsule from the origin to `end`."""
+    length = float(np.linalg.norm(end))
+    capsule = trimesh.creation.capsule(height=length, radius=radius, count=[32, 32])
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), end).matrix()
+    capsule.apply_transform(pin.SE3(turn, 0.5 * end).homogeneous)
+    return capsule

@@ -1,0 +1,188 @@
+"""A sampled control loop: when the law is asked, what it aims at, how the plant is stepped; all of it checked."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nbs_pin.base.checks import positive, whole
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference, Run
+from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.simulation.plant import Plant
+
+LONGEST_PLANT_STEP = 1e-3
+"""Plant step taken when none is given, or the nearest shorter one that divides the period [s]."""
+
+
+class Schedule(NamedTuple):
+    """Control instants of a loop and the reference at them."""
+
+    times: np.ndarray
+    """Instants [s], (rows,)."""
+    leads: np.ndarray
+    """How far ahead of each the law is evaluated [s], (rows,)."""
+    desired: Reference
+    """The reference at the instants, (rows, n) each."""
+    target: Reference
+    """The reference the law aims at, `leads` later, (rows, n) each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """What stays the same from step to step."""
+
+    plant: Plant
+    period: float
+    """Control period [s]."""
+    steps: int
+    """Number of periods."""
+    substeps: int
+    """Plant steps per period."""
+    lead: float
+    """How far ahead of the measured state the law is evaluated [s]."""
+    limit: np.ndarray
+    """Largest torque per joint [N·m], (n,), inf for none."""
+
+    @classmethod
+    def of(
+        cls,
+        plant: Plant,
+        nv: int,
+        duration: float,
+        period: float,
+        *,
+        plant_step: float | None,
+        effort_limit: Any,
+        lookahead: float | None,
+    ) -> "Loop":
+        """The loop of a law for nv joints with `simulate`'s arguments; raises ArgumentError when they do not fit."""
+        if nv != plant.nv:
+            raise ArgumentError(f"the controller has {nv} joints and the plant {plant.nv}; build both for one arm.")
+        return cls(
+            plant=plant,
+            period=period,
+            steps=whole(duration, period, "duration", "period"),
+            substeps=_substeps(period, plant_step),
+            lead=_lead(lookahead, period),
+            limit=_effort_limit(plant, effort_limit),
+        )
+
+    @property
+    def step(self) -> float:
+        """Plant step [s]."""
+        return self.period / self.substeps
+
+    def start(self, reference: DesiredMotion, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Start (q, v) of one batch shape: the reference's, or at rest in q0, unless v0 is given.
+
+        Raises ArgumentError for starts of another size or not finite.
+        """
+        return _start(_sampled(reference, np.zeros(1), self.plant.nv), q0, v0)
+
+    def schedule(self, reference: DesiredMotion, first: int = 0, steps: int | None = None) -> Schedule:
+        """The instants first, …, first + steps; without `steps`, to the end.
+
+        Raises ArgumentError when the reference gives another size or is not finite.
+        """
+        steps = self.steps - first if steps is None else steps
+        times = self.period * np.arange(first, first + steps + 1.0)
+        # A motion is not asked for what comes after its end: at the last instant the law does not look ahead.
+        seen = np.minimum(times + self.lead, self.period * self.steps)
+        desired, target = (_sampled(reference, t, self.plant.nv) for t in (times, seen))
+        return Schedule(times, seen - times, desired, target)
+
+    def blank_run(self, times: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray, controller: str) -> Run:
+        """A run with its times, reference and start in place, and room for the rest.
+
+        desired: (rows, n) each, or (rows, *batch, n) where the starts (*batch, n) follow motions of their own.
+        """
+        rows, n = len(times), self.plant.nv
+        shape, robot = (rows, *q0.shape), self.plant.robot
+        aligned = (x if x.ndim == len(shape) else x.reshape(rows, *(1,) * (q0.ndim - 1), n) for x in desired)
+        q_ref, v_ref, a_ref = (np.array(np.broadcast_to(x, shape)) for x in aligned)
+        run = Run(
+            t=times,
+            q=np.zeros(shape),
+            v=np.zeros(shape),
+            tau=np.zeros(shape),
+            tau_command=np.zeros(shape),
+            disturbance=np.zeros(shape),
+            q_ref=q_ref,
+            v_ref=v_ref,
+            a_ref=a_ref,
+            effort_limit=self.limit,
+            continuous=np.zeros(n, dtype=bool) if robot is None else robot.continuous,
+            joint_names=tuple(f"q{i + 1}" for i in range(n)) if robot is None else robot.joint_names,
+            period=self.period,
+            robot="" if robot is None else robot.source,
+            robot_sha256="" if robot is None else robot.sha256,
+            robot_options={} if robot is None else robot.options,
+            info={
+                "controller": controller,
+                "plant": repr(self.plant),
+                "plant_step": self.step,
+                "lookahead": self.lead,
+            },
+        )
+        run.q[0], run.v[0] = q0, v0
+        return run
+
+
+def _substeps(period: float, plant_step: float | None) -> int:
+    if plant_step is not None:
+        return whole(period, plant_step, "period", "plant_step")
+    positive("period", period, "s")
+    return max(1, math.ceil(period / LONGEST_PLANT_STEP - 1e-9))
+
+
+def _lead(lookahead: float | None, period: float) -> float:
+    lead = 0.5 * period if lookahead is None else lookahead
+    if not 0.0 <= lead < math.inf:
+        raise ArgumentError(f"lookahead is {lookahead} s, expected a finite time ≥ 0; half a period is usual.")
+    return lead
+
+
+def _sampled(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
+    sampled = Reference(*(np.asarray(x, dtype=float) for x in reference(t)))
+    for name, rows in sampled._asdict().items():
+        if rows.shape != (t.size, nv):
+            raise ArgumentError(
+                f"the reference at {t.size} times gave {name} of shape {rows.shape}, expected ({t.size}, {nv}); "
+                f"give it one value for each of the {nv} joints and let it take arrays of times."
+            )
+        if not np.isfinite(rows).all():
+            k, joint = np.argwhere(~np.isfinite(rows))[0]
+            raise ArgumentError(f"the reference's {name} of joint {joint} at t = {t[k]:g} s is not finite; correct it.")
+    return sampled
+
+
+def _start(desired: Reference, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Start (q, v) of one batch shape."""
+    rest = desired.v[0] if q0 is None else np.zeros_like(desired.v[0])
+    given = {"q0": desired.q[0] if q0 is None else q0, "v0": rest if v0 is None else v0}
+    start = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+    nv = rest.size
+    for name, x in start.items():
+        if x.ndim == 0 or x.shape[-1] != nv or 0 in x.shape:
+            raise ArgumentError(f"{name} has shape {x.shape}, expected (..., {nv}): one number per joint.")
+        if not np.isfinite(x).all():
+            raise ArgumentError(f"{name} is {x}, expected finite numbers; correct the start.")
+    try:
+        q, v = np.broadcast_arrays(start["q0"], start["v0"])
+        return q, v
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {x.shape}" for name, x in start.items())
+        raise ArgumentError(f"the starts do not broadcast ({shapes}); give equal leading axes.") from error
+
+
+def _effort_limit(plant: Plant, given: Any) -> np.ndarray:
+    if given is None:
+        given = np.inf if plant.robot is None else plant.robot.effort_limit
+    limit = np.asarray(given, dtype=float)
+    if limit.shape not in ((), (plant.nv,)) or not (limit > 0.0).all():
+        raise ArgumentError(
+            f"effort_limit is {given}, expected one number > 0 or {plant.nv} of them [N·m]; np.inf means no limit."
+        )
+    return np.full(plant.nv, limit)

@@ -1,0 +1,137 @@
+"""What a run achieved and what it cost, aligned in time: row k of q is held against row k of q_ref.
+
+Every function gives one number per start (shape (*batch,)), or one per start and joint where it says so.
+Torque statistics leave out the last row, whose torque was computed but never applied.
+"""
+
+import math
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Run
+from nbs_pin.robots.robot import configuration_difference
+
+Numbers: TypeAlias = Float[np.ndarray, "*batch"] | np.float64
+"""One number per start: an array for a batch, a number for a single start."""
+PAPER_THRESHOLD = 0.01
+"""‖z1‖² below which the paper calls an arm converged [rad²]."""
+
+
+def error(run: Run) -> Float[np.ndarray, "rows *batch n"]:
+    """z1 = q ⊖ q_ref at every control instant [rad], wrapped on continuous joints."""
+    return configuration_difference(run.q, run.q_ref, run.continuous)
+
+
+def squared_error(run: Run, shift: int = 0) -> Float[np.ndarray, "rows *batch"]:
+    """‖z1‖² at every control instant [rad²].
+
+    shift: hold q of row k + shift against q_ref of row k. 0 is the tracking error; 1 is the score of the authors'
+    program: q(t + h) against q_d(t), which counts the reference's own motion in h as error (docs/theory.md §8).
+    """
+    if not 0 <= shift < len(run.t):
+        raise ArgumentError(f"shift is {shift}, expected 0 (aligned) or 1 (the authors' index) for {len(run.t)} rows.")
+    z1 = configuration_difference(run.q[shift:], run.q_ref[: len(run.t) - shift], run.continuous)
+    return np.sum(z1 * z1, axis=-1)
+
+
+def steady_error(run: Run, last: float = 0.3, shift: int = 0) -> Numbers:
+    """Largest ‖z1‖² over the last fraction `last` of the time [rad²]; the paper's last 30 s of 100 s."""
+    if not 0.0 < last <= 1.0:
+        raise ArgumentError(f"last is {last}, expected a fraction in (0, 1]; the paper's is 0.3.")
+    values = squared_error(run, shift)
+    start = run.t[-1] - last * (run.t[-1] - run.t[0])
+    late = run.t[shift:] >= start - 1e-9 * run.period
+    return np.max(values[late], axis=0)
+
+
+def convergence_time(run: Run, threshold: float = PAPER_THRESHOLD, shift: int = 0) -> Numbers:
+    """First control instant from which ‖z1‖² stays below the threshold [rad²] to the end [s]; inf if it never does.
+
+    shift: as in `squared_error`; 1 is the authors' count, one period less than the aligned one.
+    """
+    outside = ~(squared_error(run, shift) < threshold)  # what is not a number is outside
+    rows = len(outside)
+    last_outside = np.where(outside.any(axis=0), rows - 1 - np.argmax(outside[::-1], axis=0), -1)
+    return np.append(run.t[:rows], np.inf)[last_outside + 1]
+
+
+def rms_error(run: Run, after: float = 0.0) -> Float[np.ndarray, "*batch n"]:
+    """Root mean square of z1 per joint from the time `after` [s] on [rad]."""
+    return np.sqrt(np.mean(error(run)[_from(run, after)] ** 2, axis=0))
+
+
+def peak_torque(run: Run) -> Numbers:
+    """Largest |τ_i| applied, over time and joints [N·m]."""
+    return np.max(joint_peak_torque(run), axis=-1)
+
+
+def joint_peak_torque(run: Run) -> Float[np.ndarray, "*batch n"]:
+    """Largest |τ_i| applied, over time, per joint [N·m]."""
+    return np.max(np.abs(run.tau[:-1]), axis=0)
+
+
+def rms_torque(run: Run) -> Numbers:
+    """Root mean square over time of ‖τ‖ applied [N·m]."""
+    return np.sqrt(np.mean(np.sum(run.tau[:-1] ** 2, axis=-1), axis=0))
+
+
+def saturated_fraction(run: Run, after: float = 0.0) -> Numbers:
+    """Fraction of the holds that end after the time `after` [s] for which some joint's command exceeded its limit.
+
+    While it does, no Lyapunov argument holds (docs/theory.md §7).
+    """
+    exceeded = np.any(np.abs(run.tau_command[:-1]) > run.effort_limit, axis=-1)
+    _from(run, after)
+    return np.mean(exceeded[run.t[1:] > after + 1e-9 * run.period], axis=0)
+
+
+def peak_torque_rate(run: Run) -> Numbers:
+    """Largest |Δτ_i| between control instants ÷ period, over time and joints [N·m/s]; 0 for a run of one period."""
+    steps = np.abs(np.diff(run.tau[:-1], axis=0)) / run.period
+    return np.max(steps, axis=(0, -1), initial=0.0)
+
+
+def summary(run: Run, after: float = 1.0) -> dict[str, Any]:
+    """Every figure above as numbers and lists that JSON can store, units in the keys, None for inf.
+
+    after: time from which RMS error and saturation are counted too [s], at most the second half of a short run.
+    A batch of starts gives lists, one entry per start.
+    """
+    after = min(after, 0.5 * float(run.t[-1]))
+    figures = {
+        "steady_error_rad2": steady_error(run),
+        "steady_error_shifted_rad2": steady_error(run, shift=1),
+        "convergence_time_s": convergence_time(run),
+        "final_error_rad": np.linalg.norm(error(run)[-1], axis=-1),
+        "rms_error_rad": rms_error(run),
+        "rms_error_late_rad": rms_error(run, after),
+        "peak_torque_Nm": peak_torque(run),
+        "joint_peak_torque_Nm": joint_peak_torque(run),
+        "rms_torque_Nm": rms_torque(run),
+        "peak_torque_rate_Nm_per_s": peak_torque_rate(run),
+        "saturated_fraction": saturated_fraction(run),
+        "saturated_fraction_late": saturated_fraction(run, after),
+        "effort_limit_Nm": run.effort_limit,
+    }
+    times = {"duration_s": float(run.t[-1]), "period_s": run.period, "late_after_s": after}
+    return {
+        **times,
+        "joints": list(run.joint_names),
+        **{name: _plain(np.asarray(value).tolist()) for name, value in figures.items()},
+    }
+
+
+def _from(run: Run, after: float) -> np.ndarray:
+    """The rows from the time `after` on."""
+    if not 0.0 <= after < run.t[-1]:
+        raise ArgumentError(f"after is {after} s, expected a time in [0, {run.t[-1]:g}) s, inside the run.")
+    return run.t >= after - 1e-9 * run.period
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(x) for x in value]
+    return value if math.isfinite(value) else None

@@ -1,0 +1,216 @@
+"""MuJoCo as a plant, built from the same URDF bytes as the Pinocchio model (the only room that imports mujoco)."""
+
+import logging
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.checks import all_finite
+from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.robots.robot import Robot
+from nbs_pin.simulation.plant import Plant
+
+_SCRATCH = ("_data", "_qpos", "_qvel", "_torque", "_warnings")
+_LOGGER = logging.getLogger("nbs_pin.mujoco")
+MujocoIntegrator: TypeAlias = Literal["rk4", "euler", "implicitfast"]
+JointFrictionChoice: TypeAlias = Literal["drop", "keep"] | JointFriction
+
+_INTEGRATORS = {
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+_OFF = mujoco.mjtDisableBit
+# Left on, autoreset silently puts a diverged arm back to its start, and a warm start makes a step depend on the last.
+_ALWAYS_OFF = _OFF.mjDSBL_AUTORESET | _OFF.mjDSBL_WARMSTART | _OFF.mjDSBL_ACTUATION
+_ALL_BUT_FRICTION = _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_CONTACT | _OFF.mjDSBL_EQUALITY  # dry friction is a constraint
+# MuJoCo's default lets a tenth of the free acceleration through dry friction, so that a light joint never really
+# sticks nor slides; its hardest setting is Coulomb friction to 1e-4 of the torque.
+_DRY_FRICTION_SOLREF = (0.002, 1.0)
+_DRY_FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+
+
+class MujocoPlant(Plant):
+    """The arm in MuJoCo: same inertias, joint axes and gravity; no contacts, position limits or effort clamps.
+
+    integrator: "rk4" (fourth order), "euler" (semi-implicit) or "implicitfast" (semi-implicit, damping implicit); None
+    takes "rk4" without friction and "implicitfast" with it, since joint damping can be too stiff for explicit steps.
+    joint_friction: "drop" leaves out the URDF's damping and dry friction, as Pinocchio does; "keep" has MuJoCo apply
+    both, the dry friction as its hardest constraint; a `JointFriction` takes their place (its transition is not used).
+    Effort limits belong to `simulate`. MuJoCo's own warnings become SimulationDiverged here; for the whole process they
+    go to the logger "nbs_pin.mujoco" in place of a file in the working directory. Each plant owns one scratch
+    `mujoco.MjData`: use one plant per thread.
+    Raises ArgumentError for an unknown choice and RobotError for an arm that MuJoCo cannot build.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        integrator: MujocoIntegrator | None = None,
+        joint_friction: JointFrictionChoice = "drop",
+    ) -> None:
+        integrator = integrator or ("rk4" if joint_friction == "drop" else "implicitfast")
+        if integrator not in _INTEGRATORS:
+            raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(_INTEGRATORS)}.")
+        if isinstance(joint_friction, JointFriction):
+            friction_of_size(joint_friction, robot.nv)
+        elif joint_friction not in ("drop", "keep"):
+            raise ArgumentError(f"joint_friction '{joint_friction}' is unknown; give 'drop' or 'keep'.")
+        mujoco.set_mju_user_warning(_LOGGER.info)
+        self._robot = robot
+        self.integrator = integrator
+        self.joint_friction = joint_friction
+        self.model = build_model(robot, integrator, joint_friction)
+        ids = [self.model.joint(name).id for name in robot.joint_names]
+        self._at_q = _in_order(self.model.jnt_qposadr[ids])
+        self._at_v = _in_order(self.model.jnt_dofadr[ids])
+        self._bind()
+
+    def _bind(self) -> None:
+        self._data = mujoco.MjData(self.model)
+        # Live arrays, fetched once: every access through the data would make them anew.
+        self._qpos, self._qvel, self._torque = self._data.qpos, self._data.qvel, self._data.qfrc_applied
+        self._warnings = self._data.warning.number
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled and copied: everything but MuJoCo's scratch data, which is no part of the plant's value."""
+        return {name: value for name, value in self.__dict__.items() if name not in _SCRATCH}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Back from a pickle, with scratch data of its own."""
+        self.__dict__.update(state)
+        mujoco.set_mju_user_warning(_LOGGER.info)
+        self._bind()
+
+    def __repr__(self) -> str:
+        return f"MujocoPlant({self._robot.name}, {self.integrator}, joint_friction={self.joint_friction})"
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self._robot.nv
+
+    @property
+    def robot(self) -> Robot:
+        """The arm."""
+        return self._robot
+
+    def step(
+        self,
+        q: Float[np.ndarray, "*batch n"],
+        v: Float[np.ndarray, "*batch n"],
+        tau: Float[np.ndarray, "*batch n"],
+        duration: float,
+    ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"]]:
+        """State (q, v) after one MuJoCo step of `duration` [s] with τ [N·m] held.
+
+        Raises SimulationDiverged when an input or the result is not finite or MuJoCo counts a warning.
+        """
+        self.model.opt.timestep = duration
+        if q.ndim == 1:
+            return self._step_row(q, v, tau)
+        result = _stack(lambda *row: np.array(self._step_row(*row)), q, v, tau)
+        return result[..., 0, :], result[..., 1, :]
+
+    def acceleration(
+        self,
+        q: Float[np.ndarray, "*batch n"],
+        v: Float[np.ndarray, "*batch n"],
+        tau: Float[np.ndarray, "*batch n"],
+    ) -> Float[np.ndarray, "*batch n"]:
+        """v̇ [rad/s²] that MuJoCo's forward dynamics gives the torque τ [N·m]."""
+        return _stack(lambda *row: self._forward(*row).qacc[self._at_v].copy(), q, v, tau)
+
+    def bias(self, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n"]:
+        """C(q, v) v + G(q) [N·m], without joint friction."""
+        return _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v].copy(), q, v, np.zeros_like(v))
+
+    def mass_matrix(self, q: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n n"]:
+        """M(q) [kg·m²]."""
+        return _stack(self._mass_matrix_row, q, np.zeros_like(q), np.zeros_like(q))
+
+    def _mass_matrix_row(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        full = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, self._forward(q, v, tau), full)
+        return full[self._at_v][:, self._at_v]
+
+    def _forward(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> mujoco.MjData:
+        self._set(q, v, tau)
+        mujoco.mj_forward(self.model, self._data)
+        self._check_warnings()
+        return self._data
+
+    def _step_row(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self._set(q, v, tau)
+        mujoco.mj_step(self.model, self._data)
+        self._check_warnings()
+        row = self._qpos[self._at_q].copy(), self._qvel[self._at_v].copy()
+        if not (all_finite(row[0]) and all_finite(row[1])):
+            raise SimulationDiverged(
+                f"{self!r} left the finite numbers; take a shorter plant step, or look for an unstable controller."
+            )
+        return row
+
+    def _set(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
+        # MuJoCo reads a torque that is not a number as zero and goes on, so it must never see one.
+        if not (all_finite(q) and all_finite(v) and all_finite(tau)):
+            raise SimulationDiverged(
+                f"{self!r} was given q = {q}, v = {v}, torque = {tau}, expected finite numbers; look for their source."
+            )
+        self._qpos[self._at_q] = q
+        self._qvel[self._at_v] = v
+        self._torque[self._at_v] = tau
+
+    def _check_warnings(self) -> None:
+        if np.count_nonzero(self._warnings):
+            kind = int(np.flatnonzero(self._warnings)[0])
+            cause = mujoco.mju_warningText(kind, int(self._data.warning.lastinfo[kind]))
+            mujoco.mj_resetData(self.model, self._data)
+            raise SimulationDiverged(
+                f"{self!r}: {cause} Take a shorter plant step, or look for an unstable controller."
+            )
+
+
+def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: JointFrictionChoice) -> mujoco.MjModel:
+    """MuJoCo's model of the arm, from its URDF without shapes; raises RobotError when it cannot be built.
+
+    It goes through `MjSpec` and never through MuJoCo's own XML, which prints six digits.
+    """
+    other: dict[str, tuple[float, float]] = {}
+    if isinstance(joint_friction, JointFriction):
+        pairs = zip(joint_friction.viscous.tolist(), joint_friction.coulomb.tolist(), strict=True)
+        other = dict(zip(robot.joint_names, pairs, strict=True))
+    try:
+        spec = mujoco.MjSpec.from_string(robot.urdf.without_geometry().decode())
+        for joint in spec.joints:
+            if joint_friction != "keep":
+                viscous, dry = other.get(joint.name, (0.0, 0.0))
+                joint.damping, joint.frictionloss = np.array([viscous, 0.0, 0.0]), dry
+            joint.solref_friction, joint.solimp_friction = _DRY_FRICTION_SOLREF, _DRY_FRICTION_SOLIMP
+        spec.option.gravity = robot.gravity_vector
+        spec.option.integrator = _INTEGRATORS[integrator]
+        off = _OFF.mjDSBL_CONSTRAINT if joint_friction == "drop" else _ALL_BUT_FRICTION
+        spec.option.disableflags = _ALWAYS_OFF | off
+        return spec.compile()
+    except ValueError as error:
+        raise RobotError(
+            f"{robot.source}: MuJoCo cannot build this arm ({error}); correct that link or joint."
+        ) from error
+
+
+def _in_order(addresses: np.ndarray) -> np.ndarray | slice:
+    """The addresses, or for 0, 1, 2, … the whole slice, which needs no gathering."""
+    return slice(None) if np.array_equal(addresses, np.arange(addresses.size)) else addresses
+
+
+def _stack(function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
+    """`function` of each row of arrays of one batch shape, stacked with that shape."""
+    first = arrays[0]
+    if first.ndim == 1:
+        return function(*arrays)
+    rows = [function(*row) for row in zip(*(x.reshape(-1, x.shape[-1]) for x in arrays), strict=True)]
+    return np.array(rows).reshape(first.shape[:-1] + rows[0].shape)

@@ -1,0 +1,259 @@
+"""The closed loop as one differentiable function: parameters and starts in, motions out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import nn
+from torch.autograd.function import once_differentiable
+
+from nbs_pin.base.checks import floats
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference, Run
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.rollouts import INTEGRATOR_CODES, Scene, rollout, rollout_adjoint, rollout_workspace
+from nbs_pin.kernels.threads import over_cores
+from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.robots.robot import configuration_difference
+from nbs_pin.simulation.costs import StageCost
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.loop import Loop
+
+Engine: TypeAlias = Literal["kernels", "torch"]
+"""Compiled kernels with adjoints written by hand, or the law and the plant in torch as they are written."""
+
+
+_TOGETHER = 256  # gradients of so many starts are kept apart, so that no thread waits and their sum is always the same
+
+
+class Motions(NamedTuple):
+    """Closed-loop motions from B starts over T periods, all differentiable."""
+
+    q: Float[torch.Tensor, "B T+1 n"]
+    """Configurations at the control instants [rad]."""
+    v: Float[torch.Tensor, "B T+1 n"]
+    """Velocities [rad/s]."""
+    command: Float[torch.Tensor, "B T n"]
+    """Torques asked for [N·m], before the limits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What B closed-loop motions begin with and aim at; `of` makes it."""
+
+    loop: Loop
+    leads: Float[np.ndarray, " T"]
+    """How far ahead of each instant the law is evaluated [s]."""
+    aims: Float[np.ndarray, "B T 4 n"]
+    """a_d now, and q_d, v_d, a_d where the law looks."""
+    desired: Float[np.ndarray, "B T+1 3 n"]
+    """q_d, v_d, a_d at the control instants."""
+    q0: Float[np.ndarray, "B n"]
+    """Starts [rad]."""
+    v0: Float[np.ndarray, "B n"]
+    """Velocities at the start [rad/s]."""
+    tau_d: Float[np.ndarray, "B T n"]
+    """Disturbance held over each period [N·m]."""
+
+    @classmethod
+    def of(cls, loop: Loop, reference: DesiredMotion, q0: Any = None, v0: Any = None, tau_d: Any = None) -> "Batch":
+        """Motions along one reference from q0, v0 (B, n): at rest without v0, on the reference without both.
+
+        tau_d: a constant torque, a number or (n,), or None. Raises ArgumentError for starts that do not fit.
+        """
+        _, leads, desired, target = loop.schedule(reference)
+        q, v = (np.array(x).reshape(-1, loop.plant.nv) for x in loop.start(reference, q0, v0))
+        aim = np.stack([desired.a, target.q, target.v, target.a], axis=1)[:-1]
+        aims, wanted = (np.tile(x, (len(q), 1, 1, 1)) for x in (aim, np.stack(desired, axis=1)))
+        torque = np.zeros((len(q), loop.steps, loop.plant.nv)) + _constant_torque(tau_d, loop.plant.nv)
+        return cls(loop, leads[:-1], aims, wanted, q, v, torque)
+
+    @classmethod
+    def joined(cls, batches: Sequence["Batch"]) -> "Batch":
+        """All motions of batches of one loop, one after the other."""
+        named = ("aims", "desired", "q0", "v0", "tau_d")
+        joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in batches]) for name in named}
+        return replace(batches[0], **joined)
+
+    def beginning(self) -> "Batch":
+        """The first period of the first motion."""
+        one = {name: getattr(self, name)[:1] for name in ("q0", "v0")}
+        rows = {name: getattr(self, name)[:1, :k] for name, k in (("aims", 1), ("desired", 2), ("tau_d", 1))}
+        first: dict[str, Any] = {name: np.ascontiguousarray(x) for name, x in (one | rows).items()}
+        return replace(self, leads=self.leads[:1], **first)
+
+    def __len__(self) -> int:
+        return len(self.q0)
+
+
+def engine_for(controller: Controller, loop: Loop) -> Engine:
+    """The fastest engine that computes this very loop: kernels where law, belief and plant have them."""
+    return "torch" if _scene(controller, loop) is None or not _on_cpu(controller) else "kernels"
+
+
+def motions(
+    controller: Controller,
+    batch: Batch,
+    engine: Engine | None = None,
+    tau_d: Float[torch.Tensor, "B T n"] | None = None,
+) -> Motions:
+    """The motions of the batch under the controller, differentiable in its parameters and in the disturbance.
+
+    engine: None takes `engine_for`; the two agree to 1e-9, in values and in gradients. tau_d: takes the place of the
+    batch's disturbance [N·m].
+    Raises ArgumentError for kernels where there are none, or a plant that cannot be differentiated.
+    """
+    check_plant(batch.loop)
+    engine = engine_for(controller, batch.loop) if engine is None else engine
+    torque = torch.as_tensor(batch.tau_d) if tau_d is None else tau_d
+    if torque.shape != batch.tau_d.shape or torque.dtype != torch.float64:
+        raise ArgumentError(
+            f"tau_d is {torque.dtype} of shape {tuple(torque.shape)}, expected float64 of shape {batch.tau_d.shape};"
+            " give a torque for every motion, period and joint."
+        )
+    if engine == "torch":
+        return _by_torch(controller, batch, torque)
+    scene = _scene(controller, batch.loop)
+    if scene is None or not _on_cpu(controller):
+        raise ArgumentError(
+            f"{type(controller).__name__} on {batch.loop.plant!r} has no kernels; take engine='torch', as any law can."
+        )
+    law = controller.packed_law(numpy=False)
+    return Motions(*_ByKernels.apply(law.weights, torque, law.layout, batch, scene))  # type: ignore[no-untyped-call]
+
+
+def running_cost(motion: Motions, batch: Batch, cost: StageCost) -> Float[torch.Tensor, " B"]:
+    """∫ l(z1, v − v_d, τ) dt of each motion: the state a period leads to, and the torque asked for during it."""
+    robot = batch.loop.plant.robot
+    q_ref, v_ref = (torch.as_tensor(batch.desired[:, 1:, k]).to(motion.q) for k in (0, 1))
+    z1 = configuration_difference(motion.q[:, 1:], q_ref, None if robot is None else robot.continuous)
+    return batch.loop.period * cost(z1, motion.v[:, 1:] - v_ref, motion.command).sum(-1)
+
+
+def recorded(motion: Motions, batch: Batch, controller: str) -> Run:
+    """The motions as a run, one start beside the other; its last row repeats the last torque."""
+    loop = batch.loop
+    q, v, command = (x.detach().cpu().numpy().swapaxes(0, 1) for x in motion)
+    desired = Reference(*np.moveaxis(batch.desired, 2, 0).swapaxes(1, 2))
+    run = loop.blank_run(loop.period * np.arange(loop.steps + 1.0), desired, batch.q0, batch.v0, controller)
+    run.q[:], run.v[:] = q, v
+    run.tau_command[:] = np.concatenate([command, command[-1:]])
+    run.tau[:] = np.clip(run.tau_command, -loop.limit, loop.limit)
+    run.disturbance[:-1] = batch.tau_d.swapaxes(0, 1)
+    return run
+
+
+def check_plant(loop: Loop) -> None:
+    """Raises ArgumentError unless the plant is one that can be differentiated."""
+    if not isinstance(loop.plant, DynamicsPlant):
+        raise ArgumentError(
+            f"{loop.plant!r} has no derivatives; train on DynamicsPlant(PinocchioDynamics(robot)), whose motions are"
+            " MuJoCo's to 1e-10, and try the result on this plant."
+        )
+
+
+def _on_cpu(controller: Any) -> bool:
+    return all(p.device.type == "cpu" for p in controller.parameters())
+
+
+def _constant_torque(tau_d: Any, nv: int) -> np.ndarray:
+    """The torque as an array; raises ArgumentError unless it is finite, a number or one per joint."""
+    torque = floats("disturbance", 0.0 if tau_d is None else tau_d)
+    if torque.shape not in ((), (nv,)) or not np.isfinite(torque).all():
+        raise ArgumentError(f"disturbance is {tau_d}, expected one finite torque or {nv}, one per joint [N·m].")
+    return torque
+
+
+def _scene(controller: Controller, loop: Loop) -> Scene | None:
+    """What the kernels need to know of this loop, or None when one of its parts has no kernel."""
+    plant = loop.plant
+    if type(plant) is not DynamicsPlant or not controller.packable:
+        return None
+    truth = plant.dynamics.packed_tree()
+    belief = controller.dynamics.packed_tree() if isinstance(controller, ModelLaw) else truth
+    if truth is None or belief is None:
+        return None
+    n, friction = plant.nv, plant.friction
+    return Scene(
+        clock=np.array([loop.period, loop.step, 1.0 if friction is None else friction.transition]),
+        counts=np.array([INTEGRATOR_CODES[plant.integrator], loop.substeps]),
+        limit=loop.limit,
+        friction=np.zeros((2, n)) if friction is None else np.array([friction.viscous, friction.coulomb]),
+        belief=tuple(belief),
+        truth=tuple(truth),
+    )
+
+
+class _ByKernels(torch.autograd.Function):
+    """One rollout per start, each on any core; a start's share of the gradient is its own until all are summed."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, weights: torch.Tensor, torque: torch.Tensor, layout: np.ndarray, batch: Batch, scene: Scene
+    ) -> tuple[torch.Tensor, ...]:
+        tau_d = np.ascontiguousarray(torque.detach().numpy())
+        count, steps, n = tau_d.shape
+        law = Packed(layout, np.ascontiguousarray(weights.detach().numpy()))
+        q, v = np.empty((2, count, steps + 1, n))
+        command, memory = np.empty((count, steps, n)), np.empty((count, steps + 1, 2, n))
+        q[:, 0], v[:, 0] = batch.q0, batch.v0
+        size = rollout_workspace(law, scene)
+
+        def run(part: slice) -> None:
+            work = np.zeros(size)
+            for k in range(count)[part]:
+                rollout(batch.aims[k], batch.leads, tau_d[k], scene, *law, work, q[k], v[k], command[k], memory[k])
+
+        over_cores(run, count, fewest=1)
+        ctx.saved = law, batch, tau_d, scene, q, v, command, memory
+        return torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(command)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        law, batch, tau_d, scene, q, v, command, memory = ctx.saved
+        q_bar, v_bar, command_bar = (np.array(x.numpy(), order="C") for x in cotangents)
+        tau_d_bar, total = np.empty(command.shape), np.zeros(len(law.weights))
+        weights_bar = np.empty((min(len(batch), _TOGETHER), len(law.weights)))
+        size = rollout_workspace(law, scene)
+
+        def run(part: slice) -> None:
+            work = np.zeros(size)
+            for k in range(first, len(batch))[part]:
+                rollout_adjoint(
+                    batch.aims[k], batch.leads, tau_d[k], scene, *law, q[k], v[k], command[k], memory[k], work,
+                    q_bar[k], v_bar[k], command_bar[k], tau_d_bar[k], weights_bar[k - first],
+                )  # fmt: skip
+
+        for first in range(0, len(batch), _TOGETHER):
+            together = min(_TOGETHER, len(batch) - first)
+            weights_bar[:] = 0.0
+            over_cores(run, together, fewest=1)
+            total += weights_bar[:together].sum(axis=0)
+        return torch.from_numpy(total), torch.from_numpy(tau_d_bar), None, None, None
+
+
+def _by_torch(controller: Controller, batch: Batch, tau_d: torch.Tensor) -> Motions:
+    """The same loop as it is written, one torch operation after the other."""
+    loop, plant = batch.loop, cast(DynamicsPlant, batch.loop.plant)
+    parameters: list[Any] = list(controller.parameters()) if isinstance(controller, nn.Module) else []
+    device = parameters[0].device if parameters else torch.device("cpu")
+    given = (batch.aims, batch.q0, batch.v0, loop.limit, tau_d)
+    aims, q, v, limit, tau_d = (torch.as_tensor(x, device=device) for x in given)
+    memory = controller.initial_memory(q)
+    states, commands = [(q, v)], []
+    for k, lead in enumerate(batch.leads.tolist()):
+        a, *aim = aims[:, k].unbind(1)
+        seen = q + lead * (v + 0.5 * lead * a), v + lead * a
+        command, memory = controller.step(memory, *seen, Reference(*aim), loop.period)
+        tau = torch.clamp(command, -limit, limit) + tau_d[:, k]
+        for _ in range(loop.substeps):
+            q, v = plant.step(q, v, tau, loop.step)
+        states.append((q, v))
+        commands.append(command)
+    return Motions(*(torch.stack(list(x), dim=1) for x in (*zip(*states, strict=True), commands)))

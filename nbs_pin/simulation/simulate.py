@@ -1,0 +1,269 @@
+"""The one time loop: a controller, a reference and a plant make a Run."""
+
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+
+from nbs_pin.base.checks import all_finite
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.base.progress import tracked
+from nbs_pin.base.records import Reference, Run
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.motions.disturbances import Disturbance, TorqueNoise
+from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.simulation.loop import Loop
+from nbs_pin.simulation.plant import Plant
+
+_MEMORY = "/dev/shm"
+_RECORDED = ("q", "v", "tau", "tau_command", "disturbance")
+
+
+def simulate(
+    plant: Plant,
+    controller: Controller,
+    reference: DesiredMotion,
+    duration: float,
+    period: float,
+    *,
+    q0: Any = None,
+    v0: Any = None,
+    plant_step: float | None = None,
+    effort_limit: Any = None,
+    disturbance: Disturbance | None = None,
+    lookahead: float | None = None,
+    workers: int = 1,
+    progress: bool = False,
+) -> Run:
+    """The motion of `plant` under `controller` following `reference` for `duration` [s].
+
+    Every `period` [s] the controller, in its compiled form, sees the state and the reference; its torque is clipped to
+    the effort limits and held until the next instant, while the plant takes steps of `plant_step` [s] under τ + τ_d.
+
+    duration: a whole number of periods. period: a whole number of plant steps; without `plant_step`, the longest step
+    of at most 1 ms that divides it.
+    q0, v0: start [rad], [rad/s]. Without q0 the start is the reference's (q and v); with q0 and no v0 it is at rest.
+    Leading axes of q0 simulate many starts at once.
+    effort_limit: largest |τ| [N·m], a number or one per joint; None takes the arm's (`plant.robot`), inf for none.
+    disturbance: τ_d(t, q, v) [N·m], evaluated at every plant step and held over it (`disturbances.py`, any callable).
+    lookahead: how far [s] ahead the controller is evaluated, on the reference of that time and the state predicted with
+    the reference's acceleration. A held torque acts half a period late on average, so None takes half a period, which
+    removes that lag (the tracking error of a panda at 1 kHz falls tenfold); 0 is the plain sampled law.
+    workers: processes that share the starts along the first axis of q0. `TorqueNoise` is then the one of all starts
+    together; any other disturbance is called with the starts of its own process.
+    progress: show a progress bar when it takes longer than 2 s at a terminal.
+
+    Raises ArgumentError for arguments that do not fit each other, and SimulationDiverged, naming the time, when the
+    controller's torque or the state is not finite or the engine warns.
+    """
+    if workers < 1 or workers != int(workers):
+        raise ArgumentError(f"workers is {workers}, expected a whole number of processes ≥ 1; correct it.")
+    loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
+    start = loop.start(reference, q0, v0)
+    if workers > 1:
+        return _shared(loop, reference, start, int(workers))
+    return _block(loop, reference, 0, loop.steps, start, None, progress)[0]
+
+
+def _shared(loop: "_Closed", reference: DesiredMotion, start: tuple[np.ndarray, np.ndarray], workers: int) -> Run:
+    """The run of slices of the starts in processes of their own, joined along the first batch axis."""
+    q0, v0 = start
+    if q0.ndim < 2:
+        raise ArgumentError(f"workers share starts, and q0 has shape {q0.shape}; give q0 of shape (starts, ..., nv).")
+    bounds = np.linspace(0, len(q0), min(workers, len(q0)) + 1).astype(int).tolist()
+    shares = list(pairwise(bounds))
+    shape = (len(_RECORDED), loop.steps + 1, *q0.shape)
+    with tempfile.TemporaryDirectory(dir=_roomy(8 * math.prod(shape))) as folder:
+        # One file that every process writes its starts into; its pages stay while the run refers to them.
+        file = str(Path(folder) / "run.npy")
+        rows = np.lib.format.open_memmap(file, mode="w+", dtype=float, shape=shape)
+        jobs = [
+            joblib.delayed(_share)(file, (first, end), _of_starts(loop, first, end, len(q0)), reference, q0, v0)
+            for first, end in shares
+        ]
+        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            runs = joblib.Parallel(n_jobs=workers)(jobs)
+    references = {name: _tiled(getattr(runs[0], name), rows[0].shape) for name in ("q_ref", "v_ref", "a_ref")}
+    return replace(runs[0], **{name: np.asarray(row) for name, row in zip(_RECORDED, rows, strict=True)}, **references)
+
+
+def _roomy(size: int) -> str | None:
+    """Memory as a folder if there is one with room for `size` bytes, else None for the usual place."""
+    return _MEMORY if os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > 2 * size else None
+
+
+def _of_starts(loop: "_Closed", first: int, end: int, count: int) -> "_Closed":
+    """The loop for some of `count` starts: noise is the one those starts have among all of them."""
+    noise = loop.disturbance
+    return replace(loop, disturbance=replace(noise, share=(first, end, count))) if type(noise) is TorqueNoise else loop
+
+
+def _share(
+    file: str, share: tuple[int, int], loop: "_Closed", reference: DesiredMotion, q0: np.ndarray, v0: np.ndarray
+) -> Run:
+    """One worker's simulation: what differs from start to start goes into the file, the first start comes back."""
+    own = slice(*share)
+    run, _ = _block(loop, reference, 0, loop.steps, (q0[own], v0[own]), None, False)
+    rows = np.lib.format.open_memmap(file, mode="r+")
+    for row, name in zip(rows, _RECORDED, strict=True):
+        row[:, own] = getattr(run, name)
+    return replace(run, **{name: getattr(run, name)[:, :1] for name in (*_RECORDED, "q_ref", "v_ref", "a_ref")})
+
+
+def _tiled(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return np.array(np.broadcast_to(x, shape))
+
+
+def stream(
+    plant: Plant,
+    controller: Controller,
+    reference: DesiredMotion,
+    duration: float,
+    period: float,
+    *,
+    block: int = 1000,
+    q0: Any = None,
+    v0: Any = None,
+    plant_step: float | None = None,
+    effort_limit: Any = None,
+    disturbance: Disturbance | None = None,
+    lookahead: float | None = None,
+    progress: bool = False,
+) -> Iterator[Run]:
+    """`simulate` without keeping what is past: one Run per `block` control periods, for hours of motion.
+
+    Each run begins at the instant and in the state in which the one before ended, and all of them together are the run
+    that `simulate` gives, for a controller whose `step` depends on its arguments alone: at the border of two blocks it
+    is asked twice. Arguments and errors are those of `simulate`.
+    """
+    loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
+    if block < 1:
+        raise ArgumentError(f"block is {block} periods, expected at least one; 1000 is usual.")
+    return _blocks(loop, reference, loop.start(reference, q0, v0), block, progress)
+
+
+def _blocks(
+    loop: "_Closed", reference: DesiredMotion, state: tuple[np.ndarray, np.ndarray], block: int, progress: bool
+) -> Iterator[Run]:
+    memory = None
+    for first in tracked(range(0, loop.steps, block), "simulating", progress):
+        run, memory = _block(loop, reference, first, min(block, loop.steps - first), state, memory, False)
+        state = run.q[-1].copy(), run.v[-1].copy()  # the run itself is its reader's
+        yield run
+
+
+@dataclass(frozen=True, eq=False)
+class _Closed(Loop):
+    """A loop with what closes it."""
+
+    law: Controller
+    name: str
+    disturbance: Disturbance | None
+
+
+def _closed(
+    plant: Plant,
+    controller: Controller,
+    duration: float,
+    period: float,
+    plant_step: float | None,
+    effort_limit: Any,
+    lookahead: float | None,
+    disturbance: Disturbance | None,
+) -> _Closed:
+    settings = {"plant_step": plant_step, "effort_limit": effort_limit, "lookahead": lookahead}
+    loop = Loop.of(plant, controller.nv, duration, period, **settings)
+    return _Closed(**vars(loop), law=_compiled(controller), name=type(controller).__name__, disturbance=disturbance)
+
+
+def _compiled(controller: Controller) -> Controller:
+    """The compiled form; the controller itself where `compile` is another base's method, as torch.nn.Module's."""
+    law = controller.compile()
+    return law if isinstance(law, Controller) else controller
+
+
+def _block(
+    loop: _Closed,
+    reference: DesiredMotion,
+    first: int,
+    steps: int,
+    start: tuple[np.ndarray, np.ndarray],
+    memory: Any,
+    progress: bool,
+) -> tuple[Run, Any]:
+    """The rows of `steps` periods from the instant number `first` on, and the controller's memory at their end."""
+    times, ahead, desired, target = loop.schedule(reference, first, steps)
+    leads = ahead.tolist()
+    run = loop.blank_run(times, desired, *start, controller=loop.name)
+    memory = loop.law.initial_memory(run.q[0]) if first == 0 else memory
+    # Overflow needs no warning here: every torque and every state is checked, and reported with its time.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in tracked(range(steps), "simulating", progress):
+            tau, memory = _control(loop, run, k, leads[k], target, memory)
+            run.q[k + 1], run.v[k + 1] = _advance(loop, run, k, tau)
+        _control(
+            loop, run, steps, leads[steps], target, memory
+        )  # recorded, and asked for again by whoever goes on from here
+    return run, memory
+
+
+def _control(loop: _Closed, run: Run, k: int, lead: float, target: Reference, memory: Any) -> tuple[np.ndarray, Any]:
+    """The torque of row k, seen `lead` [s] ahead and written into the run, and the memory after it."""
+    q, v, tau, dv = run.q[k], run.v[k], run.tau[k], lead * run.a_ref[k]
+    aim = Reference(target.q[k], target.v[k], target.a[k])
+    command, memory = loop.law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, loop.period)
+    # Finite before clipped: a clip can turn a torque that is not a number into full effort.
+    run.tau_command[k] = command = _checked(command, q.shape, loop.name, float(run.t[k]))
+    np.maximum(np.minimum(command, loop.limit, out=tau), -loop.limit, out=tau)
+    return tau, memory
+
+
+def _advance(loop: _Closed, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The state one period after row k; the disturbance at its start goes into the run."""
+    q, v, t, step = run.q[k], run.v[k], float(run.t[k]), loop.step
+    try:
+        for j in range(loop.substeps):
+            total = tau
+            if loop.disturbance is not None:
+                torque = _disturbance(loop.disturbance, t + j * step, q, v)
+                total = tau + torque
+                if j == 0:
+                    run.disturbance[k] = torque
+            q, v = loop.plant.step(q, v, total, step)
+    except SimulationDiverged as error:
+        raise SimulationDiverged(f"after t = {t:g} s: {error}") from error
+    return q, v
+
+
+def _checked(command: Any, shape: tuple[int, ...], name: str, t: float) -> np.ndarray:
+    command = np.asarray(command, dtype=float)
+    if command.shape != shape:
+        raise ArgumentError(
+            f"{name} gave a torque of shape {command.shape} at t = {t:g} s, expected {shape}; "
+            "a controller returns one torque per joint for every start."
+        )
+    if not all_finite(command):
+        raise SimulationDiverged(
+            f"{name} asked for the torque {command} at t = {t:g} s, expected finite numbers; "
+            "look for a division by zero or an unstable gain."
+        )
+    return command
+
+
+def _disturbance(disturbance: Disturbance, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    torque = np.asarray(disturbance(t, q, v), dtype=float)
+    if torque.shape not in (q.shape, q.shape[-1:]):
+        raise ArgumentError(
+            f"the disturbance at t = {t:g} s has shape {torque.shape}, expected {q.shape}; return one torque per joint."
+        )
+    if not all_finite(torque):
+        raise SimulationDiverged(f"the disturbance at t = {t:g} s is {torque}, expected finite torques; correct it.")
+    return torque

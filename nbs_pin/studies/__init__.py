@@ -1,1 +1,0 @@
-"""Whole studies: what the commands of the command line do, as functions."""

@@ -1,0 +1,1 @@
+"""Controllers trained through the closed loop."""

@@ -1,0 +1,70 @@
+"""How parameters move: optimisers by name, each with its schedule, and their state as plain tensors and numbers."""
+
+from collections.abc import Sequence
+from typing import Any, Literal, TypeAlias
+
+import torch
+
+from nbs_pin.base.checks import positive
+from nbs_pin.base.exceptions import ArgumentError
+
+OptimiserName: TypeAlias = Literal["cautious", "adam", "lbfgs"]
+"""Adam that goes back to the best parameters with half the step whenever the cost has risen by `RISE` of theirs;
+Adam with its step halved after every fifth of the epochs, as in the paper; or L-BFGS with a strong Wolfe line search.
+
+A sampled loop has cliffs, where gains become too high for the period and the cost leaps. Adam steps over them and then
+searches on the far side; a line search stops before them for good."""
+LEARNING_RATES: dict[str, float] = {"cautious": 1e-2, "adam": 1e-2, "lbfgs": 1.0}
+"""Step of each unless another is asked for; the paper takes 1e-3 for Adam."""
+RISE = 0.02
+"""Share of the lowest cost by which "cautious" lets the cost rise."""
+STAGES = 5
+
+
+def optimiser(name: str, parameters: Sequence[torch.nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
+    """The optimiser of that name; raises ArgumentError for an unknown one or a rate that is not positive."""
+    positive("learning_rate", learning_rate, "")
+    if name in ("adam", "cautious"):
+        return torch.optim.Adam(parameters, lr=learning_rate)
+    if name == "lbfgs":
+        # One iteration per epoch; its line search takes as many evaluations of the cost as it needs, mostly one.
+        # torch's own tolerances are for costs of about one; costs here are a thousandth, and it would stand still.
+        return torch.optim.LBFGS(
+            parameters,
+            lr=learning_rate,
+            max_iter=1,
+            history_size=20,
+            line_search_fn="strong_wolfe",
+            tolerance_grad=0.0,
+            tolerance_change=1e-16,
+        )
+    raise ArgumentError(f"optimiser '{name}' is unknown; choose one of {', '.join(LEARNING_RATES)}.")
+
+
+def scheduled_rate(name: str, learning_rate: float, epoch: int, epochs: int) -> float:
+    """Adam's step at an epoch: halved after every fifth of the epochs (the paper: every 40 of 200)."""
+    return learning_rate * 0.5 ** (epoch * STAGES // epochs) if name == "adam" else learning_rate
+
+
+def packed_state(state: Any, tensors: dict[str, torch.Tensor], path: str = "optimiser") -> Any:
+    """The nested state of an optimiser as JSON can hold it, its tensors moved into `tensors` under their paths."""
+    if isinstance(state, torch.Tensor):
+        tensors[path] = state.detach().clone()
+        return {"tensor": path}
+    if isinstance(state, dict):
+        return {"dict": [[key, packed_state(value, tensors, f"{path}.{key}")] for key, value in state.items()]}
+    if isinstance(state, list | tuple):
+        return {"list": [packed_state(value, tensors, f"{path}.{k}") for k, value in enumerate(state)]}
+    return {"plain": state}
+
+
+def unpacked_state(packed: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    """What `packed_state` was given."""
+    ((kind, content),) = packed.items()
+    if kind == "tensor":
+        return tensors[content].clone()
+    if kind == "dict":
+        return {key: unpacked_state(value, tensors) for key, value in content}
+    if kind == "list":
+        return [unpacked_state(value, tensors) for value in content]
+    return content

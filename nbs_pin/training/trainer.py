@@ -1,0 +1,302 @@
+"""The epochs of a training: steps, retreats, checkpoints and the best so far."""
+
+import copy
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.base.progress import tracked, waiting
+from nbs_pin.controllers.gain import Gain
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.simulation.costs import StageCost
+from nbs_pin.simulation.rollout import Batch, Engine, motions, running_cost
+from nbs_pin.storage.checkpoints import TrainingState, read_checkpoint, write_checkpoint
+from nbs_pin.storage.descriptions import describe
+from nbs_pin.training.optimisers import RISE, optimiser, packed_state, scheduled_rate, unpacked_state
+
+Regulariser: TypeAlias = Callable[[Any], torch.Tensor]
+"""A price on the controller itself, added to the mean cost of the motions: controller -> scalar tensor."""
+Stop: TypeAlias = Literal["epochs", "patience", "interrupted"]
+"""Why training ended: all epochs done, no progress on the held-out motions, or Ctrl-C."""
+SAVE_EVERY = 10
+"""Epochs between two checkpoints."""
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """What training gave."""
+
+    controller: Any
+    """The controller as it was at its best epoch; the one given to `train` is left alone."""
+    history: Float[np.ndarray, " epochs"]
+    """Mean cost of the training motions, regulariser included, before each epoch's step and after the last."""
+    held_out: Float[np.ndarray, " checked"]
+    """Mean cost of the held-out motions alone, at the same instants; empty without any."""
+    best_epoch: int
+    """Row of the controller that is given: the lowest held-out cost, or the lowest cost without held-out motions."""
+    stopped: Stop
+    """Why it ended."""
+    seconds: float
+    """Wall time, that before a resume included [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is to be made small, and how."""
+
+    controller: Any
+    training: Batch
+    held_out: Batch | None
+    cost: StageCost
+    regulariser: Regulariser | None
+    gains: bool
+    epochs: int
+    optimiser: str
+    learning_rate: float
+    patience: int | None
+    seed: int
+    engine: Engine
+    checkpoint: Path | None
+
+    def value(self, batch: Batch) -> torch.Tensor:
+        """Mean cost of the motions of a batch."""
+        try:
+            motion = motions(self.controller, batch, self.engine)
+        except SimulationDiverged:  # the torch engine's plant; the kernels give NaN
+            return torch.tensor(math.nan, dtype=torch.float64)
+        return running_cost(motion, batch, self.cost).mean()
+
+    def loss(self) -> torch.Tensor:
+        """What the optimiser sees."""
+        value = self.value(self.training)
+        return value if self.regulariser is None else value + self.regulariser(self.controller)
+
+    def warm_up(self) -> None:
+        """Run one period of one motion there and back, so that whatever has to be compiled is."""
+        if self.engine == "kernels":
+            first = self.training.beginning()
+            motions(self.controller, first, self.engine).command.sum().backward()  # type: ignore[no-untyped-call]
+
+    def fingerprint(self) -> str:
+        """Of what a resumed training must have in common with the one that wrote the checkpoint.
+
+        Cost, regulariser, model and plant may be anything callable: they are known by the numbers they give at first.
+        Raises ArgumentError for a controller that no checkpoint can hold.
+        """
+        digest = hashlib.sha256()
+        for batch in (self.training, self.held_out):
+            for array in () if batch is None else (batch.aims, batch.desired, batch.q0, batch.v0, batch.tau_d):
+                digest.update(np.ascontiguousarray(array).tobytes())
+        settings, tensors = describe(self.controller)
+        for tensor in tensors.values():
+            digest.update(tensor.detach().cpu().numpy().tobytes())
+        digest.update(self.training.loop.limit.tobytes())
+        with torch.no_grad():
+            checked = [] if self.held_out is None else [self.value(self.held_out)]
+            first = [f"{float(value):.9g}" for value in (self.loss(), *checked)]
+        loop = self.training.loop
+        stated = (loop.period, loop.substeps, repr(loop.plant), self.gains, self.epochs, self.optimiser, self.engine)
+        digest.update(repr((json.dumps(settings, sort_keys=True), *stated, self.learning_rate, first)).encode())
+        return digest.hexdigest()
+
+
+@dataclass(eq=False)
+class _Progress:
+    """Where training stands between two epochs."""
+
+    epoch: int = 0
+    rate_scale: float = 1.0
+    history: list[float | None] = field(default_factory=list)
+    held_out: list[float | None] = field(default_factory=list)
+    best: dict[str, torch.Tensor] = field(default_factory=dict)
+    best_epoch: int = 0
+    best_score: float = math.inf
+    seconds: float = 0.0
+
+
+class Trainer:
+    """One training, from its first epoch or from a checkpoint."""
+
+    def __init__(self, task: Task, resume: bool, progress: bool) -> None:
+        self.task, self.at = task, _Progress()
+        modules = task.controller.modules()
+        fixed = set() if task.gains else {id(m.change) for m in modules if isinstance(m, Gain)}
+        self.parameters = [p for p in task.controller.parameters() if p.requires_grad and id(p) not in fixed]
+        if not self.parameters:
+            raise ArgumentError("nothing is left to train without the gains; give gains=True.")
+        self.optimiser = self._fresh()
+        self.first: float | None = None
+        with waiting("compiling, once on a machine", progress):
+            task.warm_up()
+        # Before anything is trained: a controller that no checkpoint can hold is known now and not at the first save.
+        self.fingerprint = "" if task.checkpoint is None else task.fingerprint()
+        if resume:
+            self._restore()
+
+    def run(self, progress: bool) -> Training:
+        """The epochs that are left."""
+        stopped: Stop = "epochs"
+        mark = self._mark()
+        began, before = time.perf_counter(), self.at.seconds
+        try:
+            for _ in tracked(range(self.at.epoch, self.task.epochs), self._label, progress):
+                if self.task.patience is not None and self.at.epoch - self.at.best_epoch > self.task.patience:
+                    stopped = "patience"
+                    break
+                mark = self._mark()
+                self._epoch()
+                self.at.seconds = before + time.perf_counter() - began
+                if self.at.epoch % SAVE_EVERY == 0:
+                    self._save()
+            with torch.no_grad():
+                self._note(self.at.epoch, float(self.task.loss()))
+        except KeyboardInterrupt:
+            stopped = "interrupted"
+            self._go_back(mark)
+        self.at.seconds = before + time.perf_counter() - began
+        try:
+            self._save()
+        except KeyboardInterrupt:  # the file holds the epoch it held before, and the result is still given
+            stopped = "interrupted"
+        return self._result(stopped)
+
+    def _label(self) -> str:
+        history = self.at.history
+        return f"training, cost {history[-1]:.4g} from {history[0]:.4g}" if history else "training"
+
+    def _epoch(self) -> None:
+        """One step of the optimiser, or a retreat to the best parameters."""
+        at, task = self.at, self.task
+        for group in self.optimiser.param_groups:
+            group["lr"] = at.rate_scale * scheduled_rate(task.optimiser, task.learning_rate, at.epoch, task.epochs)
+        before, self.first = [p.detach().clone() for p in self.parameters], None
+        try:
+            self.optimiser.step(self._closure)
+            sound = True
+        except _NotFinite:  # at these parameters, or where a line search looked
+            sound = False
+        at.epoch += 1
+        stepped = [p.detach().clone() for p in self.parameters]
+        self._set(before)
+        value = math.nan if self.first is None else self.first
+        self._note(at.epoch - 1, value)
+        if not sound or self._has_risen(value):
+            self._retreat()
+        else:
+            self._set(stepped)
+
+    def _has_risen(self, value: float) -> bool:
+        """Whether "cautious" goes back from this cost."""
+        lowest = self.at.history[self.at.best_epoch]
+        return self.task.optimiser == "cautious" and lowest is not None and value - lowest > RISE * abs(lowest)
+
+    def _closure(self) -> float:
+        self.optimiser.zero_grad()
+        loss = self.task.loss()
+        if not torch.isfinite(loss):
+            raise _NotFinite
+        loss.backward()  # type: ignore[no-untyped-call]
+        if not all(bool(p.grad.isfinite().all()) for p in self.parameters if p.grad is not None):
+            raise _NotFinite
+        value = float(loss.detach())
+        self.first = value if self.first is None else self.first
+        return value
+
+    def _note(self, row: int, value: float) -> None:
+        """Write the cost of the present parameters down, and keep them when they are the best so far."""
+        at, task = self.at, self.task
+        del at.history[row:], at.held_out[row:]  # the last of a training that had ended and goes on
+        at.history.append(value if math.isfinite(value) else None)
+        score = value
+        if task.held_out is not None:
+            with torch.no_grad():
+                score = float(task.value(task.held_out))
+            at.held_out.append(score if math.isfinite(score) else None)
+        if not at.best and not math.isfinite(score):
+            which = "training" if task.held_out is None or not math.isfinite(value) else "held-out"
+            raise SimulationDiverged(
+                f"the {which} motions left the finite numbers before anything was trained; take a shorter period or"
+                " plant step, starts nearer to the reference, or softer gains."
+            )
+        if score < at.best_score:
+            at.best_score, at.best_epoch = score, len(at.history) - 1
+            at.best = {k: x.detach().clone() for k, x in task.controller.state_dict().items()}
+
+    def _retreat(self) -> None:
+        """Back to the best parameters with half the step."""
+        self.at.rate_scale *= 0.5
+        self.task.controller.load_state_dict(self.at.best)
+        self.optimiser = self._fresh()
+
+    def _mark(self) -> tuple[_Progress, list[torch.Tensor], Any, dict[str, torch.Tensor]]:
+        """Where training stands, as `_go_back` takes it: Ctrl-C may come in the middle of a step."""
+        tensors: dict[str, torch.Tensor] = {}
+        state = packed_state(self.optimiser.state_dict(), tensors)
+        at = replace(self.at, history=[*self.at.history], held_out=[*self.at.held_out])
+        return at, [p.detach().clone() for p in self.parameters], state, tensors
+
+    def _go_back(self, mark: tuple[_Progress, list[torch.Tensor], Any, dict[str, torch.Tensor]]) -> None:
+        self.at, values, state, tensors = mark
+        self._set(values)
+        self.optimiser.load_state_dict(unpacked_state(state, tensors))
+
+    def _fresh(self) -> torch.optim.Optimizer:
+        return optimiser(self.task.optimiser, self.parameters, self.task.learning_rate)
+
+    def _set(self, values: list[torch.Tensor]) -> None:
+        with torch.no_grad():
+            for parameter, value in zip(self.parameters, values, strict=True):
+                parameter.copy_(value)
+
+    def _result(self, stopped: Stop) -> Training:
+        at = self.at
+        best = copy.deepcopy(self.task.controller)
+        if at.best:
+            best.load_state_dict(at.best)
+        for parameter in best.parameters():
+            parameter.grad = None
+        history, held_out = (np.array(x, dtype=float) for x in (at.history, at.held_out))
+        return Training(best, history, held_out, at.best_epoch, stopped, at.seconds)
+
+    def _save(self) -> None:
+        if self.task.checkpoint is None or not self.at.history:
+            return
+        tensors = {f"best.{name}": x for name, x in self.at.best.items()}
+        facts = {k: v for k, v in vars(self.at).items() if k != "best"}
+        facts["optimiser"] = packed_state(self.optimiser.state_dict(), tensors)
+        facts["fingerprint"] = self.fingerprint
+        state, info = TrainingState(tensors, facts), {"seed": self.task.seed}
+        write_checkpoint(self.task.checkpoint, self.task.controller, state, info=info)
+
+    def _restore(self) -> None:
+        path = self.task.checkpoint
+        if path is None:
+            raise ArgumentError(
+                "resume was asked for without a checkpoint; give the file of the training to go on with."
+            )
+        law = self.task.controller
+        saved, state = read_checkpoint(path, law.dynamics.robot if isinstance(law, ModelLaw) else None)
+        if state is None or state.facts["fingerprint"] != self.fingerprint:
+            raise ArgumentError(
+                f"{path} is not a checkpoint of this training; give the settings it was begun with, or start afresh."
+            )
+        self.task.controller.load_state_dict(saved.state_dict())
+        facts = dict(state.facts)
+        self.optimiser.load_state_dict(unpacked_state(facts.pop("optimiser"), state.tensors))
+        del facts["fingerprint"]
+        best = {k.removeprefix("best."): x for k, x in state.tensors.items() if k.startswith("best.")}
+        self.at = _Progress(**facts, best=best)
+
+
+class _NotFinite(ArithmeticError):
+    """A cost that is not a number: the motions left the finite numbers."""
