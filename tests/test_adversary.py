@@ -211,5 +211,5 @@ def test_disturbances_of_another_arm_are_refused(two_link):
 
 def test_an_unstable_loop_is_named(two_link):
     """A period far too long for the gains."""
-    with pytest.raises(nbs.exceptions.SimulationDiverged, match="shorter control period"):
+    with pytest.raises(nbs.SimulationDiverged, match="shorter control period"):
         attack(two_link, [5.0, 5.0], reference=Hold([0.3, -0.4]), period=0.5, duration=10.0, rounds=0)

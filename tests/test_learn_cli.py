@@ -140,7 +140,7 @@ def test_missing_data_are_refused(tmp_path, capsys):
 def test_an_arm_whose_description_changed_is_refused(path):
     data = load_dataset(path)
     changed = replace(data, about=data.about | {"robot": data.about["robot"] | {"sha256": "0" * 64}})
-    with pytest.raises(nbs.exceptions.ArgumentError, match="has changed since"):
+    with pytest.raises(nbs.ArgumentError, match="has changed since"):
         learning.arm_of(changed)
     assert learning.arm_of(data).name == "two_link"
     assert learning.arm_of(replace(data, about={})) is None

@@ -1,7 +1,7 @@
 """Runs in the browser: one self-contained page with the arm and a translucent reference arm.
 
 The page carries meshcat's viewer, the arm as meshcat commands that are handled in order, and the poses of its bodies
-by Pinocchio's forward kinematics; a small script of ours (`replay_page.html`) moves them. No server is started, and
+by Pinocchio's forward kinematics; a small script of ours (`replay.html`) moves them. No server is started, and
 the page's own security policy forbids it every connection.
 """
 
@@ -196,5 +196,5 @@ def _page(name: str, data: dict[str, Any]) -> str:
         # "<" would let a name end the script element
         "data": json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
     }
-    template = (importlib.resources.files("nbs_pin") / "replay_page.html").read_text(encoding="utf-8")
+    template = (importlib.resources.files("nbs_pin.reports") / "replay.html").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda hole: holes[hole[1]], template)

@@ -1,1 +1,5 @@
-"""Plants and the closed loop."""
+"""Plants, the sampled closed loop, and figures of its runs."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules={"metrics"})

@@ -1,0 +1,80 @@
+# The public names and their rooms: type checkers and editors read them here, and `__init__.py` imports each at first use.
+
+from .accuracy.compare import ModelErrors as ModelErrors, compare as compare
+from .base.exceptions import (
+    ArgumentError as ArgumentError,
+    CertificateRefused as CertificateRefused,
+    FileFormatError as FileFormatError,
+    MissingExtra as MissingExtra,
+    NbsPinError as NbsPinError,
+    RobotError as RobotError,
+    RobotNotFound as RobotNotFound,
+    SimulationDiverged as SimulationDiverged,
+)
+from .base.records import Reference as Reference, Run as Run
+from .certificates.admissible import Admissible as Admissible
+from .certificates.attack import Attack as Attack, attack as attack
+from .certificates.certify import Certificate as Certificate, certify as certify
+from .certificates.monitor import Monitored as Monitored, monitor as monitor
+from .certificates.online_monitor import Watch as Watch
+from .certificates.propose import Proposal as Proposal, propose as propose
+from .controllers.computed_torque import ComputedTorque as ComputedTorque
+from .controllers.controller import Controller as Controller, MemorylessController as MemorylessController
+from .controllers.damping import Damping as Damping
+from .controllers.neural_backstepping import (
+    NeuralBackstepping as NeuralBackstepping,
+    paper_controller as paper_controller,
+)
+from .controllers.pd import PD as PD
+from .controllers.pid import PID as PID
+from .controllers.potential import Potential as Potential
+from .controllers.slotine_li import SlotineLi as SlotineLi
+from .dynamics.analytic import AnalyticDynamics as AnalyticDynamics
+from .dynamics.equations import (
+    bias as bias,
+    energy as energy,
+    forward_dynamics as forward_dynamics,
+    inverse_dynamics as inverse_dynamics,
+    kinetic_energy as kinetic_energy,
+    reference_torque as reference_torque,
+)
+from .dynamics.friction import JointFriction as JointFriction
+from .dynamics.identified import IdentifiedDynamics as IdentifiedDynamics
+from .dynamics.lagrangian import LagrangianDynamics as LagrangianDynamics
+from .dynamics.pinocchio import PinocchioDynamics as PinocchioDynamics
+from .dynamics.provider import DynamicsProvider as DynamicsProvider
+from .dynamics.residual import ResidualDynamics as ResidualDynamics
+from .identification.collect import collect as collect
+from .identification.datasets import Dataset as Dataset, load_dataset as load_dataset
+from .identification.fit import fit as fit
+from .identification.identify import identify as identify
+from .identification.logs import load_log as load_log
+from .identification.measurement import Noise as Noise
+from .motions.disturbances import (
+    ConstantTorque as ConstantTorque,
+    SinusoidalTorque as SinusoidalTorque,
+    SquareWave as SquareWave,
+    TorqueNoise as TorqueNoise,
+)
+from .motions.reference_files import Sampled as Sampled, load_reference as load_reference
+from .motions.references import (
+    Hold as Hold,
+    MinimumJerk as MinimumJerk,
+    Sinusoid as Sinusoid,
+    check_reference as check_reference,
+    paper_reference as paper_reference,
+)
+from .reports.plotting import plot_tracking as plot_tracking
+from .reports.replay import replay as replay
+from .robots.catalogue import ROBOT_NAMES as ROBOT_NAMES
+from .robots.robot import Robot as Robot, load_robot as load_robot
+from .simulation.costs import TimeOutside as TimeOutside, TorqueAware as TorqueAware, squared_error as squared_error
+from .simulation.dynamics_plant import DynamicsPlant as DynamicsPlant
+from .simulation.mujoco_plant import MujocoPlant as MujocoPlant
+from .simulation.plant import Plant as Plant
+from .simulation.simulate import simulate as simulate, stream as stream
+from .storage.checkpoints import load as load, save as save
+from .training.train import Training as Training, train as train
+from .simulation import metrics as metrics
+
+__version__: str
