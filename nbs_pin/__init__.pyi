@@ -1,4 +1,4 @@
-# The public names and their rooms: type checkers and editors read them here, and `__init__.py` imports each at first use.
+# The public names and their rooms, for type checkers and editors; `__init__.py` imports each name at its first use.
 
 from .accuracy.compare import ModelErrors as ModelErrors, compare as compare
 from .base.exceptions import (
@@ -68,6 +68,7 @@ from .reports.plotting import plot_tracking as plot_tracking
 from .reports.replay import replay as replay
 from .robots.catalogue import ROBOT_NAMES as ROBOT_NAMES
 from .robots.robot import Robot as Robot, load_robot as load_robot
+from .simulation import metrics as metrics
 from .simulation.costs import TimeOutside as TimeOutside, TorqueAware as TorqueAware, squared_error as squared_error
 from .simulation.dynamics_plant import DynamicsPlant as DynamicsPlant
 from .simulation.mujoco_plant import MujocoPlant as MujocoPlant
@@ -75,6 +76,5 @@ from .simulation.plant import Plant as Plant
 from .simulation.simulate import simulate as simulate, stream as stream
 from .storage.checkpoints import load as load, save as save
 from .training.train import Training as Training, train as train
-from .simulation import metrics as metrics
 
 __version__: str

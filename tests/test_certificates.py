@@ -7,21 +7,21 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import nbs_pin as nbs
 from nbs_pin.accuracy.mismatch import mismatch
-from nbs_pin.base.claims import Claim, Condition, Label, weakest
+from nbs_pin.base.claims import Claim, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.certificates import one_joint
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.comparison_system import _STEEPNESS, Comparison, _growth, decay, level, reach
+from nbs_pin.certificates.claims import Condition
+from nbs_pin.certificates.comparison_system import _STEEPNESS, ComparisonSystem, _growth, decay, level, reach
 from nbs_pin.controllers.gains import gains_for_robot
 
 POSITIVE = st.floats(0.05, 20.0)
 CONSTANTS = st.builds(
-    Comparison,
+    ComparisonSystem,
     rho=POSITIVE,
     delta=POSITIVE,
     kappa=POSITIVE,
@@ -121,16 +121,16 @@ def test_the_level_is_the_one_in_closed_form():
     for rho, kappa in ((1.0, 0.3), (1.0, 1.9), (0.5, 4.0)):
         epsilon = 1.0 if kappa <= 2.0 * rho else 2.0 - 2.0 * rho / kappa
         exact = 4.0 / (2.0 * epsilon * min(2.0 * rho, (2.0 - epsilon) * kappa))
-        found = level(Comparison(rho, 1.0, kappa, math.inf, 0.0, 2.0))
+        found = level(ComparisonSystem(rho, 1.0, kappa, math.inf, 0.0, 2.0))
         assert exact * (1.0 - 1e-12) <= found.storage <= 1.01 * exact
-    found = level(Comparison(8.0, 0.1, 0.0, math.inf, 5.0, 2.0))
+    found = level(ComparisonSystem(8.0, 0.1, 0.0, math.inf, 5.0, 2.0))
     assert found.storage == pytest.approx(4.0 / (8.0 * 5.0))
-    assert decay(Comparison(8.0, 0.1, 0.0, math.inf, 5.0, 2.0)) == 10.0
-    assert level(Comparison(8.0, 0.1, 0.0, math.inf, 0.0, 2.0)).storage == math.inf
+    assert decay(ComparisonSystem(8.0, 0.1, 0.0, math.inf, 5.0, 2.0)) == 10.0
+    assert level(ComparisonSystem(8.0, 0.1, 0.0, math.inf, 0.0, 2.0)).storage == math.inf
 
 
 def test_a_models_error_slows_the_decay_until_theorem_4_fails():
-    k = Comparison(2.0, 1.0, 3.0, math.inf, 0.0, 1.0)
+    k = ComparisonSystem(2.0, 1.0, 3.0, math.inf, 0.0, 1.0)
     rates = [decay(dataclasses.replace(k, alpha=a)) for a in (0.0, 0.5, 1.0, 1.9)]
     assert rates == sorted(rates, reverse=True)
     assert rates[-1] > 0.0
@@ -142,7 +142,7 @@ def test_a_models_error_slows_the_decay_until_theorem_4_fails():
 
 def test_the_reach_is_tighter_than_the_level_on_a_panda_with_constant_damping():
     """S = D = 4I, 5 N·m on every joint: 4.43 rad by the level, with the trace bound a₂ = 14.35 kg·m²."""
-    k = Comparison(8.0, 4.0, 4.0 / 14.35, math.inf, 0.0, math.sqrt(175.0 / 4.0))
+    k = ComparisonSystem(8.0, 4.0, 4.0 / 14.35, math.inf, 0.0, math.sqrt(175.0 / 4.0))
     storage = level(k).storage
     assert math.sqrt(storage / 4.0) == pytest.approx(4.43, abs=0.01)
     assert math.sqrt(reach(k, storage) / 4.0) < 1.27
@@ -186,10 +186,10 @@ def test_one_joint_with_networks_stays_inside_its_bound(one_joint_arm, seed):
                 p.copy_(0.05 * torch.rand_like(p))
     z = np.linspace(-2.0, 2.0, 2001)[:, None]
     second = law.potential.terms(z, np.ones_like(z))[2][:, 0] - 1.0
-    bounds = one_joint.curvature(law.potential, 2.0)
+    bounds = law.potential.curvature(2.0)
     assert bounds.low <= second.min() <= second.max() <= bounds.high
     assert bounds.high - bounds.low < 1.2 * (second.max() - second.min()) + 1e-3
-    extra, more = one_joint.extra_damping(law.damping, 2.0), law.damping.matrix(z)[:, 0, 0] - 1.0
+    extra, more = law.damping.excess(2.0), law.damping.matrix(z)[:, 0, 0] - 1.0
     assert extra.low <= more.min() <= more.max() <= extra.high
     certificate = nbs.certify(law, np.array([1.0]))
     found = nbs.attack(law, np.array([1.0]), reference=nbs.Hold(np.zeros(1)), period=0.01, rounds=3, starts=4)
@@ -277,7 +277,7 @@ def test_what_follows_is_known_no_better_than_what_it_rests_on():
 
 
 def nbs_network(robot):
-    from nbs_pin.dynamics.families import make_network
+    from nbs_pin.dynamics.registry import make_network
 
     return make_network("cholesky", [False] * robot.nv, seed=0)
 

@@ -12,12 +12,12 @@ import pytest
 
 import nbs_pin as nbs
 from nbs_pin import cli
-from nbs_pin.base.claims import Assumption
 from nbs_pin.base.records import Run
 from nbs_pin.base.versions import versions
 from nbs_pin.certificates.certify import certify
+from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.loads import friction, gravity_error, payload, total
-from nbs_pin.cli import certifying
+from nbs_pin.commands import certify as certifying
 from nbs_pin.reproduction import certificate_poses, certificate_study
 from nbs_pin.robots.catalogue import find
 

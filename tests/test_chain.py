@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 import nbs_pin as nbs
@@ -22,7 +21,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import coordinates
 from nbs_pin.identification.chain_fit import TreeGeometry, fit_chain
 from nbs_pin.identification.collect import collect
-from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit import fit
 from nbs_pin.identification.identify import explain, identify
 from nbs_pin.identification.levenberg_marquardt import Normal, levenberg_marquardt
@@ -178,7 +177,7 @@ def test_a_massless_tree_is_its_floor(seed, spread):
 
 def chain_of(robot) -> Chain:
     """The arm as a chain: its placements and bodies put in by hand."""
-    truth, (parents, prismatic) = PinocchioDynamics(robot), joint_tree(robot)
+    truth, (parents, prismatic) = PinocchioDynamics(robot), (robot.parents, robot.prismatic)
     weights = truth.packed_tree().weights
     joints = weights[3:].reshape(robot.nv, BODY)
     network = Chain(parents, prismatic, epsilon=1e-12)
@@ -199,7 +198,7 @@ def chain_of(robot) -> Chain:
 def test_with_the_parameters_of_an_arm_the_chain_is_the_arm(name):
     """Every arm is in the class."""
     robot = load_robot(name)
-    truth, (_, prismatic) = PinocchioDynamics(robot), joint_tree(robot)
+    truth, (_, prismatic) = PinocchioDynamics(robot), (robot.parents, robot.prismatic)
     network = chain_of(robot)
     model = LagrangianDynamics(network)
     assert errors(model, truth, prismatic).max() < 1e-9
@@ -339,7 +338,7 @@ def test_the_regressor_of_a_guess_gives_its_torque(kinds):
 def test_the_regressor_of_an_arms_own_geometry_spans_pinocchios():
     """Joint frames differ in the direction of their axes' x alone: the same torques are linear in both."""
     robot = load_robot("panda")
-    parents, prismatic = joint_tree(robot)
+    parents, prismatic = robot.parents, robot.prismatic
     packed = PinocchioDynamics(robot).packed_tree()
     joints = packed.weights[3:].reshape(robot.nv, BODY)
     guess = TreeGuess(
@@ -525,7 +524,7 @@ def test_any_tree_is_found_from_its_motions(tree, seed):
 def test_the_gantry_is_found_from_its_motions():
     robot = load_robot(GANTRY)
     model = fit(collect(robot, "uniform", 400), "chain", robot=robot)
-    assert errors(model, PinocchioDynamics(robot), joint_tree(robot)[1]).max() < 1e-8
+    assert errors(model, PinocchioDynamics(robot), robot.prismatic).max() < 1e-8
     assert model.report.test_nmse < 1e-16
 
 

@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import nbs_pin as nbs
 from nbs_pin import cli
 from nbs_pin.base.versions import versions
-from nbs_pin.cli import tracking
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_number
+from nbs_pin.commands import track as tracking
 from nbs_pin.simulation import metrics
 
 NBS_PIN = (sys.executable, "-m", "nbs_pin.cli")
@@ -196,7 +195,7 @@ def test_results_of_another_run_are_kept_unless_forced(two_link, capsys):
 # Refusals: exit code 2 and one sentence.
 
 REFUSED = {
-    "": f"Expected one of {{{', '.join(cli.NAMES)}}}",
+    "": f"Expected one of {{{', '.join(cli.COMMANDS)}}}",
     "trak panda": "no command 'trak'; did you mean track?",
     "track": "ROBOT",
     "track pand": "did you mean panda?",
@@ -204,7 +203,7 @@ REFUSED = {
     "track panda x": "cannot use the word 'x'",
     "track panda --durtion 3": "did you mean --duration?",
     "track panda --duration": "Missing value for argument '--duration'",
-    "track panda --plant gazebo": "invalid choice 'gazebo' for argument '--plant'",
+    "track panda --plant gazebo": "--plant is 'gazebo'; give mujoco, pinocchio.",
     "track panda --duration 1.0005": "expected a whole number",
     "track panda --duration 90000 --period 1e-5": "GB",
     "track panda --bandwidth 600": "at most 500 rad/s",
@@ -315,7 +314,7 @@ def test_ctrl_c_while_drawing_keeps_the_old_results_whole(two_link, monkeypatch,
         raise KeyboardInterrupt
 
     before = contents(two_link)
-    monkeypatch.setattr("nbs_pin.reports.replay.replay", interrupted)
+    monkeypatch.setattr("nbs_pin.commands.track.replay", interrupted)
     assert cli.main(["track", "two_link", "--duration", "0.1", "--seed", "9", "--force", "--out", str(two_link)]) == 130
     assert "interrupted" in capsys.readouterr().err
     assert contents(two_link) == before
@@ -374,7 +373,7 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"nbs-pin {nbs.__version__}\n"
 
 
-@pytest.mark.parametrize("command", cli.NAMES)
+@pytest.mark.parametrize("command", cli.COMMANDS)
 def test_the_example_in_each_help_is_a_command(command, capsys):
     assert cli.main([command, "--help"]) == 0
     example = re.search(r"^Example: nbs-pin (.+)$", capsys.readouterr().out, re.MULTILINE)

@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 import nbs_pin as nbs
 from nbs_pin import cli
 from nbs_pin.base.versions import versions
-from nbs_pin.cli import collecting
+from nbs_pin.commands import collect as collecting
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import load_dataset
 from nbs_pin.identification.measurement import Noise

@@ -13,10 +13,11 @@ from nbs_pin import cli
 from nbs_pin.accuracy.compare import compare
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.versions import versions
-from nbs_pin.cli import comparing as comparison
-from nbs_pin.dynamics.families import make_network
+from nbs_pin.commands import compare as comparison
+from nbs_pin.commands.results import Results
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
+from nbs_pin.dynamics.registry import make_network
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.robots.catalogue import find
 
@@ -159,7 +160,7 @@ def test_a_model_whose_law_is_unstable_still_has_its_errors(tmp_path):
     assert result.missing.startswith("the closed loop diverged")
     assert result.errors.mismatch is None
     assert result.errors.gravity > 100.0
-    comparison.write_results(result, robot, tmp_path, {}, "unstable")
+    comparison.write_results(result, robot, Results(tmp_path, {}), "unstable")
     assert summary(tmp_path)["figures"]["no_closed_loop_because"].startswith("the closed loop diverged")
 
 
@@ -168,7 +169,7 @@ def test_an_arm_of_one_joint_has_no_map(tmp_path):
     truth = nbs.PinocchioDynamics(robot)
     result = comparison.compare_models(truth, robot, samples=20, trajectories=0)
     assert result.heat is None
-    comparison.write_results(result, robot, tmp_path, {}, "one joint")
+    comparison.write_results(result, robot, Results(tmp_path, {}), "one joint")
     assert (tmp_path / "errors.png").stat().st_size > 10_000
 
 

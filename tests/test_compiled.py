@@ -10,8 +10,7 @@ import numba
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from nbs_pin.base.arrays import array_namespace
 from nbs_pin.base.exceptions import ArgumentError

@@ -7,15 +7,14 @@ from pathlib import Path
 import jaxtyping
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.identification.collect import collect
-from nbs_pin.identification.datasets import Dataset, joint_tree, load_dataset, trajectory_slices
+from nbs_pin.identification.datasets import Dataset, load_dataset, trajectory_slices
 from nbs_pin.identification.excitation import configuration_box, excitation, torque_limits
 from nbs_pin.identification.logs import load_log
 from nbs_pin.identification.measurement import Noise, derivative, quantised
@@ -202,7 +201,7 @@ def test_the_data_obey_the_arms_equation(name, recipe):
     scale = 1.0 + np.abs(data.tau).max()
     assert torque_error(robot, data).max() < 1e-11 * scale * (1.0 + np.abs(data.a).max())
     assert (np.abs(data.tau) <= robot.effort_limit).all()
-    parents, prismatic = joint_tree(robot)
+    parents, prismatic = robot.parents, robot.prismatic
     assert_array_equal(data.parents, parents)
     assert_array_equal(data.prismatic, prismatic)
     assert data.trajectories == {"excited": 2, "reference": 2, "passive": 1, "uniform": 60}[recipe]

@@ -14,6 +14,14 @@ import nbs_pin
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 THEORY = ROOT / "docs" / "theory.md"
+HOME_OF = {
+    alias.name: f"nbs_pin.{node.module}"
+    for node in ast.parse((ROOT / "nbs_pin" / "__init__.pyi").read_text()).body
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+    if alias.name != "metrics"
+}
+"""The module of every public name."""
 LONGEST_RUN = 2.0
 """What a simulation of the README is cut to [s]."""
 
@@ -121,7 +129,7 @@ def assigned_docstrings(module: str) -> set[str]:
 def test_every_public_name_has_a_docstring(name):
     thing = getattr(nbs_pin, name)
     if not (inspect.ismodule(thing) or inspect.isclass(thing) or inspect.isfunction(thing)):
-        assert name in assigned_docstrings(nbs_pin._HOME_OF[name])
+        assert name in assigned_docstrings(HOME_OF[name])
         return
     text = vars(thing).get("__doc__") if inspect.isclass(thing) else thing.__doc__  # inherited words do not count
     assert text
@@ -138,7 +146,7 @@ def test_the_package_and_the_theory_write_the_same_symbols():
 
 def test_every_public_name_is_the_thing_and_not_its_module():
     """A function named like its module would be shadowed by it after the first import."""
-    for module in set(nbs_pin._HOME_OF.values()):
+    for module in set(HOME_OF.values()):
         import_module(module)
-    for name in nbs_pin._HOME_OF:
+    for name in HOME_OF:
         assert not inspect.ismodule(getattr(nbs_pin, name)), name

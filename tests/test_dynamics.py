@@ -11,10 +11,10 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics import equations
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.chain import Chain
-from nbs_pin.dynamics.families import make_network
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.registry import make_network
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import load_robot

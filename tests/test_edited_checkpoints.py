@@ -141,7 +141,7 @@ def test_an_edited_checkpoint_is_refused_or_labelled_down(edit, checkpoints):
 def outcome(path) -> str:
     """The weakest label of the file's claims, or the error that refused it."""
     try:
-        return str(weakest(*(claim.label for claim in check_structure(load(path)))))
+        return str(weakest(*(claim.label for claim in check_structure(load(path)).claims)))
     except NbsPinError as error:
         return str(error)
 
@@ -151,7 +151,7 @@ def test_no_edit_of_the_parameters_behind_wy_makes_a_weight_negative(form, check
     """W^(y) goes through a function that has no negative values: an edit is kept, and its claims are true."""
     wild = [f"potential.network.wy{k}" for k in (1, 2, 3)]
     edited = load(resealed(checkpoints[form], factor(-7.0, *wild)))
-    convex = next(claim for claim in check_structure(edited) if claim.name == "ψ convex")
+    convex = next(claim for claim in check_structure(edited).claims if claim.name == "ψ convex")
     layers = edited.potential.network.layers(numpy=True)
     least = min(float(layer.wy.min()) for layer in layers if layer.wy is not None)
     assert least >= 0.0

@@ -9,12 +9,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.dynamics.families import NETWORKS, make_network
 from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.registry import NETWORKS, make_network
 from nbs_pin.identification import network_fit
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.compatibility import arm_fault
-from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit import MODELS, fit, parted
 from nbs_pin.identification.fit_report import torque_errors, torque_nmse
 from nbs_pin.identification.network_equations import Equation, Equations
@@ -35,7 +35,7 @@ def states(samples, seed=0, noise=0.0, friction=None, still=False):
     tau = nbs.inverse_dynamics(TRUTH, q, v, a) + noise * rng.normal(size=(samples, n))
     tau += 0.0 if friction is None else friction.torque(v)
     order = np.arange(samples)
-    return Dataset(q, v, a, tau, 1.0 * order, order, *joint_tree(ROBOT), ROBOT.name)
+    return Dataset(q, v, a, tau, 1.0 * order, order, ROBOT.parents, ROBOT.prismatic, ROBOT.name)
 
 
 def relative(model):

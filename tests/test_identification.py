@@ -17,7 +17,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import BASIS, coordinates, inertial_parameters, pseudo_inertia, symmetric
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.consistent_fit import consistent_fit
-from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.identify import identify
 from nbs_pin.identification.measurement import Noise
 from nbs_pin.robots.robot import Robot, load_robot
@@ -34,7 +34,7 @@ def states(nv: int, samples: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray
 
 def dataset(robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray, tau: np.ndarray) -> Dataset:
     order = np.arange(len(q))
-    return Dataset(q, v, a, tau, 0.0 * order, order, *joint_tree(robot), robot.name)
+    return Dataset(q, v, a, tau, 0.0 * order, order, robot.parents, robot.prismatic, robot.name)
 
 
 def clean(robot: Robot, samples: int = 300, friction: JointFriction | None = None) -> Dataset:

@@ -10,7 +10,9 @@ from scipy.optimize import minimize
 from nbs_pin import load_robot
 from nbs_pin.base.claims import Label
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.dynamics.pinocchio import pack_model
+from nbs_pin.base.rounding import down, largest_eigenvalue, least_eigenvalue, up
+from nbs_pin.dynamics.pinocchio_tree import pack_model
+from nbs_pin.dynamics.rigid_tree import RigidTree
 from nbs_pin.inertia import multipliers
 from nbs_pin.inertia.bounds import (
     determinant_bound,
@@ -23,8 +25,6 @@ from nbs_pin.inertia.bounds import (
 from nbs_pin.inertia.lever_arms import lever_arms
 from nbs_pin.inertia.multipliers import Motions, least_by_multipliers, maximise
 from nbs_pin.inertia.pose_grid import Plan
-from nbs_pin.inertia.rigid_tree import RigidTree
-from nbs_pin.inertia.rounding import down, largest_eigenvalue, least_eigenvalue, up
 
 FEW = 20_000
 """Poses sampled by `trigonometric_bound` where the test is about truth, not tightness."""

@@ -5,15 +5,13 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics import equations
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.cholesky import CholeskyNetwork
-from nbs_pin.dynamics.families import NETWORKS, make_network
 from nbs_pin.dynamics.features import JointFeatures
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
@@ -21,6 +19,7 @@ from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.lagrangian_network import GeneralLagrangianNetwork, LagrangianNetwork
 from nbs_pin.dynamics.picnn import PICNN
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.registry import NETWORKS, make_network
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork, nominal_terms
 from nbs_pin.dynamics.softplus_network import SoftplusNetwork, paper_spread, softplus
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 
 import nbs_pin as nbs
 from nbs_pin import cli
-from nbs_pin.cli import learning
+from nbs_pin.commands import learn as learning
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import load_dataset
 from nbs_pin.identification.fit import parted

@@ -9,19 +9,19 @@ from matplotlib.image import imread
 
 import nbs_pin as nbs
 from nbs_pin.accuracy.mismatch import mismatch
-from nbs_pin.base.claims import Assumption
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assumptions import Promise, jumps
 from nbs_pin.certificates.attack import attack, random_disturbances
 from nbs_pin.certificates.certify import certify
+from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Instants, balance, beyond, storage_of
 from nbs_pin.certificates.monitor import monitor
 from nbs_pin.certificates.online_monitor import Watch
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
-from nbs_pin.dynamics.families import make_network
 from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.registry import make_network
 from nbs_pin.motions.disturbances import ConstantTorque, SinusoidalTorque, SquareWave
 from nbs_pin.motions.references import Sinusoid
 from nbs_pin.reports.certificate_charts import plot_certificate, plot_monitor

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.activations import SmoothedReLU, Squareplus

@@ -13,6 +13,7 @@ import torch
 from nbs_pin.base.arrays import matvec
 from nbs_pin.base.pages import Section, page, plain, short
 from nbs_pin.cli import main
+from nbs_pin.commands import reproduce
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.motions.references import paper_reference
 from nbs_pin.reproduction import paper
@@ -214,7 +215,7 @@ def quick(monkeypatch):
         (folder / "part.csv").write_text("x\n")
         return [Section("First", f"Seed {seed}.", {"seed": seed})]
 
-    monkeypatch.setattr(paper, "reproduce_paper", part)
+    monkeypatch.setitem(reproduce.PARTS, "paper", part)
 
 
 def test_the_command_joins_the_parts(tmp_path, quick, capsys):
@@ -235,7 +236,7 @@ def test_an_interrupted_command_leaves_no_empty_folder(tmp_path, monkeypatch, ca
     def part(folder, seed, progress):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(paper, "reproduce_paper", part)
+    monkeypatch.setitem(reproduce.PARTS, "paper", part)
     assert main(["reproduce", "--part", "paper", "--out", str(tmp_path / "out")]) == 130
     assert not (tmp_path / "out").exists()
     assert "interrupted" in capsys.readouterr().err

@@ -13,9 +13,9 @@ import pytest
 import nbs_pin as nbs
 from nbs_pin import cli
 from nbs_pin.base.versions import versions
+from nbs_pin.commands import train as training
 from nbs_pin.reports.charts import plot_training
-from nbs_pin.training import train_robot as training
-from nbs_pin.training import trainer
+from nbs_pin.training import evaluation, trainer
 from tests.test_plotting import drawn, png_size, sinusoid_run
 
 QUICK = ("--starts", "6", "--duration", "0.3", "--frequencies", "1,2", "--epochs", "6", "--bandwidth", "4")
@@ -241,7 +241,7 @@ def test_a_controller_of_another_arm_is_refused_in_a_sentence(folder, tmp_path, 
         ("--duration 0.3001", "expected a whole number; take for instance 0.3 s"),
         ("--period 0.2", "--period is '0.2'"),
         ("--learning-rate 0", "--learning-rate is '0'"),
-        ("--controller nsb", "no controller 'nsb'; did you mean nbs?"),
+        ("--controller nsb", "--controller is 'nsb'; did you mean nbs?"),
         ("--controller none.nbs", "none.nbs"),
         ("--cost time", "time"),
         ("--effort-limit 5 --no-effort-limit", "choose one"),
@@ -309,7 +309,7 @@ def test_one_motion_that_diverges_leaves_the_others_their_figures(monkeypatch, w
     batch.v0[2] = 1e3
     if without_kernels:
         moved = training.motions
-        monkeypatch.setattr(training, "motions", lambda law, batch: moved(law, batch, "torch"))
+        monkeypatch.setattr(evaluation, "motions", lambda law, batch: moved(law, batch, "torch"))
     figures = training.fresh_figures(training.compared(law, batch))
     assert np.isfinite(figures["convergence_time_median_s"])
     assert figures["convergence_time_worst_s"] == np.inf

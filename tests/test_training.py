@@ -9,8 +9,8 @@ import torch
 
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
-from nbs_pin.cli.tracking import build_controller
 from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.controllers.registry import build_law
 from nbs_pin.simulation.costs import TimeOutside, TorqueAware, squared_error
 from nbs_pin.simulation.loop import Loop
 from nbs_pin.simulation.rollout import Batch, engine_for, motions, recorded, running_cost
@@ -37,7 +37,7 @@ def problem(robot, steps=8, starts=2, *, integrator="rk4", substeps=1, friction=
 
 
 def law_for(robot, name="nbs", **settings):
-    controller = build_controller(name, robot, period=PERIOD, bandwidth=4.0, **settings)
+    controller = build_law(name, robot, period=PERIOD, bandwidth=4.0, **settings)
     draw = torch.Generator().manual_seed(5)
     with torch.no_grad():  # gains off their nominal values, so that every term of their derivative counts
         for parameter in controller.parameters():
@@ -201,7 +201,7 @@ def quick(controller, robot, **settings):
 @pytest.mark.parametrize("optimiser", ["cautious", "adam", "lbfgs"])
 def test_training_lowers_the_held_out_cost_and_leaves_the_given_law_alone(name, optimiser):
     robot = arm("two_link")
-    controller = build_controller(name, robot, period=PERIOD)
+    controller = build_law(name, robot, period=PERIOD)
     before = {k: x.clone() for k, x in controller.state_dict().items()}
     result = quick(controller, robot, optimiser=optimiser, cost=squared_error)
     assert result.held_out[result.best_epoch] == np.nanmin(result.held_out) < result.held_out[0]
@@ -213,7 +213,7 @@ def test_training_lowers_the_held_out_cost_and_leaves_the_given_law_alone(name, 
 
 def test_the_given_controller_is_the_one_of_the_best_epoch():
     robot = arm("two_link")
-    result = quick(build_controller("nbs", robot, period=PERIOD), robot, held_out=0, epochs=5)
+    result = quick(build_law("nbs", robot, period=PERIOD), robot, held_out=0, epochs=5)
     plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot))
     loop = Loop.of(plant, 2, 0.4, PERIOD, plant_step=PERIOD, effort_limit=None, lookahead=None)
     q0 = nbs.Sinusoid.for_robot(robot)(0.0).q + np.random.default_rng(0).uniform(-0.5, 0.5, (4, 2))
@@ -224,7 +224,7 @@ def test_the_given_controller_is_the_one_of_the_best_epoch():
 
 def test_gains_stay_above_their_share_and_can_be_left_alone():
     robot = arm("two_link")
-    controller = build_controller("nbs", robot, period=PERIOD)
+    controller = build_law("nbs", robot, period=PERIOD)
     moved = quick(controller, robot, learning_rate=0.02).controller
     assert not np.array_equal(moved.rate.numpy(), controller.rate.numpy())
     for gain, nominal in ((moved.rate, controller.rate), (moved.damping.floor, controller.damping.floor)):
@@ -234,12 +234,12 @@ def test_gains_stay_above_their_share_and_can_be_left_alone():
     np.testing.assert_array_equal(fixed.rate.numpy(), controller.rate.numpy())
     np.testing.assert_array_equal(fixed.potential.stiffness.numpy(), controller.potential.stiffness.numpy())
     with pytest.raises(ArgumentError, match="nothing is left to train"):
-        quick(build_controller("pid", robot, period=PERIOD), robot, gains=False)
+        quick(build_law("pid", robot, period=PERIOD), robot, gains=False)
 
 
 def test_a_regulariser_keeps_weights_small():
     robot = arm("two_link")
-    controller = build_controller("nbs", robot, period=PERIOD)
+    controller = build_law("nbs", robot, period=PERIOD)
 
     def size(law):
         return sum((p**2).sum() for p in law.potential.network.parameters())
@@ -252,7 +252,7 @@ def test_a_regulariser_keeps_weights_small():
 @pytest.mark.parametrize("optimiser", ["cautious", "adam", "lbfgs"])
 def test_a_resumed_training_is_the_same_to_the_last_bit(optimiser, tmp_path, monkeypatch):
     robot = arm("two_link")
-    controller = build_controller("nbs", robot, period=PERIOD)
+    controller = build_law("nbs", robot, period=PERIOD)
     settings = {"optimiser": optimiser, "epochs": 25, "starts": 2, "duration": 0.2, "learning_rate": 0.05}
     whole = quick(controller, robot, **settings, checkpoint=tmp_path / "whole.ckpt")
     stop_at(monkeypatch, epoch=13)
@@ -281,7 +281,7 @@ def stop_at(monkeypatch, epoch):
 
 def test_ctrl_c_keeps_the_best(monkeypatch, tmp_path):
     robot = arm("two_link")
-    controller = build_controller("nbs", robot, period=PERIOD)
+    controller = build_law("nbs", robot, period=PERIOD)
     stop_at(monkeypatch, epoch=6)
     result = quick(controller, robot, checkpoint=tmp_path / "c.ckpt")
     assert result.stopped == "interrupted"
@@ -292,7 +292,7 @@ def test_ctrl_c_keeps_the_best(monkeypatch, tmp_path):
 
 def test_patience_ends_a_training_that_gains_nothing():
     robot = arm("two_link")
-    result = quick(build_controller("nbs", robot, period=PERIOD), robot, optimiser="adam", learning_rate=1.0, epochs=40,
+    result = quick(build_law("nbs", robot, period=PERIOD), robot, optimiser="adam", learning_rate=1.0, epochs=40,
                    patience=3)  # fmt: skip
     assert result.stopped == "patience"
     assert len(result.history) < 41
@@ -300,7 +300,7 @@ def test_patience_ends_a_training_that_gains_nothing():
 
 def test_a_checkpoint_of_another_training_or_arm_is_refused(tmp_path):
     robot, path = arm("two_link"), tmp_path / "a.ckpt"
-    controller = build_controller("nbs", robot, period=PERIOD)
+    controller = build_law("nbs", robot, period=PERIOD)
     quick(controller, robot, checkpoint=path, epochs=2)
     changes = (
         {"epochs": 3},
@@ -314,18 +314,18 @@ def test_a_checkpoint_of_another_training_or_arm_is_refused(tmp_path):
     for change in changes:
         with pytest.raises(ArgumentError, match="not a checkpoint of this training"):
             quick(controller, robot, **{"checkpoint": path, "epochs": 2, "resume": True} | change)
-    stiffer = build_controller("nbs", robot, period=PERIOD, bandwidth=7.0)
+    stiffer = build_law("nbs", robot, period=PERIOD, bandwidth=7.0)
     with pytest.raises(ArgumentError, match="not a checkpoint of this training"):
         quick(stiffer, robot, checkpoint=path, epochs=2, resume=True)
     assert about(path)["info"] == {"seed": 0}
     other = arm("three_link")
     with pytest.raises(ArgumentError, match="two_link"):
-        quick(build_controller("nbs", other, period=PERIOD), other, checkpoint=path, epochs=2, resume=True)
+        quick(build_law("nbs", other, period=PERIOD), other, checkpoint=path, epochs=2, resume=True)
 
 
 def test_a_training_whose_plant_is_another_arm_than_the_law_believes_is_resumed(tmp_path):
     robot, heavier = arm("two_link"), nbs.load_robot("two_link", gravity=12.0)
-    controller = build_controller("nbs", robot, period=PERIOD)
+    controller = build_law("nbs", robot, period=PERIOD)
     plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(heavier))
     settings = {"starts": 2, "duration": 0.2, "epochs": 3, "effort_limit": 50.0, "checkpoint": tmp_path / "c.ckpt"}
     first = nbs.train(controller, plant, [nbs.Sinusoid.for_robot(robot)], **settings)
@@ -350,14 +350,14 @@ def test_gradients_that_are_no_numbers_do_not_reach_the_parameters(tmp_path):
         return (z1 * z1).sum(-1) + (torch.sqrt(0.0 * z1[..., 0]) if next(count) > 8 else 0.0)
 
     robot = arm("two_link")
-    result = quick(build_controller("nbs", robot, period=PERIOD), robot, cost=kinked, checkpoint=tmp_path / "c.ckpt")
+    result = quick(build_law("nbs", robot, period=PERIOD), robot, cost=kinked, checkpoint=tmp_path / "c.ckpt")
     assert all(bool(p.isfinite().all()) for p in result.controller.parameters())
     assert result.history[1] < result.history[0]
 
 
 def test_costs_may_be_negative():
     robot = arm("two_link")
-    result = quick(build_controller("nbs", robot, period=PERIOD), robot, cost=lambda z, dz, tau: (z * z).sum(-1) - 1.0)
+    result = quick(build_law("nbs", robot, period=PERIOD), robot, cost=lambda z, dz, tau: (z * z).sum(-1) - 1.0)
     assert result.history[0] < 0.0
     assert len(set(result.history)) > 6
 
@@ -366,12 +366,12 @@ def test_held_out_motions_that_are_never_finite_are_named():
     robot = arm("two_link", np.inf)
     far = np.full((1, 2), 1e200)
     with pytest.raises(SimulationDiverged, match="the held-out motions left the finite numbers"):
-        quick(build_controller("nbs", robot, period=PERIOD), robot, held_out=far)
+        quick(build_law("nbs", robot, period=PERIOD), robot, held_out=far)
 
 
 def test_what_cannot_be_trained_is_refused_in_one_sentence():
     robot = arm("two_link")
-    controller, reference = build_controller("nbs", robot, period=PERIOD), nbs.Sinusoid.for_robot(robot)
+    controller, reference = build_law("nbs", robot, period=PERIOD), nbs.Sinusoid.for_robot(robot)
     plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot))
     with pytest.raises(ArgumentError, match="has no derivatives; train on DynamicsPlant"):
         nbs.train(controller, nbs.MujocoPlant(robot), [reference])

@@ -7,7 +7,8 @@ import torch
 
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.analytic import AnalyticDynamics
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics, pack_model
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import Link, pack_tree

@@ -6,8 +6,7 @@ import warnings
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.catalogue import find

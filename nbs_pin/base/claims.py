@@ -1,11 +1,11 @@
-"""What is claimed, and how it is known."""
+"""What is claimed of a controller or a model, and how it is known."""
 
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple, NoReturn
 
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 
 
 class Label(StrEnum):
@@ -19,19 +19,6 @@ class Label(StrEnum):
     """With a confidence, for what is drawn as the samples were."""
     EMPIRICAL = "EMPIRICAL"
     """On samples; others may break it."""
-
-
-class Assumption(StrEnum):
-    """What bounds assume, in the words that a certificate prints and a monitor names."""
-
-    MODEL = "the arm is its model"
-    FRICTION = "joint friction is what is fed forward, or counted as disturbance"
-    DISTURBANCE = "the disturbance is within its bound"
-    REFERENCE = "the reference is twice differentiable"
-    STOPS = "no joint meets its stop"
-    EFFORT = "torques stay inside the effort limits"
-    TIME = "continuous time, no delay"
-    WRAP = "errors of continuous joints stay within ±π"
 
 
 class Group(StrEnum):
@@ -84,32 +71,18 @@ class Claim:
         }
 
 
-@dataclass(frozen=True)
-class Condition:
-    """An inequality that a theorem asks for, with the numbers on both sides: left > right."""
+def refuse(fault: str, remedy: str) -> NoReturn:
+    """Raise CertificateRefused in one sentence."""
+    raise CertificateRefused(f"{fault}; {remedy}.")
 
-    name: str
-    left: float
-    right: float
-    unit: str
+
+class Known(NamedTuple):
+    """How something is known."""
+
     label: Label
     because: str
-    assumed: bool = True
-    """Whether the bounds are void where it does not hold; False for what is printed for comparison."""
 
-    @property
-    def holds(self) -> bool:
-        """Whether left > right."""
-        return self.left > self.right
 
-    def plain(self) -> dict[str, Any]:
-        """The condition as JSON can store it, null for infinity."""
-        sides = {key: x if math.isfinite(x) else None for key, x in (("left", self.left), ("right", self.right))}
-        return {
-            "name": self.name,
-            **sides,
-            "holds": self.holds,
-            "unit": self.unit,
-            "label": str(self.label),
-            "because": self.because,
-        }
+def known(why: str, proof: str) -> Known:
+    """PROVED by the structure of known code, or EMPIRICAL because of `why` the code may be another."""
+    return Known(Label.EMPIRICAL, f"{why}: held on samples") if why else Known(Label.PROVED, proof)

@@ -19,22 +19,20 @@ from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
 from nbs_pin.benchmarks.bench_training import training_epochs
 from nbs_pin.benchmarks.serial_chains import serial_chain
-from nbs_pin.cli.tracking import ControllerName, build_controller
 from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.registry import LAWS, build_law
 from nbs_pin.dynamics.chain import Chain
 from nbs_pin.dynamics.cholesky import CholeskyNetwork
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.identification.datasets import joint_tree
 from nbs_pin.motions.disturbances import SquareWave, TorqueNoise
 from nbs_pin.motions.references import Sinusoid
 from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.simulation import metrics
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
-from nbs_pin.simulation import metrics
 from nbs_pin.simulation.simulate import simulate, stream
 
-LAWS: tuple[ControllerName, ...] = ("nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid")
 MODELS = ("three_link", "panda")
 """Arms whose models are timed, learned ones beside Pinocchio."""
 CHAINS = (1, 2, 3, 5, 7, 10, 15, 20, 25, 30)
@@ -91,7 +89,7 @@ def bench(
 
 def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step", against_torch: bool = False) -> Row:
     """Percentiles of one compiled control step [µs], its ratio to two RNEA, and eager torch's ratio to it."""
-    plain = build_controller(law, robot, period=PERIOD)
+    plain: Any = build_law(law, robot, period=PERIOD)
     controller = plain.compile()
     states = _states(robot)
     memory = controller.initial_memory(states[0][0])
@@ -118,9 +116,9 @@ def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step
     }
     if against_torch:
         tensors = [tuple(torch.as_tensor(x) for x in state) for state in states]
-        with_graph = np.median(_times(plain.torque, tensors, 200))  # type: ignore[attr-defined]
+        with_graph = np.median(_times(plain.torque, tensors, 200))
         with torch.no_grad():
-            eager = np.median(_times(plain.torque, tensors, 200))  # type: ignore[attr-defined]
+            eager = np.median(_times(plain.torque, tensors, 200))
         figures |= {
             "torch_us": float(eager),
             "torch_graph_us": float(with_graph),
@@ -144,7 +142,7 @@ def plant_rows(robot: Robot) -> Iterator[Row]:
 
 def model_rows(robot: Robot, calls: int = 5000) -> Iterator[Row]:
     """The cost of M a_r + C(q, v) v_r + G at one state [µs] for each kind of model; weights do not matter to it."""
-    parents, prismatic = joint_tree(robot)
+    parents, prismatic = robot.parents, robot.prismatic
     exact = PinocchioDynamics(robot)
     models = {
         "pinocchio": exact,
@@ -161,7 +159,7 @@ def model_rows(robot: Robot, calls: int = 5000) -> Iterator[Row]:
 
 def simulation_row(robot: Robot, duration: float = 5.0) -> Row:
     """Steps per second of `simulate` with full recording, NBS against MuJoCo Euler at 1 ms, and the memory it keeps."""
-    controller: Controller = build_controller("nbs", robot, period=PERIOD).compile()
+    controller: Controller = build_law("nbs", robot, period=PERIOD).compile()
     reference = Sinusoid.for_robot(robot)
     plant = MujocoPlant(robot, "euler")
     simulate(plant, controller, reference, 0.1, PERIOD)
@@ -175,7 +173,7 @@ def simulation_row(robot: Robot, duration: float = 5.0) -> Row:
 
 def endurance_row(robot: Robot, duration: float = 3600.0) -> Row:
     """An hour at 1 kHz under square-wave and noise torques, streamed: time, memory growth, and whether errors grow."""
-    controller = build_controller("nbs", robot, period=PERIOD)
+    controller = build_law("nbs", robot, period=PERIOD)
     square, noise = SquareWave(1.0, 5.0), TorqueNoise(0.1, PERIOD)
     blocks = stream(
         MujocoPlant(robot, "euler"),
@@ -203,7 +201,7 @@ def endurance_row(robot: Robot, duration: float = 3600.0) -> Row:
 
 def workers_row(robot: Robot, starts: int = 1000, duration: float = 1.0) -> Row:
     """A thousand starts on one core and on two: a process each, without threads of their own."""
-    controller, reference = build_controller("nbs", robot, period=PERIOD), Sinusoid.for_robot(robot)
+    controller, reference = build_law("nbs", robot, period=PERIOD), Sinusoid.for_robot(robot)
     plant = MujocoPlant(robot, "euler")
     q0 = reference(0.0).q + 0.1 * np.random.default_rng(0).normal(size=(starts, robot.nv))
     simulate(plant, controller, reference, 0.01, PERIOD, q0=q0, workers=2)  # starts the processes

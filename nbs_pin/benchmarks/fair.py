@@ -10,8 +10,8 @@ import numpy as np
 
 from nbs_pin.base.pages import Section, markdown_table, plain, write_csv
 from nbs_pin.base.progress import tracked
-from nbs_pin.cli.tracking import build_controller
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import DesiredMotion, Sinusoid
 from nbs_pin.robots.robot import Robot, load_robot
@@ -19,8 +19,8 @@ from nbs_pin.simulation.costs import TimeOutside
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.loop import Loop
 from nbs_pin.simulation.metrics import PAPER_THRESHOLD
+from nbs_pin.training.evaluation import FRESH_STARTS, compared, fresh_batch, fresh_figures
 from nbs_pin.training.train import Training, train
-from nbs_pin.training.train_robot import FRESH_STARTS, compared, fresh_batch, fresh_figures
 
 FREQUENCIES = (0.1, 1.0, 3.0)
 """Of the references [rad/s]."""
@@ -196,7 +196,7 @@ def fair_part(folder: Path, seed: int, progress: bool) -> list[Section]:
 def _built(setting: Setting, name: str, robot: Robot, seed: int) -> Any:
     if LAWS[name] == "nbs":
         return NeuralBackstepping.for_robot(robot, period=setting.period, least_share=LEAST_SHARE, seed=seed)
-    return build_controller(LAWS[name], robot, period=setting.period, seed=seed)
+    return build_law(LAWS[name], robot, period=setting.period, seed=seed)
 
 
 def _train(setting: Setting, law: Any, rate: float, epochs: int, seed: int) -> Training:

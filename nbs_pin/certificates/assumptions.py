@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nbs_pin.base.claims import Assumption
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Balance, Instants, beyond
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 
 WRONG = "the certificate is wrong"
 """What is said when none of the assumptions accounts for what happened."""
@@ -225,7 +225,7 @@ JUMPS = (Assumption.WRAP, Assumption.REFERENCE)
 """Assumptions without which V itself jumps, so that no power accounts for what it does."""
 
 
-def jumps(controller: NeuralBackstepping, at: Instants) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
+def jumps(controller: LyapunovLaw, at: Instants) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
     """When an error leapt from one end of its turn to the other, and when the reference is no motion with a velocity.
 
     Between two instants a smooth reference moves by the mean of its velocities, but for a share of these and of their

@@ -1,4 +1,4 @@
-"""`certify`: what an NBS law promises under disturbances, before the arm moves."""
+"""`certify`: what a law with a storage function promises under disturbances, before the arm moves."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,17 +9,18 @@ from jaxtyping import Float
 
 from nbs_pin.accuracy.mismatch import Mismatch
 from nbs_pin.base.checks import PerJoint, floats, positive
-from nbs_pin.base.claims import Assumption, Claim, Condition, Group, Label, weakest
+from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.comparison_system import Comparison, Level, decay, level, reach
+from nbs_pin.certificates.claims import Assumption, Condition
+from nbs_pin.certificates.comparison_system import ComparisonSystem, Level, decay, level, reach
 from nbs_pin.certificates.constants import Constants, constants_of
 from nbs_pin.certificates.error_bounds import errors, radians
 from nbs_pin.certificates.margins import headroom, room, sampled_control, units
 from nbs_pin.certificates.model_error import ModelError, model_error
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.robots.robot import Robot
 
@@ -47,12 +48,12 @@ _TRUE = "what Theorem 3 of the paper prints: here no tighter than what is proved
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Bounds of the closed loop of an NBS law, each with the way it is known (docs/certificates.md).
+    """Bounds of the closed loop of a `LyapunovLaw`, each with the way it is known (docs/certificates.md).
 
     They hold for every admissible disturbance and every reference, under `assumptions`.
     """
 
-    controller: NeuralBackstepping
+    controller: LyapunovLaw
     admissible: Admissible
     rate: float
     """Without disturbance errors decay at least like e^{−rate·t} and V like e^{−2 rate·t} [1/s]."""
@@ -160,7 +161,7 @@ def certify(
     do not fit.
     """
     constants = constants_of(controller)
-    law = cast(NeuralBackstepping, controller)  # any other was refused
+    law = cast(LyapunovLaw, controller)  # any other was refused
     arm = law.dynamics.robot if robot is None else robot
     admissible = Admissible.of(disturbance, law.nv)
     start = _check_arguments(law, arm, reference, duration, q0, v0, mismatch, period)
@@ -174,7 +175,7 @@ def certify(
     if not math.isfinite(least.storage):
         raise CertificateRefused(_why_not(comparison))
     potential = reach(comparison, least.storage)
-    size, joints, source = errors(law, comparison, least.storage, potential)
+    size, joints, source = errors(law, constants, comparison, least.storage, potential)
     rate, printed = 0.5 * decay(comparison), math.sqrt(constants.largest_rate) * comparison.t / (2.0 * constants.rho)
     margins, sampled = sampled_control(law, period)
     decays = Condition("Theorem 1: min(ρ, ω + κ) > 0", rate, 0.0, "1/s", constants.label, "docs/certificates.md §2")
@@ -191,7 +192,7 @@ def certify(
         lines=(*constants.lines, *error.lines, *margins),
         conditions=(decays, *error.conditions, *sampled),
         assumptions=_assumptions(arm, mismatch),
-        stiffness=np.asarray(law.potential.stiffness.numpy()),
+        stiffness=constants.stiffness,
         robot=arm,
         mismatch=mismatch,
     )
@@ -199,7 +200,7 @@ def certify(
 
 
 def _check_arguments(
-    law: NeuralBackstepping,
+    law: LyapunovLaw,
     robot: Robot | None,
     reference: DesiredMotion | None,
     duration: float,
@@ -229,8 +230,8 @@ def _check_arguments(
     return start
 
 
-def _comparison(constants: Constants, admissible: Admissible, error: ModelError) -> Comparison:
-    return Comparison(
+def _comparison(constants: Constants, admissible: Admissible, error: ModelError) -> ComparisonSystem:
+    return ComparisonSystem(
         rho=constants.rho,
         delta=constants.delta,
         kappa=constants.kappa,
@@ -239,10 +240,11 @@ def _comparison(constants: Constants, admissible: Admissible, error: ModelError)
         t=math.sqrt(admissible.energy(constants.metric)) + error.t,
         alpha=error.alpha,
         beta=error.beta,
+        coupling=constants.coupling,
     )
 
 
-def _why_not(k: Comparison) -> str:
+def _why_not(k: ComparisonSystem) -> str:
     if not k.is_dissipative:
         return (
             f"Theorem 4 asks for 1 − β > α²/4 and the model's error gives 1 − β = {1.0 - k.beta:.3g} and α²/4 = "

@@ -3,11 +3,12 @@
 Along every motion (docs/certificates.md §2), with y² = z2ᵀD₀z2 and some x, s, σ
 
     Φ̇ = −x² + s,     x² ≥ 2ρΦ,   |s| ≤ xy/√δ,
-    Ẇ ≤ −s − (1 − β)y² + αxy − 2ωW + σ,     2κW ≤ y² ≤ 2νW,   σ ≤ t y.
+    Ẇ ≤ −ζs − (1 − β)y² + αxy − 2ωW + σ,     2κW ≤ y² ≤ 2νW,   σ ≤ t y.
 
 What no choice of x, y, s, σ can leave, no motion leaves: neither a level of V = Φ + W, nor a polygon below it.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ _OUTWARD = 1.0 + 1e-9
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparisonSystem:
     """The constants of the two inequalities; every one on the safe side."""
 
     rho: float
@@ -43,11 +44,18 @@ class Comparison:
     """α, of a model's error in proportion to ‖q‖ and ‖v‖."""
     beta: float = 0.0
     """β, of a model's error in proportion to ‖v‖."""
+    coupling: float = 1.0
+    """ζ: how much of s, the power that z2 brings into Φ, the law takes out of W."""
+
+    @property
+    def cross(self) -> float:
+        """α + (1 − ζ)/√δ: the coefficient of xy in V̇."""
+        return self.alpha + (1.0 - self.coupling) / math.sqrt(self.delta)
 
     @property
     def is_dissipative(self) -> bool:
-        """Whether x² − αxy + (1 − β)y² is positive definite: the condition of Theorem 4."""
-        return self.beta < 1.0 and self.alpha**2 < 4.0 * (1.0 - self.beta)
+        """Whether x² − (α + (1 − ζ)/√δ)xy + (1 − β)y² is positive definite: the condition of Theorem 4 for ζ = 1."""
+        return self.beta < 1.0 and self.cross**2 < 4.0 * (1.0 - self.beta)
 
 
 class Level(NamedTuple):
@@ -59,22 +67,23 @@ class Level(NamedTuple):
     """V∞ [J], inf where c is 0."""
 
 
-def decay(comparison: Comparison, share: float = 0.0) -> float:
-    """The largest c found with x² − αxy + (1 − β − share)y² + 2ωW ≥ c(Φ + W) [1/s], 0 where there is none.
+def decay(comparison: ComparisonSystem, share: float = 0.0) -> float:
+    """The largest c found with x² − axy + (1 − β − share)y² + 2ωW ≥ c(Φ + W) [1/s], 0 where there is none.
 
-    Two parts, ηx² ≥ 2ηρΦ and r y² + 2ωW ≥ 2(rκ + ω)W, with (1 − η)(1 − β − share − r) ≥ α²/4 and r ≥ 0.
+    a = α + (1 − ζ)/√δ. Two parts, ηx² ≥ 2ηρΦ and r y² + 2ωW ≥ 2(rκ + ω)W, with (1 − η)(1 − β − share − r) ≥ a²/4 and
+    r ≥ 0.
     """
     k = comparison
     rest = 1.0 - k.beta - share
-    if k.alpha == 0.0:
+    if k.cross == 0.0:
         return max(0.0, min(2.0 * k.rho, 2.0 * (rest * k.kappa + k.omega))) if rest >= 0.0 else 0.0
     eta = _SHARES
-    r = rest - 0.25 * k.alpha**2 / (1.0 - eta)
+    r = rest - 0.25 * k.cross**2 / (1.0 - eta)
     c = np.where(r >= 0.0, np.minimum(2.0 * eta * k.rho, 2.0 * (r * k.kappa + k.omega)), 0.0)
     return float(c.max(initial=0.0))
 
 
-def level(comparison: Comparison) -> Level:
+def level(comparison: ComparisonSystem) -> Level:
     """The least V∞ over all shares θ of y² that pay for the disturbance: ty ≤ θy² + t²/4θ, V∞ = t²/(4θ c(θ))."""
     if comparison.t == 0.0:
         c = decay(comparison) / _OUTWARD
@@ -88,7 +97,7 @@ def level(comparison: Comparison) -> Level:
     return found
 
 
-def reach(comparison: Comparison, storage: float) -> float:
+def reach(comparison: ComparisonSystem, storage: float) -> float:
     """Φ∞ [J]: the least found such that {V ≤ V∞} cut off by a polygon from (Φ∞, 0) upwards is never left.
 
     storage: V∞ of `level`. Every edge descends m times as fast in W as it advances in Φ, and is only taken when
@@ -107,7 +116,7 @@ def reach(comparison: Comparison, storage: float) -> float:
     return min(storage, high * _OUTWARD)
 
 
-def _closes(k: Comparison, potential: float, storage: float) -> bool:
+def _closes(k: ComparisonSystem, potential: float, storage: float) -> bool:
     """Whether steep edges lead from (Φ, 0) up to the line Φ + W = V∞."""
     rows = storage * np.linspace(0.0, 1.0, _ROWS + 1) ** 2
     phi = potential
@@ -122,15 +131,15 @@ def _closes(k: Comparison, potential: float, storage: float) -> bool:
     return False
 
 
-def _growth(k: Comparison, end: np.ndarray, low: float, high: float) -> np.ndarray:
+def _growth(k: ComparisonSystem, end: np.ndarray, low: float, high: float) -> np.ndarray:
     """At least max Ẇ + mΦ̇ over Φ ≥ end and W from low to high, for every m of `_STEEPNESS`, m ≥ 1.
 
-    With a = (m − 1)/√δ + α it is max axy − m x² − (1 − β)y² + ty − 2ωW over x ≥ x₀ and y₀ ≤ y ≤ y₁: for given y the
+    With a = (m − ζ)/√δ + α it is max axy − m x² − (1 − β)y² + ty − 2ωW over x ≥ x₀ and y₀ ≤ y ≤ y₁: for given y the
     best x is max(x₀, ay/2m), which leaves a quadratic in y on either side of y = 2mx₀/a, greatest at a border or where
     its slope is 0.
     """
     m, g = _STEEPNESS, 1.0 - k.beta
-    a = (m - 1.0) / np.sqrt(k.delta) + k.alpha + _LEAST_A
+    a = (m - k.coupling) / np.sqrt(k.delta) + k.alpha + _LEAST_A
     x0 = np.sqrt(2.0 * k.rho * np.maximum(end, 0.0))
     y0, y1 = np.sqrt(2.0 * k.kappa * low), np.sqrt(2.0 * k.nu * high)
     bend = g - a * a / (4.0 * m)

@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.claims import Claim, Group, Label, weakest
-from nbs_pin.certificates.structure import DAMPING, check_structure
+from nbs_pin.base.rounding import least_eigenvalue
+from nbs_pin.certificates.structure import check_structure
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.inertia.bounds import largest_inertia_bound, least_inertia_bound
-from nbs_pin.inertia.rounding import least_eigenvalue
 
 _SAMPLES = 2000
 
@@ -34,10 +34,16 @@ class Constants:
     """ν = 1/min_q λ_min(D₀^-½M(q)D₀^-½) [1/s], inf for none."""
     omega: float
     """ω [1/s]."""
+    coupling: float
+    """ζ: 1 for a law that feeds −∇Φ back, 0 for one that does not."""
     largest_rate: float
     """λ_max(Λ) [rad/s per N·m]."""
     least_floor: float
     """λ_min(D₀) [N·m·s/rad]."""
+    stiffness: Float[np.ndarray, "n n"]
+    """S [J/rad²]."""
+    floor: Float[np.ndarray, "n n"]
+    """D₀ [N·m·s/rad]."""
     metric: Float[np.ndarray, "n n"]
     """D₀⁻¹, for Δ = sup τ_dᵀD₀⁻¹τ_d."""
     label: Label
@@ -50,36 +56,29 @@ def constants_of(law: Controller) -> Constants:
 
     Raises CertificateRefused where those give no ground for a proof.
     """
-    structure = check_structure(law)
-    controller = cast(NeuralBackstepping, law)  # any other law was refused
-    floor = _floor(controller, structure)
-    stiffness, rate = (np.asarray(gain.numpy()) for gain in (controller.potential.stiffness, controller.rate))
-    omega, root = float(controller.inertial_rate), np.sqrt(rate)
-    rho = least_eigenvalue(2.0 * root[:, None] * stiffness * root)
-    delta = least_eigenvalue(root[:, None] * floor * root)
-    largest, least, *plain = _inertia(controller.dynamics, floor)
+    v = check_structure(law)
+    controller = cast(LyapunovLaw, law)  # any other law was refused
+    root = np.sqrt(v.rate)
+    delta = least_eigenvalue(root[:, None] * v.floor * root)
+    largest, least, *plain = _inertia(controller.dynamics, v.floor)
     # With ωM in the damping no bound of M is needed, so one that is not proved is not used.
-    used = omega == 0.0 or largest.label is Label.PROVED
+    used = v.inertial_rate == 0.0 or largest.label is Label.PROVED
     claim = Claim("δ = λ_min(Λ^½D₀Λ^½)", delta, "", Label.PROVED, "eigenvalue of the gains", Group.CONSTANTS)
     return Constants(
-        rho=rho,
+        rho=least_eigenvalue(2.0 * root[:, None] * v.stiffness * root),
         delta=delta,
         kappa=1.0 / largest.value if used and largest.value > 0.0 else 0.0,
         nu=1.0 / least.value if used and least.value > 0.0 else math.inf,
-        omega=omega,
-        largest_rate=float(rate.max()),
-        least_floor=least_eigenvalue(floor),
-        metric=above_inverse(floor),
-        label=weakest(*(line.label for line in structure), *([largest.label, least.label] if used else [])),
-        lines=(*structure, *plain, largest, least, claim),
+        omega=v.inertial_rate,
+        coupling=v.coupling,
+        largest_rate=float(v.rate.max()),
+        least_floor=least_eigenvalue(v.floor),
+        stiffness=v.stiffness,
+        floor=v.floor,
+        metric=above_inverse(v.floor),
+        label=weakest(*(line.label for line in v.claims), *([largest.label, least.label] if used else [])),
+        lines=(*v.claims, *plain, largest, least, claim),
     )
-
-
-def _floor(controller: NeuralBackstepping, structure: tuple[Claim, ...]) -> Float[np.ndarray, "n n"]:
-    """D₀: that of the damping, or as large a multiple of I as the check of its structure found."""
-    if controller.damping.floor is not None:
-        return np.asarray(controller.damping.floor.numpy())
-    return next(line.value for line in structure if line.name == DAMPING) * np.eye(controller.nv)
 
 
 def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tuple[Claim, ...]:

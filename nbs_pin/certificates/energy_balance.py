@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import matvec
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.controllers.controller import MemorylessController
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.equations import inverse_dynamics
 
 _TOGETHER = 4096  # states a network sees at once
@@ -84,13 +83,13 @@ class Balance(NamedTuple):
     """‖q‖ [rad] and ‖v‖ [rad/s]."""
 
 
-def storage_of(controller: NeuralBackstepping, at: Instants) -> Float[np.ndarray, "*rows"]:
+def storage_of(controller: LyapunovLaw, at: Instants) -> Float[np.ndarray, "*rows"]:
     """V [J] at the instants."""
     return _in_parts(controller.storage, at.q, at.v, at.q_ref, at.v_ref)[0]
 
 
 def balance(
-    controller: NeuralBackstepping,
+    controller: LyapunovLaw,
     before: Instants,
     after: Instants,
     change: Float[np.ndarray, "*rows"],
@@ -145,7 +144,7 @@ def beyond(
 
 
 def _powers(
-    controller: NeuralBackstepping,
+    controller: LyapunovLaw,
     q: np.ndarray,
     v: np.ndarray,
     a: np.ndarray,
@@ -158,9 +157,7 @@ def _powers(
     needed, extra = inverse_dynamics(dynamics, q, v, a), np.zeros_like(q)
     if friction is not None:
         needed, extra = needed + friction.torque(v), friction.torque(v) - friction.torque(e.v_r)
-    force = controller.inertial_rate * matvec(dynamics.mass_matrix(q), e.z2) + controller.damping.force(e.z2)
-    losses = _dot(e.gradient, controller.rate.numpy() * e.gradient), _dot(e.z2, force)
-    return needed, np.stack(losses, axis=-1), e.z2, extra
+    return needed, np.stack(controller.losses(q, e), axis=-1), e.z2, extra
 
 
 def _middle(x0: np.ndarray, x1: np.ndarray, rate0: np.ndarray, rate1: np.ndarray, h: np.ndarray) -> np.ndarray:

@@ -14,8 +14,8 @@ from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.motions.references import DesiredMotion, Hold, Sinusoid
 from nbs_pin.robots.robot import configuration_difference
@@ -175,15 +175,15 @@ def _check_motion(motion: Any) -> None:
 def slowest_rate(controller: ModelLaw, reference: DesiredMotion) -> float:
     """The least |Re λ| [1/s] of the undisturbed loop, linearised at the start of the reference held still.
 
-    With z1, z2: ż1 = z2 − Λ∇²Φ(0)z1 and M ż2 = −∇²Φ(0)z1 − (ωM + D(0))z2; other laws than NBS have 1.
+    With z1, z2: ż1 = z2 − Λ∇²Φ(0)z1 and M ż2 = −∇²Φ(0)z1 − (ωM + D(0))z2; a law without a storage function has 1.
     """
-    if not isinstance(controller, NeuralBackstepping):
+    if not isinstance(controller, LyapunovLaw):
         return 1.0
     n, zero = controller.nv, np.zeros(controller.nv)
     eye = np.eye(n)
-    hessian = controller.potential.terms(np.zeros((n, n)), eye)[2]
+    hessian = controller.potential_terms(np.zeros((n, n)), eye)[2]
     mass = controller.dynamics.mass_matrix(np.asarray(reference(np.zeros(1)).q)[0])
-    damping = controller.inertial_rate * eye + np.linalg.solve(mass, controller.damping.matrix(zero))
-    above = np.hstack([-controller.rate.numpy()[:, None] * hessian, eye])
-    loop = np.vstack([above, np.hstack([-np.linalg.solve(mass, hessian), -damping])])
+    damping = controller.inertial_rate * eye + np.linalg.solve(mass, controller.damping_matrix(zero))
+    above = np.hstack([-controller.rate_like(zero)[:, None] * hessian, eye])
+    loop = np.vstack([above, np.hstack([-controller.coupling * np.linalg.solve(mass, hessian), -damping])])
     return float(max(np.abs(np.linalg.eigvals(loop).real).min(), 1e-6))

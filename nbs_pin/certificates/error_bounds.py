@@ -5,42 +5,44 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.rounding import least_eigenvalue
 from nbs_pin.certificates import one_joint
-from nbs_pin.certificates.comparison_system import Comparison
-from nbs_pin.certificates.constants import above_inverse
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.certificates.comparison_system import ComparisonSystem
+from nbs_pin.certificates.constants import Constants, above_inverse
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.inertia.rounding import least_eigenvalue
 
 
 def errors(
-    controller: NeuralBackstepping, comparison: Comparison, storage: float, potential: float
+    controller: LyapunovLaw, constants: Constants, comparison: ComparisonSystem, storage: float, potential: float
 ) -> tuple[float, Float[np.ndarray, " n"], str]:
     """Bounds of ‖z1‖ and each |z1_i| [rad], and where they come from."""
-    size, joints = radians(np.asarray(controller.potential.stiffness.numpy()), potential)
+    size, joints = radians(constants.stiffness, potential)
     exact = math.inf
     # Friction fed forward leaves a term that is not linear, a model's error another.
     if controller.nv == 1 and controller.friction is None and comparison.alpha == comparison.beta == 0.0:
-        exact = _of_one_joint(controller, comparison, storage, size)
+        exact = _of_one_joint(controller, constants, comparison, storage, size)
     if exact < size:
         return exact, np.array([exact]), "the loop of one joint is linear up to ψ and T, docs/certificates.md §4"
     return size, joints, "Φ ≥ z1ᵀSz1 and Φ∞, docs/certificates.md §3"
 
 
-def _of_one_joint(controller: NeuralBackstepping, comparison: Comparison, storage: float, size: float) -> float:
+def _of_one_joint(
+    controller: LyapunovLaw, constants: Constants, comparison: ComparisonSystem, storage: float, size: float
+) -> float:
     """The bound of |z1| that linear theory gives, inf where it does not apply; `size` [rad] is one already."""
-    if type(controller.dynamics) is not PinocchioDynamics or controller.damping.floor is None:
+    if type(controller.dynamics) is not PinocchioDynamics:
         return math.inf
     loop = one_joint.Loop(
         inertia=float(controller.dynamics.mass_matrix(np.zeros(1))[0, 0]),
-        rate=float(controller.rate.numpy()[0]),
-        omega=float(controller.inertial_rate),
-        stiffness=2.0 * float(controller.potential.stiffness.numpy()[0, 0]),
-        damping=float(controller.damping.floor.numpy()[0, 0]),
+        rate=constants.largest_rate,
+        omega=constants.omega,
+        stiffness=2.0 * float(constants.stiffness[0, 0]),
+        damping=float(constants.floor[0, 0]),
+        coupling=constants.coupling,
     )
     within = one_joint.Worst(size, math.sqrt(2.0 * storage / loop.inertia) * (1.0 + 1e-12))
-    torque = comparison.t * math.sqrt(loop.damping)
-    return one_joint.worst_error(loop, torque, controller.potential, controller.damping, within)
+    return one_joint.worst_error(loop, comparison.t * math.sqrt(loop.damping), controller, within)
 
 
 def radians(stiffness: Float[np.ndarray, "n n"], potential: float) -> tuple[float, Float[np.ndarray, " n"]]:

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.claims import Claim, Condition, Group, Label
+from nbs_pin.base.claims import Claim, Group, Label, refuse
 from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.claims import Condition
 from nbs_pin.certificates.constants import configurations
-from nbs_pin.certificates.model_structure import check_box
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.motions.references import DesiredMotion
@@ -17,20 +17,18 @@ _INSTANTS = 2001
 _RULE = "a rule that told calm from chatter in 52 runs of a panda (docs/theory.md §5), over sampled configurations"
 
 
-def sampled_control(
-    controller: NeuralBackstepping, period: float | None
-) -> tuple[tuple[Claim, ...], tuple[Condition, ...]]:
+def sampled_control(controller: LyapunovLaw, period: float | None) -> tuple[tuple[Claim, ...], tuple[Condition, ...]]:
     """The longest hold and delay of the two rules of sampled control [s], and the period held against the first.
 
     h < 2/(λ_max(M⁻¹D) + λ_max(Λ∇²Φ(0))) and delay < (π/2)/λ_max(M⁻¹D), D at z2 = 0, its inertial part ωM with it.
     """
     zero = np.zeros(controller.nv)
-    damping = controller.damping.matrix(zero)
+    damping = controller.damping_matrix(zero)
     mass = controller.dynamics.mass_matrix(configurations(controller.dynamics))
     speed = controller.inertial_rate + float(np.linalg.eigvals(np.linalg.solve(mass, damping)).real.max())
     columns = np.eye(controller.nv)
-    curvature = controller.potential.terms(0.0 * columns, columns)[2]
-    error_speed = float(np.linalg.eigvals(controller.rate.numpy()[:, None] * curvature).real.max())
+    curvature = controller.potential_terms(0.0 * columns, columns)[2]
+    error_speed = float(np.linalg.eigvals(controller.rate_like(zero)[:, None] * curvature).real.max())
     hold, delay = 2.0 / (speed + error_speed), 0.5 * np.pi / speed
     lines = (
         Claim("longest control period", hold, "s", Label.EMPIRICAL, _RULE, Group.SAMPLED),
@@ -82,3 +80,30 @@ def room(
 def units(robot: Robot | None, nv: int = 0) -> tuple[str, ...]:
     """What each joint's position is measured in."""
     return ("rad",) * nv if robot is None else tuple("m" if joint.prismatic else "rad" for joint in robot.joints)
+
+
+def check_box(
+    positions: Float[np.ndarray, "rows n"],
+    low: Float[np.ndarray, " n"],
+    high: Float[np.ndarray, " n"],
+    *,
+    error: Float[np.ndarray, " n"] | float = 0.0,
+    box: str = "the joint limits",
+) -> Claim:
+    """How far the reference with its tube stays inside a box [rad, m]: the least distance to a side, over the rows.
+
+    positions: of the reference. low, high: sides of the box, ∓inf where it has none. error: |z1_i| around the
+    reference. box: what the box is, in words. EMPIRICAL, as nothing is said between the rows.
+    Raises CertificateRefused where the reference or its tube leaves the box, or a number is NaN.
+    """
+    inside = np.minimum(positions - low, high - positions) - error
+    if not positions.size or np.isnan(inside).any():
+        refuse(f"the reference or {box} has no rows or numbers that are none", "give finite positions and sides")
+    margin, joint = float(inside.min()), int(inside.min(axis=0).argmin())
+    if margin < 0.0:
+        refuse(
+            f"{box} is too small for the reference: with its error it leaves it at joint {joint + 1} by {-margin:.3g}",
+            "give a larger box or a smaller motion",
+        )
+    because = f"least over {len(positions)} instants and all joints; nothing is said between the instants"
+    return Claim(f"reference inside {box}, least margin", margin, "rad", Label.EMPIRICAL, because)

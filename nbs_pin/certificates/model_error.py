@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nbs_pin.accuracy.mismatch import Mismatch
-from nbs_pin.base.claims import Claim, Condition, Group
+from nbs_pin.accuracy.mismatch import Mismatch, violation_chance
+from nbs_pin.base.claims import Claim, Group, Label, refuse
+from nbs_pin.certificates.claims import Condition
 from nbs_pin.certificates.constants import Constants
-from nbs_pin.certificates.model_structure import check_fit
 from nbs_pin.motions.references import DesiredMotion
 
 _INSTANTS = 2001
@@ -51,3 +51,28 @@ def model_error(constants: Constants, mismatch: Mismatch, reference: DesiredMoti
         Condition("printed: α > √a", mu, math.sqrt(a), "", fit.label, printed, assumed=False),
     )
     return ModelError(k / math.sqrt(d), alpha, beta, lines, conditions)
+
+
+def check_fit(mismatch: Mismatch) -> Claim:
+    """The chance ε that a further trajectory breaks ‖δ‖ ≤ a‖q‖ + b‖v‖ + c, computed again from its trajectories.
+
+    PROBABILISTIC with its β and N; EMPIRICAL where ε ≥ ½, as with few trajectories: then the bound describes its data
+    and nothing else. Copies of a trajectory are counted once. Raises CertificateRefused for constants that are negative
+    or not finite, or that its own data exceed.
+    """
+    m = mismatch
+    constants = np.array([m.a, m.b, m.c])
+    if not (np.isfinite(constants).all() and (constants >= 0.0).all() and 0.0 < m.doubt < 1.0):
+        refuse(f"the mismatch has a, b, c = {constants.tolist()} and β = {m.doubt}", "fit it again with `mismatch`")
+    excess = m.size - m.bound(m.q_norm, m.v_norm)
+    if not m.size.size or not bool((excess <= 1e-9 * (1.0 + m.size.max())).all()):
+        refuse("the mismatch exceeds the bound a‖q‖ + b‖v‖ + c in its own data", "fit it again with `mismatch`")
+    distinct = np.unique(np.concatenate([m.q_norm, m.v_norm, m.size]), axis=1).shape[1]
+    count = min(int(m.trajectories), distinct)
+    chance = max(violation_chance(count, m.doubt), float(m.violation))
+    said = f"{count} independent trajectories, confidence 1 − {m.doubt:g}, for the law, arm and reference they ran with"
+    name = "‖δ‖ ≤ a‖q‖ + b‖v‖ + c, chance that a trajectory breaks it"
+    if chance < 0.5:
+        return Claim(name, chance, "", Label.PROBABILISTIC, f"scenario theorem over {said}")
+    because = f"{said}: too few, so the bound describes its own data alone; 374 trajectories give 5 %"
+    return Claim(name, chance, "", Label.EMPIRICAL, because)

@@ -6,7 +6,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nbs_pin.base.claims import Assumption
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.assumptions import (
@@ -26,6 +25,7 @@ from nbs_pin.certificates.assumptions import (
     summed,
 )
 from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Balance, Instants, balance, storage_of
 
 

@@ -10,18 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nbs_pin.certificates.intervals import Interval
-from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
-from nbs_pin.controllers.damping import Damping
-from nbs_pin.controllers.potential import Potential
+from nbs_pin.base.intervals import OUTWARD, Interval
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 
-_OUTWARD = 1.0 + 1e-9
-_CELLS = 400
 _ROUNDS = 12
 
 
 class Loop(NamedTuple):
-    """ż1 = z2 − λ(kz1 + n), Mż2 = −(kz1 + n) − (Mω + d)z2 − e + τ_d."""
+    """ż1 = z2 − λ(kz1 + n), Mż2 = −ζ(kz1 + n) − (Mω + d)z2 − e + τ_d."""
 
     inertia: float
     """M [kg·m²]."""
@@ -33,6 +29,8 @@ class Loop(NamedTuple):
     """2S [N·m/rad]."""
     damping: float
     """D₀ [N·m·s/rad]."""
+    coupling: float = 1.0
+    """ζ."""
 
 
 class Worst(NamedTuple):
@@ -49,77 +47,35 @@ def worst_of(loop: Loop, disturbance: float, curvature: Interval, extra_damping:
 
     curvature: of ψ'' [N·m/rad]. extra_damping: of D − D₀ [N·m·s/rad], both wherever the loop goes.
     """
-    m, lam = loop.inertia, loop.rate
+    if not (np.isfinite(curvature.high) and np.isfinite(extra_damping.high)):
+        return Worst(np.inf, np.inf)
+    m, lam, zeta = loop.inertia, loop.rate, loop.coupling
     k, d = loop.stiffness + float(curvature.middle), loop.damping + float(extra_damping.middle)
     b = d / m + loop.omega
-    value, rate = _norms(lam * k + b, lam * k * b + k / m)
+    value, rate = _norms(lam * k + b, lam * k * b + zeta * k / m)
     torque_to_z1, torque_to_z2 = value / m, (rate + lam * k * value) / m
-    n_to_z1, n_to_z2 = lam * rate + (lam * b + 1.0 / m) * value, rate / m
+    n_to_z1, n_to_z2 = lam * rate + (lam * b + zeta / m) * value, zeta * rate / m
     # |z1| ≤ g₁(τ + e|z2|) + h n₁|z1| and |z2| ≤ g₂(τ + e|z2|) + h n₂|z1|
     h, e = float(curvature.half_width), float(extra_damping.half_width)
     free = np.eye(2) - np.array([[h * n_to_z1, e * torque_to_z1], [h * n_to_z2, e * torque_to_z2]])
     if not (free[0, 0] > 1e-9 and free[1, 1] > 1e-9 and np.linalg.det(free) > 1e-9):
         return Worst(np.inf, np.inf)
     z1, z2 = np.linalg.solve(free, np.array([torque_to_z1, torque_to_z2]) * disturbance)
-    return Worst(float(z1) * _OUTWARD, float(z2) * _OUTWARD)
+    return Worst(float(z1) * OUTWARD, float(z2) * OUTWARD)
 
 
-def worst_error(loop: Loop, disturbance: float, potential: Potential, damping: Damping, within: Worst) -> float:
+def worst_error(loop: Loop, disturbance: float, law: LyapunovLaw, within: Worst) -> float:
     """At least sup |z1| [rad] from z1 = z2 = 0 and limsup |z1| from anywhere, under |τ_d| ≤ `disturbance` [N·m].
 
     within: bounds of |z1| and |z2| known already. ψ'' and T² are bounded there, which bounds z1 and z2 anew, and so on.
     """
     for _ in range(_ROUNDS):
-        found = worst_of(loop, disturbance, curvature(potential, within.z1), extra_damping(damping, within.z2))
+        found = worst_of(loop, disturbance, law.extra_stiffness(within.z1), law.extra_damping(within.z2))
         closer = Worst(min(found.z1, within.z1), min(found.z2, within.z2))
         if closer.z1 > 0.999 * within.z1 and closer.z2 > 0.999 * within.z2:
             return closer.z1
         within = closer
     return within.z1
-
-
-def curvature(potential: Potential, radius: float) -> Interval:
-    """ψ''(z) for |z| ≤ radius [N·m/rad]: y, y' and y'' of each layer on small cells, by interval arithmetic.
-
-    y = σ(a), y' = σ'(a) a', y'' = σ''(a) a'² + σ'(a) a'', with σ and σ' monotone. Any number ≥ 0 for an activation
-    that is not the package's.
-    """
-    scale, activation = float(potential.scale[0]), potential.network.activation
-    if not isinstance(activation, SmoothedReLU | Squareplus):
-        return Interval(np.float64(0.0), np.float64(np.inf))
-    x = Interval.cells(scale * radius, _CELLS)
-    one = Interval.of(np.ones_like(x.low))
-    layers = potential.network.layers(numpy=True)
-    y = dy = ddy = Interval.of(np.zeros((0, *x.low.shape[1:])))
-    for layer in layers:
-        wx, wy = np.asarray(layer.wx), np.zeros((len(layer.wx), 0)) if layer.wy is None else np.asarray(layer.wy)
-        bias = np.float64(0.0) if layer.bias is None else np.asarray(layer.bias)[:, None]
-        a, da, dda = (x.through(wx) + y.through(wy)) + bias, one.through(wx) + dy.through(wy), ddy.through(wy)
-        ends = [activation.derivatives(end) for end in (a.low, a.high)]
-        y, slope = Interval(ends[0][0], ends[1][0]), Interval(ends[0][1], ends[1][1])
-        dy, ddy = slope * da, _bend(activation, a) * da.squared() + slope * dda
-    return ddy.hull().times(scale * scale).widened(_OUTWARD)
-
-
-def extra_damping(damping: Damping, radius: float) -> Interval:
-    """T(z2)² for |z2| ≤ radius [N·m·s/rad], by interval arithmetic on small cells; tanh is monotone."""
-    scale = float(damping.scale[0])
-    x = Interval.cells(scale * radius, _CELLS)
-    layers = damping.diagonal.layers(numpy=True)
-    for i, (weight, bias) in enumerate(layers):
-        x = x.through(np.asarray(weight)) + np.asarray(bias)[:, None]
-        x = Interval(np.tanh(x.low), np.tanh(x.high)) if i < len(layers) - 1 else x
-    return x.squared().hull().times(scale * scale).widened(_OUTWARD)
-
-
-def _bend(activation: SmoothedReLU | Squareplus, a: Interval) -> Interval:
-    """σ'' over the intervals: one hump, of which the ends and the top tell everything."""
-    if isinstance(activation, SmoothedReLU):
-        inside, touching = (a.low > 0.0) & (a.high < activation.d), (a.high >= 0.0) & (a.low <= activation.d)
-        return Interval(inside / activation.d, touching / activation.d)
-    low, high = (activation.derivatives(end)[2] for end in (a.low, a.high))
-    top = activation.derivatives(np.zeros_like(low))[2]
-    return Interval(np.minimum(low, high), np.where((a.low <= 0.0) & (a.high >= 0.0), top, np.maximum(low, high)))
 
 
 def _norms(p1: float, p0: float) -> tuple[float, float]:

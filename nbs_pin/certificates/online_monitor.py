@@ -7,7 +7,6 @@ from typing import NamedTuple, cast
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nbs_pin.base.claims import Assumption
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.assumptions import (
@@ -26,6 +25,7 @@ from nbs_pin.certificates.assumptions import (
     sentence,
 )
 from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Balance, Instants, balance, storage_of
 from nbs_pin.controllers.controller import MemorylessController
 

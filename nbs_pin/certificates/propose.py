@@ -16,7 +16,7 @@ from jaxtyping import Float
 from nbs_pin.base.checks import PerJoint, floats, positive
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.comparison_system import Comparison, level, reach
+from nbs_pin.certificates.comparison_system import ComparisonSystem, level, reach
 from nbs_pin.certificates.loads import sampled
 from nbs_pin.controllers.gains import Gains, effective_inertia, largest_inertia
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -189,7 +189,7 @@ def _potential(gains: Gains, admissible: Admissible) -> float:
     omega = gains.bandwidth
     delta = float((omega * gains.damping / gains.stiffness).min())
     t = float(np.sqrt(admissible.energy(np.diag(1.0 / gains.damping))))
-    comparison = Comparison(rho=omega, delta=delta, kappa=0.0, nu=np.inf, omega=omega, t=t)
+    comparison = ComparisonSystem(rho=omega, delta=delta, kappa=0.0, nu=np.inf, omega=omega, t=t)
     return reach(comparison, level(comparison).storage)
 
 

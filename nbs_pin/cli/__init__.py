@@ -9,8 +9,9 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, TypeAlias, cast
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
+from typing import Annotated, Any, Union, cast
 
 import tyro
 from rich.console import Console
@@ -29,19 +30,19 @@ from nbs_pin.cli.track import Track
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import OptionError
 
-Command: TypeAlias = (
-    Annotated[Track, tyro.conf.subcommand("track")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Collect, tyro.conf.subcommand("collect")]
-    | Annotated[Learn, tyro.conf.subcommand("learn")]
-    | Annotated[Compare, tyro.conf.subcommand("compare")]
-    | Annotated[Certify, tyro.conf.subcommand("certify")]
-    | Annotated[Replay, tyro.conf.subcommand("replay")]
-    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-    | Annotated[Robots, tyro.conf.subcommand("robots")]
-)
-NAMES = ("track", "train", "collect", "learn", "compare", "certify", "replay", "reproduce", "bench", "robots")
+COMMANDS: dict[str, type] = {
+    "track": Track,
+    "train": Train,
+    "collect": Collect,
+    "learn": Learn,
+    "compare": Compare,
+    "certify": Certify,
+    "replay": Replay,
+    "reproduce": Reproduce,
+    "bench": Bench,
+    "robots": Robots,
+}
+"""The options of every command by its name; `nbs_pin.commands` has a module of that name, whose `run` does the work."""
 BAD_INPUT, INTERRUPTED = 2, 130
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` shows the options of a command; "
@@ -101,19 +102,21 @@ def _run(arguments: list[str], notes: Console) -> int:
         return 0
     command = parse(arguments)
     if command is not None:
-        command.run(console, notes)
+        with notes.status("loading"):
+            body = import_module(f"nbs_pin.commands.{arguments[0]}")
+        body.run(command, console, notes)
     return 0
 
 
 def parse(arguments: list[str]) -> Any:
     """The command with its options, None when help was asked for; raises OptionError for words that make no command."""
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in NAMES:
-        raise OptionError(f"no command '{arguments[0]}'; {_near(arguments[0], NAMES)}give {', '.join(NAMES)}.")
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+        raise OptionError(f"no command '{arguments[0]}'; {_near(arguments[0], COMMANDS)}give {', '.join(COMMANDS)}.")
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
             command, unknown = tyro.cli(
-                cast(Any, Command),
+                cast(Any, Union[tuple(_subcommand(name) for name in COMMANDS)]),  # noqa: UP007
                 prog="nbs-pin",
                 description=_DESCRIPTION,
                 args=arguments,
@@ -132,7 +135,11 @@ def parse(arguments: list[str]) -> Any:
     return command
 
 
-def _near(word: str, words: Sequence[str]) -> str:
+def _subcommand(name: str) -> Any:
+    return Annotated[COMMANDS[name], tyro.conf.subcommand(name)]
+
+
+def _near(word: str, words: Iterable[str]) -> str:
     near = difflib.get_close_matches(word.partition("=")[0], words, n=1)
     return f"did you mean {near[0]}? " if near else ""
 

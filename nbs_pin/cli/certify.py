@@ -1,19 +1,15 @@
 """`nbs-pin certify`: what a controller promises before the arm moves, and the worst that an adversary finds."""
 
-import dataclasses
-import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
-from rich.console import Console
 from tyro.constructors import PrimitiveConstructorSpec
 
-from nbs_pin.cli.certificate_tables import print_certificate
-from nbs_pin.cli.folders import check_folder, default, folder_for, made
-from nbs_pin.cli.values import SAVED, OptionError, integer, number, plain_numbers, positive_list
+from nbs_pin.cli.values import OptionError, choice, default, integer, number, plain_numbers, positive_list, text
+from nbs_pin.controllers.registry import LAWS
 
 
 def torque_bounds() -> PrimitiveConstructorSpec[str]:
@@ -28,7 +24,7 @@ def torque_bounds() -> PrimitiveConstructorSpec[str]:
             )
         return words[0]
 
-    return _text("D1,D2,…", parse)
+    return text("D1,D2,…", parse)
 
 
 def friction_text() -> PrimitiveConstructorSpec[str]:
@@ -44,17 +40,7 @@ def friction_text() -> PrimitiveConstructorSpec[str]:
             )
         return words[0]
 
-    return _text("urdf|B,C", parse)
-
-
-def _text(metavar: str, parse: Any) -> PrimitiveConstructorSpec[str]:
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=metavar,
-        instance_from_str=parse,
-        is_instance=lambda value: True,
-        str_from_instance=lambda value: [value or ""],
-    )
+    return text("urdf|B,C", parse)
 
 
 @dataclass(frozen=True)
@@ -70,6 +56,8 @@ class Certify:
 
     controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")]
     """A .nbs file with a controller; or an arm by name or path, for the one that `for_robot` makes for it."""
+    law: Annotated[str, choice("--law", LAWS)] = "nbs"
+    """The law to make for an arm; a .nbs file holds its own."""
     disturbance: Annotated[str | None, torque_bounds(), default("none beside the loads")] = None
     """Largest |τ_d,i| [N·m]: of every joint, or one for each joint, split by commas."""
     norm: bool = False
@@ -114,106 +102,3 @@ class Certify:
     """Folder for the results."""
     force: bool = False
     """Replace the results of another certificate in that folder."""
-
-    def run(self, console: Console, notes: Console) -> None:
-        """Certifies, writes and prints; raises NbsPinError and OSError."""
-        if self.wanted is not None and self.controller.endswith(SAVED):
-            raise OptionError(f"--wanted designs a controller for an arm, and '{self.controller}' is one; give an arm.")
-        with notes.status(f"loading {self.controller}"):
-            from nbs_pin.base.records import Run
-            from nbs_pin.base.versions import versions
-            from nbs_pin.cli import certifying
-
-            controller = self._controller()
-            task = self._task(controller)
-            robot = certifying.arm_of(controller, task)
-            run = None if self.monitor is None else Run.load(self.monitor)
-        folder = folder_for(self.out, "certify", robot.name)
-        facts = {"settings": self._settings(robot.source), "versions": versions(), "robot_sha256": robot.sha256}
-        names = (*certifying.FILES, certifying.MONITOR, certifying.DESIGNED)
-        check_folder(folder, names, facts, self.force, whose="another certificate")
-        with made(folder):
-            proposal = None
-            if self.wanted is not None:
-                wanted = plain_numbers(self.wanted) or []
-                error = wanted[0] if len(wanted) == 1 else wanted
-                proposal = certifying.design(robot, task, error, period=self.period)
-                controller, task = proposal.controller, dataclasses.replace(task, period=proposal.period)
-            result = certifying.certify_controller(
-                controller, task, thorough=self.attack, run=run, proposal=proposal, progress=True
-            )
-            with notes.status(f"drawing the picture into {folder}"):
-                figures, written = certifying.write_results(result, folder, facts)
-        law = Path(self.controller).name if self.controller.endswith(SAVED) else "a law made for it"
-        print_certificate(console, f"{robot.name}, {law}", figures)
-        for path in written:
-            console.print(str(path), soft_wrap=True, highlight=False, markup=False)
-
-    def _controller(self) -> Any:
-        """The one to certify; with --wanted one whose arm counts alone."""
-        from nbs_pin.cli.certifying import controller_of
-
-        return controller_of(self.controller, bandwidth=self.bandwidth, period=self.period or 0.001, seed=self.seed)
-
-    def _task(self, controller: Any) -> Any:
-        """Where and against what to certify; raises OptionError for options that do not fit each other."""
-        from nbs_pin.certificates.loads import MARGIN
-        from nbs_pin.certificates.model_structure import is_exact
-        from nbs_pin.cli.certifying import TRAJECTORIES, Task, arm_of, box_or_ball
-        from nbs_pin.motions.by_name import motion_of
-        from nbs_pin.robots.robot import load_robot
-
-        self._check_options()
-        period = self.period or 0.001
-        truth = None if self.against is None else load_robot(self.against)
-        blank = Task(reference=_no_motion, truth=truth)
-        robot = arm_of(controller, blank)
-        if self.trajectories is not None and is_exact(controller.dynamics, robot):
-            raise OptionError(
-                f"--trajectories is about a model that is not exact, and this one is that of {robot.name} itself; "
-                "leave it out, or give the true arm with --against."
-            )
-        motion, duration = motion_of(self.reference, robot, frequency=self.frequency, period=period)
-        coefficients = None if self.friction in (None, "urdf") else plain_numbers(str(self.friction)) or []
-        numbers = None if self.disturbance is None else plain_numbers(self.disturbance) or []
-        return dataclasses.replace(
-            blank,
-            reference=motion,
-            duration=duration,
-            period=period,
-            disturbance=None if numbers is None else box_or_ball(numbers, robot.nv, norm=self.norm),
-            payload=self.payload,
-            link=self.link,
-            friction=self.friction if coefficients is None else (coefficients[0], coefficients[1]),
-            gravity_error=self.gravity_error,
-            margin=MARGIN if self.margin is None else self.margin,
-            start_error=self.start_error,
-            trajectories=self.trajectories or TRAJECTORIES,
-            seed=self.seed,
-        )
-
-    def _check_options(self) -> None:
-        """Raises OptionError for options about others that were not given."""
-        loads = {"--payload": self.payload, "--friction": self.friction, "--gravity-error": self.gravity_error}
-        if self.norm and self.disturbance is None:
-            raise OptionError("--norm is about --disturbance; give that too.")
-        if self.link is not None and self.payload is None:
-            raise OptionError("--link is about --payload; give that too.")
-        if self.margin is not None and all(load is None for load in loads.values()):
-            raise OptionError(f"--margin is about {', '.join(loads)}; give one of them too.")
-
-    def _settings(self, robot: str) -> dict[str, Any]:
-        """Everything that decides the figures, as JSON can store it."""
-        settings = dataclasses.asdict(self) | {"against": robot}
-        for name in ("out", "force"):
-            del settings[name]
-        for name in ("controller", "monitor", "reference"):
-            path = Path(str(settings[name]))
-            settings[name] = None if settings[name] is None else str(settings[name])
-            if path.is_file():
-                settings[f"{name}_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-        return settings
-
-
-def _no_motion(t: Any) -> Any:
-    raise OptionError("no reference was chosen; give --reference.")

@@ -1,18 +1,12 @@
 """`nbs-pin collect`: motions of an arm in MuJoCo, to learn its dynamics from."""
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from nbs_pin.cli.folders import check_folder, default, folder_for, made
-from nbs_pin.cli.values import OptionError, integer, number
+from nbs_pin.cli.values import default, integer, number
 
 
 @dataclass(frozen=True)
@@ -53,61 +47,3 @@ class Collect:
     """Folder for the results."""
     force: bool = False
     """Replace other data in that folder."""
-
-    def run(self, console: Console, notes: Console) -> None:
-        """Collects, writes and prints; raises NbsPinError and OSError."""
-        with notes.status(f"loading {self.robot}"):
-            from nbs_pin.base.versions import versions
-            from nbs_pin.cli import collecting
-            from nbs_pin.identification.collect import collect
-            from nbs_pin.identification.measurement import Noise
-            from nbs_pin.robots.robot import load_robot
-
-            robot = load_robot(self.robot)
-        if self.friction and not (robot.damping.any() or robot.friction.any()):
-            raise OptionError(f"--friction was given, but the URDF of {robot.name} states none; leave it out.")
-        folder = folder_for(self.out, "collect", robot.name)
-        facts = {"settings": self._settings(robot.source), "versions": versions(), "robot_sha256": robot.sha256}
-        check_folder(folder, collecting.FILES, facts, self.force, whose="other data")
-        with made(folder):
-            data = collect(
-                robot,
-                self.recipe,
-                self.samples,
-                self.seed,
-                noise=Noise(0.0 if self.encoder_bits is None else 2.0**-self.encoder_bits, self.torque_noise),
-                acceleration="differentiated" if self.differentiated else None,
-                friction=self.friction,
-                sampling=self.sampling,
-                duration=self.duration,
-                speed=self.speed,
-                progress=True,
-            )
-            with notes.status(f"writing into {folder}"):
-                figures = collecting.write_results(data, folder, robot, facts)
-        _print(console, f"{robot.name}, {self.recipe}", figures)
-        for name in collecting.FILES:
-            console.print(str(folder / name), soft_wrap=True, highlight=False, markup=False)
-
-    def _settings(self, robot: str) -> dict[str, Any]:
-        """Everything that decides the data, as JSON can store it."""
-        settings = dataclasses.asdict(self) | {"robot": robot}
-        for name in ("out", "force"):
-            del settings[name]
-        return settings
-
-
-def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """A row per joint; `figures` as `studies.collecting.figures` gives them."""
-    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    table.add_column("joint", overflow="fold")
-    headings = ("q from\n[rad]", "to\n[rad]", "RMS v\n[rad/s]", "RMS acc.\n[rad/s²]", "RMS τ\n[N·m]", "at limit")
-    for heading in headings:
-        table.add_column(Text(heading), justify="right", no_wrap=True)
-    columns = ("q_least_rad", "q_most_rad", "rms_velocity_rad_per_s", "rms_acceleration_rad_per_s2", "rms_torque_Nm")
-    numbers = zip(*(figures[name] for name in columns), strict=True)
-    for joint, row, saturated in zip(figures["joints"], numbers, figures["at_torque_limit_fraction"], strict=True):
-        table.add_row(Text(joint), *(f"{x:.3g}" for x in row), f"{saturated:.1%}")
-    console.print(table)
-    plural = "trajectory" if figures["trajectories"] == 1 else "trajectories"
-    console.print(f"{figures['samples']} samples of {figures['trajectories']} {plural}", highlight=False)

@@ -1,19 +1,13 @@
 """`nbs-pin learn`: a model of an arm from its data, and how well it explains motions that it never saw."""
 
-import dataclasses
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from nbs_pin.cli.folders import check_folder, default, folder_for, made
-from nbs_pin.cli.values import integer, number
+from nbs_pin.cli.values import choice, default, integer, number
+from nbs_pin.identification.registry import MODELS
 
 
 @dataclass(frozen=True)
@@ -28,7 +22,7 @@ class Learn:
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """Data of nbs-pin collect, or a log: CSV or NPZ with t, q, tau and, if there are any, v and a."""
-    model: Literal["chain", "cholesky", "homogenised", "picnn", "unconstrained", "residual", "identified"] = "chain"
+    model: Annotated[str, choice("--model", MODELS)] = "chain"
     """A rigid tree found from the order of the joints alone; M = LLᵀ + εI by a network; a convex network made
     quadratic; the paper's convex network; a Lagrangian without structure; a network that corrects the arm's URDF; or
     inertias by least squares in the geometry of the URDF."""
@@ -54,82 +48,3 @@ class Learn:
     """Folder for the results."""
     force: bool = False
     """Replace another model in that folder."""
-
-    def run(self, console: Console, notes: Console) -> None:
-        """Learns, writes and prints; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
-        with notes.status(f"loading {self.data}"):
-            from nbs_pin.base.versions import versions
-            from nbs_pin.cli import learning
-
-            data, robot = learning.data_and_arm(self.data, self.robot)
-        name = self.data.stem if robot is None else robot.name
-        folder = folder_for(self.out, "learn", name)
-        sha = None if robot is None else robot.sha256
-        facts = {"settings": self._settings(), "versions": versions(), "robot_sha256": sha}
-        check_folder(folder, learning.FILES, facts | {"interrupted": False}, self.force, whose="another model")
-        given = {name: getattr(self, name) for name in ("optimiser", "iterations")}
-        given["loss"] = None if self.loss == "torque" else self.loss  # which every model minimises
-        with made(folder):
-            result = learning.learn(
-                data,
-                self.model,
-                robot,
-                self.seed,
-                held_out=self.held_out,
-                friction=self.friction,
-                progress=True,
-                **{name: value for name, value in given.items() if value is not None},
-            )
-            interrupted = result.report.stopped == "interrupted"
-            with notes.status(f"writing into {folder}"):
-                figures = learning.write_results(result, folder, facts | {"interrupted": interrupted})
-        _print(console, f"{name}, {self.model}", figures)
-        for file in learning.FILES:
-            console.print(str(folder / file), soft_wrap=True, highlight=False, markup=False)
-        if interrupted:
-            raise KeyboardInterrupt
-
-    def _settings(self) -> dict[str, Any]:
-        """Everything that decides the model, as JSON can store it."""
-        settings = dataclasses.asdict(self) | {"data_sha256": hashlib.sha256(self.data.read_bytes()).hexdigest()}
-        for name in ("data", "out", "force"):
-            del settings[name]
-        return settings
-
-
-def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """A row per joint, then what counts for the whole arm."""
-    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    table.add_column("joint", overflow="fold")
-    for heading in ("torque\ndeviation [N·m]", "error [N·m]", "error, held\nout [N·m]", "friction\n[N·m·s, N·m]"):
-        table.add_column(Text(heading), justify="right", no_wrap=True)
-    for i, joint in enumerate(figures["joints"]):
-        test, viscous = figures["rms_test_torque_error_Nm"], figures["viscous_friction"]
-        table.add_row(
-            Text(joint),
-            f"{figures['torque_deviation_Nm'][i]:.4g}",
-            f"{figures['rms_torque_error_Nm'][i]:.2e}",
-            "none" if test is None else f"{test[i]:.2e}",
-            "none" if viscous is None else f"{viscous[i]:.3g}, {figures['coulomb_friction_Nm'][i]:.3g}",
-        )
-    console.print(table)
-    for line in _lines(figures):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
-
-
-def _lines(figures: dict[str, Any]) -> list[str]:
-    train, test = (figures[name] for name in ("train_nmse", "test_nmse"))
-    ended = {"held out": "no better on what was held out", "iterations": "all iterations done"}
-    shown, more = figures["unexcited"][:3], len(figures["unexcited"]) - 3
-    return [
-        f"mean square of the torque error over the torque's variance: {_short(train)} on {figures['samples']} samples"
-        + ("" if test is None else f", {_short(test)} on {figures['test_samples']} of trajectories held out"),
-        f"{figures['parameters']} numbers learned in {figures['seconds']:.1f} s "
-        f"({ended.get(figures['stopped'], figures['stopped'])})",
-        *(f"the data leave open: {text}" for text in shown),
-        *([f"… and {more} more in summary.json"] if more > 0 else []),
-    ]
-
-
-def _short(value: float | None) -> str:
-    return "none" if value is None else f"{value:.2e}"

@@ -1,18 +1,14 @@
 """`nbs-pin train`: a controller learns through the closed loop, and says what it gained on starts it never saw."""
 
-import dataclasses
-import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
-from rich.console import Console
 
-from nbs_pin.cli.folders import check_folder, default, folder_for, made
-from nbs_pin.cli.tables import print_training
-from nbs_pin.cli.values import OptionError, controller_text, integer, number, plain_numbers, positive_list
+from nbs_pin.cli.values import SAVED, choice, default, integer, number, positive_list
+from nbs_pin.controllers.registry import LAWS
 
 
 @dataclass(frozen=True)
@@ -27,7 +23,7 @@ class Train:
 
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
     """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
-    controller: Annotated[str, controller_text()] = "nbs"
+    controller: Annotated[str, choice("--controller", LAWS, SAVED)] = "nbs"
     """The law to begin with, by name, or a saved controller to train on."""
     frequencies: Annotated[str, positive_list("--frequencies", most=1000.0, unit="rad/s")] = "0.5,1,2"
     """Sinusoids to follow, fitted to the arm: their frequencies [rad/s], split by commas."""
@@ -71,60 +67,3 @@ class Train:
     """Go on with the training in that folder, as if it had never stopped."""
     force: bool = False
     """Replace the results of another training in that folder."""
-
-    def run(self, console: Console, notes: Console) -> None:
-        """Trains, writes and prints; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
-        if self.no_effort_limit and self.effort_limit is not None:
-            raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
-        with notes.status(f"loading {self.robot}"):
-            from nbs_pin.base.versions import versions
-            from nbs_pin.robots.robot import load_robot
-            from nbs_pin.training import train_robot as training
-
-            robot = load_robot(self.robot)
-        if self.no_effort_limit or self.effort_limit is not None:
-            robot = robot.with_effort_limit(self.effort_limit or math.inf)
-        folder = folder_for(self.out, "train", robot.name)
-        facts = {"settings": self._settings(robot.source), "versions": versions(), "robot_sha256": robot.sha256}
-        if not self.resume:
-            whole, names = facts | {"interrupted": False}, (training.CHECKPOINT, *training.FILES)
-            whose, remedy = "another or an unfinished training", "give another --out, --resume to go on with it"
-            check_folder(folder, names, whole, self.force, whose=whose, remedy=remedy)
-        with made(folder):
-            result = training.train_robot(
-                robot,
-                controller=self.controller,
-                bandwidth=self.bandwidth,
-                frequencies=tuple(plain_numbers(self.frequencies) or ()),
-                starts=self.starts,
-                start_error=self.start_error,
-                duration=self.duration,
-                period=self.period,
-                epochs=self.epochs,
-                cost=self.cost,
-                optimiser=self.optimiser,
-                learning_rate=self.learning_rate,
-                patience=self.patience,
-                gains=not self.fixed_gains,
-                seed=self.seed,
-                folder=folder,
-                resume=self.resume,
-                progress=True,
-            )
-            interrupted = result.training.stopped == "interrupted"
-            with notes.status(f"drawing the picture into {folder}"):
-                figures = training.write_results(result, folder, facts | {"interrupted": interrupted})
-        print_training(console, f"{robot.name}, {self.controller}", figures)
-        for name in training.FILES:
-            console.print(str(folder / name), soft_wrap=True, highlight=False, markup=False)
-        if interrupted:
-            raise KeyboardInterrupt
-
-    def _settings(self, robot: str) -> dict[str, Any]:
-        """Everything that decides the training, as JSON can store it."""
-        settings = dataclasses.asdict(self) | {"robot": robot}
-        for name in ("out", "resume", "force"):
-            del settings[name]
-        if Path(self.controller).is_file():
-            settings["controller_sha256"] = hashlib.sha256(Path(self.controller).read_bytes()).hexdigest()
-        return settings

@@ -3,18 +3,17 @@
 import difflib
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
+import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from nbs_pin.base.exceptions import NbsPinError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INTEGER = re.compile(r"[0-9]+")
-LAWS = ("nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid")
-"""Laws by name; those that `studies.tracking.build_controller` knows, which is too heavy to ask here."""
 SAVED = ".nbs"
 """How the name of a saved controller ends."""
 DisturbanceKind: TypeAlias = Literal["constant", "square", "sine", "noise"]
@@ -64,17 +63,29 @@ def positive_list(flag: str, most: float, unit: str) -> PrimitiveConstructorSpec
     return _spec("W1,W2,…", parse, str)
 
 
-def controller_text() -> PrimitiveConstructorSpec[str]:
-    """The name of a law, or a path that ends in .nbs, for tyro; raises OptionError for any other text."""
+def choice(flag: str, names: Iterable[str], ending: str = "") -> PrimitiveConstructorSpec[str]:
+    """One of the names, or with an ending a path that ends so, for tyro; raises OptionError for any other text."""
+    known = tuple(names)
+    file = f" or a {ending} file" if ending else ""
 
     def parse(words: list[str]) -> str:
-        if words[0] not in LAWS and not words[0].endswith(SAVED):
-            near = difflib.get_close_matches(words[0], LAWS, n=1)
+        if words[0] not in known and not (ending and words[0].endswith(ending)):
+            near = difflib.get_close_matches(words[0], known, n=1)
             hint = f"did you mean {near[0]}? " if near else ""
-            raise OptionError(f"no controller '{words[0]}'; {hint}give {', '.join(LAWS)}, or a {SAVED} file.")
+            raise OptionError(f"{flag} is '{words[0]}'; {hint}give {', '.join(known)}{file}.")
         return words[0]
 
-    return _spec(f"{{{','.join(LAWS)},FILE{SAVED}}}", parse, str)
+    return _spec(f"{{{','.join((*known, *([f'FILE{ending}'] if ending else [])))}}}", parse, str)
+
+
+def default(hint: str) -> Any:
+    """What --help says of an option whose default is worked out later."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {hint})")
+
+
+def text(metavar: str, parse: Callable[[list[str]], str]) -> PrimitiveConstructorSpec[str]:
+    """A text that `parse` has checked, for tyro."""
+    return _spec(metavar, parse, str)
 
 
 def integer(flag: str, most: int, least: int = 0) -> PrimitiveConstructorSpec[int]:

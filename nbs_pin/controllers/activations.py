@@ -3,10 +3,14 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import Array, array_namespace
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.intervals import Interval
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.kernels.layout import SMOOTHED_RELU, SQUAREPLUS
 
 
@@ -21,10 +25,16 @@ class Activation(ABC):
 
     @property
     def kernel(self) -> tuple[int, float] | None:
-        """Code and parameter of its compiled form (`runtime/layout.py`), or None where there is none."""
+        """Code and parameter of its compiled form (`kernels/layout.py`), or None where there is none."""
         return None
 
+    def curvature_range(self, a: Interval) -> Interval:
+        """Where σ'' lies over the intervals; anything ≥ 0 unless the activation says more."""
+        return Interval(0.0 * a.low, np.inf + 0.0 * a.high)
 
+
+@known_code
+@storable(("d",))
 @dataclass(frozen=True)
 class SmoothedReLU(Activation):
     """The paper's choice: 0 (x ≤ 0), x²/2d (0 < x < d), x − d/2 (x ≥ d).
@@ -53,7 +63,14 @@ class SmoothedReLU(Activation):
         """Code and parameter of the compiled form."""
         return SMOOTHED_RELU, self.d
 
+    def curvature_range(self, a: Interval) -> Interval:
+        """1/d between the switches, 0 outside."""
+        inside, touching = (a.low > 0.0) & (a.high < self.d), (a.high >= 0.0) & (a.low <= self.d)
+        return Interval(inside / self.d, touching / self.d)
 
+
+@known_code
+@storable(("b",))
 @dataclass(frozen=True)
 class Squareplus(Activation):
     """σ(x) = ½(x + √(x² + b)): smooth everywhere, algebraic, and close to ReLU beyond |x| ≈ √b.
@@ -78,3 +95,9 @@ class Squareplus(Activation):
     def kernel(self) -> tuple[int, float]:
         """Code and parameter of the compiled form."""
         return SQUAREPLUS, self.b
+
+    def curvature_range(self, a: Interval) -> Interval:
+        """σ'' is one hump: its least is at an end, its largest at an end or at 0."""
+        low, high = (self.derivatives(end)[2] for end in (a.low, a.high))
+        top = self.derivatives(np.zeros_like(low))[2]
+        return Interval(np.minimum(low, high), np.where((a.low <= 0.0) & (a.high >= 0.0), top, np.maximum(low, high)))

@@ -4,7 +4,16 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import Array, as_vectors
-from nbs_pin.controllers.gains import PerJoint, PositiveGains, gains_for_robot, largest_inertia, warn_if_too_fast
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
+from nbs_pin.controllers.gains import (
+    PerJoint,
+    PositiveGains,
+    gains_for_robot,
+    largest_inertia,
+    stored_gains,
+    warn_if_too_fast,
+)
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -13,6 +22,8 @@ from nbs_pin.kernels.layout import COMPUTED_TORQUE, Packed
 from nbs_pin.robots.robot import Robot
 
 
+@known_code
+@storable(parts=("dynamics", "friction"), arrays=stored_gains("kp", "kd"))
 class ComputedTorque(ModelLaw):
     """τ = M(a_d − k_d ż1 − k_p z1) + C v + G, so that z̈1 + k_d ż1 + k_p z1 = M⁻¹τ_d.
 
@@ -68,8 +79,8 @@ class ComputedTorque(ModelLaw):
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
 
     @property
-    def _is_known(self) -> bool:
-        return type(self) is ComputedTorque
+    def _has_kernel(self) -> bool:
+        return True
 
     def _packed(self, numpy: bool) -> Packed:
         kp, kd = self.gains.value(numpy=numpy)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.base.arrays import Array, is_torch_array
+from nbs_pin.base.known_code import known_code
 from nbs_pin.controllers.activations import Activation
 
 
@@ -19,6 +20,7 @@ class ConvexLayer(NamedTuple):
     bias: Array | None
 
 
+@known_code
 class FICNN(nn.Module):
     """f(x): ℝⁿ → ℝ, convex for every parameter value (paper eq. (6), Amos et al. 2017).
 

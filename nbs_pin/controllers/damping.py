@@ -1,7 +1,9 @@
 """The damping matrix D(z2): positive definite for every parameter value."""
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,12 +13,26 @@ from torch import nn
 
 from nbs_pin.base.arrays import Array, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.controllers.gain import Gain, positive_definite, positive_scale
+from nbs_pin.base.intervals import OUTWARD, Interval
+from nbs_pin.base.known_code import is_known, known_code
+from nbs_pin.base.storable import Tensors, storable
+from nbs_pin.base.tensors import positive_definite, positive_scale
+from nbs_pin.controllers.gain import Gain
 from nbs_pin.kernels.layout import Packed, pack_damping
 
 DAMPINGS = ("bounded", "paper")
+_CELLS = 400  # intervals that [−radius, radius] is cut into
 
 
+def _stored(t: Tensors) -> Mapping[str, Any]:
+    sizes = {"nv": len(t["scale"]), "scale": t["scale"], "widths": t.widths("diagonal.w")}
+    if "floor.nominal" not in t:
+        return sizes
+    return sizes | {"floor": t["floor.nominal"], "least_share": float(t["floor.least_share"])}
+
+
+@known_code
+@storable(("form", "m"), arrays=_stored)
 class Damping(nn.Module):
     """D(z) = D₀ + R T(Rz)ᵀT(Rz) R [N·m·s/rad], T lower triangular from two tanh networks (docs/theory.md §4).
 
@@ -98,7 +114,7 @@ class Damping(nn.Module):
     @property
     def is_packable(self) -> bool:
         """Whether all parts are the ones the kernels know, and not those of a subclass."""
-        return (type(self), type(self.diagonal), type(self.lower)) == (Damping, _FCNN, _FCNN)
+        return all(map(is_known, (self, self.diagonal, self.lower)))
 
     def packed(self, *, numpy: bool = True) -> Packed:
         """The weights as the compiled form of `force` takes them (`runtime/damping.py`).
@@ -109,12 +125,23 @@ class Damping(nn.Module):
         d0, r = self._constants(numpy=numpy)
         return pack_damping(networks, self.form == "paper", self.m, r, d0)
 
+    def excess(self, radius: float) -> Interval:
+        """Where T(z)² lies for |z| ≤ radius [rad/s], for one joint [N·m·s/rad]: tanh is monotone on small cells."""
+        scale = float(self.scale[0])
+        x = Interval.cells(scale * radius, _CELLS)
+        layers = self.diagonal.layers(numpy=True)
+        for i, (weight, bias) in enumerate(layers):
+            x = x.through(weight) + bias[:, None]
+            x = Interval(np.tanh(x.low), np.tanh(x.high)) if i < len(layers) - 1 else x
+        return x.squared().hull().times(scale * scale).widened(OUTWARD)
+
     def _constants(self, *, numpy: bool) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         r = self.scale.numpy(force=True) if numpy else self.scale
         zero = array_namespace(r).zeros((self.nv, self.nv), dtype=r.dtype, device=device(r))
         return zero if self.floor is None else self.floor.like(r), r
 
 
+@known_code
 class _FCNN(nn.Module):
     """Tanh hidden layers, linear output; starts like the authors', U(−gain, gain) and no bias (docs/theory.md §8)."""
 

@@ -1,14 +1,16 @@
 """Gains that training may change, but never below a share of where they began."""
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.base.arrays import Array, array_namespace, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.tensors import positive_definite, positive_scale
 
 
+@known_code
 class Gain(nn.Module):
     """G(s) = φG₀ + (1 − φ) E G₀ E with E = diag(eˢ): a positive vector (n,) or a positive definite matrix (n, n).
 
@@ -54,30 +56,3 @@ class Gain(nn.Module):
     def numpy(self) -> Float[Array, " n"] | Float[Array, "n n"]:
         """G as a numpy array of its own."""
         return self.value(numpy=True)
-
-
-def positive_definite(name: str, matrix: Float[Array, "n n"]) -> Float[torch.Tensor, "n n"]:
-    """The matrix as a float64 tensor; raises ArgumentError unless it is symmetric positive definite."""
-    tensor = _copied(matrix)
-    square = tensor.ndim == 2 and tensor.shape[0] == tensor.shape[1]
-    if not square or not bool(torch.isfinite(tensor).all()) or not torch.equal(tensor, tensor.T):
-        raise ArgumentError(
-            f"{name} of shape {tuple(tensor.shape)} is not a finite symmetric matrix; give an n × n one."
-        )
-    smallest = float(torch.linalg.eigvalsh(tensor)[0])
-    if not smallest > 0.0:
-        raise ArgumentError(f"{name} has the eigenvalue {smallest:.3g}; give a positive definite matrix.")
-    return tensor
-
-
-def positive_scale(name: str, scale: Float[Array, " n"] | None, nv: int) -> Float[torch.Tensor, " n"]:
-    """The scale as a float64 tensor of shape (nv,), ones for None; raises ArgumentError unless all are positive."""
-    tensor = torch.ones(nv, dtype=torch.float64) if scale is None else _copied(scale)
-    if tensor.shape != (nv,) or not bool((tensor > 0.0).all() & torch.isfinite(tensor).all()):
-        raise ArgumentError(f"{name} is {tensor.tolist()}; give {nv} positive numbers.")
-    return tensor
-
-
-def _copied(x: Array) -> torch.Tensor:
-    """A float64 tensor of its own; numpy copies first, because torch warns of arrays that cannot be written."""
-    return x.detach().clone().double() if is_torch_array(x) else torch.from_numpy(np.array(x, dtype=float))

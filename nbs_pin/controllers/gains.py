@@ -1,8 +1,9 @@
 """Gains for an arm that nobody tuned, from its inertia and its effort limits."""
 
 import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -10,6 +11,8 @@ from torch import nn
 
 from nbs_pin.base.arrays import Array, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import Tensors
 from nbs_pin.controllers.gain import Gain
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robots.robot import Robot
@@ -128,6 +131,7 @@ def positive_gains(nv: int, **gains: PerJoint) -> tuple[Float[np.ndarray, " n"],
     return tuple(np.full(nv, gain) for gain in arrays.values())
 
 
+@known_code
 class PositiveGains(nn.ModuleDict):
     """Gains by name, one positive number per joint each; training may make them anything positive (`Gain`, φ = 0).
 
@@ -148,4 +152,13 @@ class PositiveGains(nn.ModuleDict):
 
     def numpy(self, name: str) -> Float[np.ndarray, " n"]:
         """The gain of that name."""
-        return cast(Gain, self[name]).numpy()
+        return self.named(name).numpy()
+
+    def named(self, name: str) -> Gain:
+        """The gain of that name with what training may change of it."""
+        return cast(Gain, self[name])
+
+
+def stored_gains(*names: str) -> Callable[[Tensors], Mapping[str, Any]]:
+    """The gains of a law that its tensors hold, when they are its `PositiveGains` (`base/storable.py`)."""
+    return lambda t: {name: t[f"gains.{name}.nominal"].numpy(force=True) for name in names}

@@ -1,11 +1,11 @@
 """What every law with a model of the arm is: a belief, friction to feed forward, parameters and a compiled form."""
 
-from abc import abstractmethod
 from typing import Any
 
 from torch import nn
 
 from nbs_pin.base.arrays import Array
+from nbs_pin.base.known_code import is_known
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
@@ -32,8 +32,8 @@ class ModelLaw(MemorylessController, nn.Module):
     @property
     def packable(self) -> bool:
         """Whether law, error and friction are the ones the kernels know, and not those of a subclass."""
-        known = type(self.dynamics).difference is DynamicsProvider.difference
-        return known and type(self.friction) in (JointFriction, type(None)) and self._is_known
+        wraps = type(self.dynamics).difference is DynamicsProvider.difference
+        return wraps and is_known(self) and (self.friction is None or is_known(self.friction)) and self._has_kernel
 
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """Constants and weights for the kernels (`Controller.packed_law`)."""
@@ -44,13 +44,13 @@ class ModelLaw(MemorylessController, nn.Module):
         return CompiledController(self.packed_law(), self.dynamics) if self.packable else self
 
     @property
-    @abstractmethod
-    def _is_known(self) -> bool:
-        """Whether this is the law itself and its parts are known; a subclass may have another torque."""
+    def _has_kernel(self) -> bool:
+        """Whether the law and its parts have a kernel; a law that says nothing runs as it is written."""
+        return False
 
-    @abstractmethod
     def _packed(self, numpy: bool) -> Packed:
-        """`packed_law` of a law that is packable."""
+        """`packed_law` of a law that has a kernel."""
+        raise NotImplementedError
 
     def _pack(self, law: int, gains: tuple[Array, Array], **parts: Any) -> Packed:
         """The law of that code (`runtime/layout.py`) with its gains; parts: those of `layout.pack_law`."""

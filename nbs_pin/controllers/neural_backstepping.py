@@ -1,18 +1,32 @@
 """The neural backstepping (NBS) law: tracking that is stable for every value of its network weights."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, array_namespace, as_vectors, matvec
+from nbs_pin.base.arrays import Array, as_vectors
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.intervals import Interval
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import Tensors, storable
+from nbs_pin.base.tensors import positive_scale
 from nbs_pin.controllers.damping import Damping
-from nbs_pin.controllers.gain import Gain, positive_scale
+from nbs_pin.controllers.gain import Gain
 from nbs_pin.controllers.gains import Gains, gains_for_robot, warn_if_too_fast
-from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.controllers.lyapunov_law import Lyapunov, LyapunovLaw
+from nbs_pin.controllers.part_claims import (
+    check_kind,
+    check_parts,
+    damping_claims,
+    friction_claims,
+    potential_claims,
+    rate_claims,
+)
 from nbs_pin.controllers.potential import Potential
 from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.kernels.layout import BACKSTEPPING, Packed
 from nbs_pin.robots.robot import Robot
@@ -20,24 +34,13 @@ from nbs_pin.robots.robot import Robot
 DAMPINGS = ("inertial", "bounded", "paper")
 
 
-class Errors(NamedTuple):
-    """The signals of one backstepping step, each of shape (..., nv) but the value."""
-
-    z1: Array
-    """q ⊖ q_d [rad]."""
-    z2: Array
-    """v − v_r [rad/s]."""
-    v_r: Array
-    """Reference velocity φ = v_d − Λ∇Φ(z1) [rad/s]."""
-    a_r: Array
-    """Reference acceleration φ̇ = a_d − Λ∇²Φ(z1)(v − v_d) [rad/s²]."""
-    gradient: Array
-    """∇Φ(z1) [N·m]."""
-    value: Array
-    """Φ(z1) [J], shape (...)."""
+def _stored(t: Tensors) -> Mapping[str, Any]:
+    return {"rate": t["rate.nominal"], "least_share": float(t["rate.least_share"])}
 
 
-class NeuralBackstepping(ModelLaw):
+@known_code
+@storable(("inertial_rate",), parts=("dynamics", "friction", "potential", "damping"), arrays=_stored)
+class NeuralBackstepping(LyapunovLaw):
     """τ = M(φ̇ − ωz2) + C(q, v)φ + G − ∇Φ(z1) − D(z2)z2 with φ = v_d − Λ∇Φ(z1), z1 = q ⊖ q_d, z2 = v − φ.
 
     With V = Φ + ½z2ᵀM z2:  V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ(ωM + D)z2 + z2ᵀτ_d for every weight of Φ and D (docs/theory.md §2).
@@ -98,8 +101,6 @@ class NeuralBackstepping(ModelLaw):
         The paper's networks with S = I, Λ = I are built by hand: see `paper_controller`.
         Raises ArgumentError for unknown names or numbers out of range.
         """
-        from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-
         if damping not in DAMPINGS:
             raise ArgumentError(f"damping '{damping}' is unknown; choose one of {', '.join(DAMPINGS)}.")
         dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
@@ -115,13 +116,6 @@ class NeuralBackstepping(ModelLaw):
         omega = chosen.bandwidth if damping == "inertial" else 0.0
         return cls(dynamics, phi, d, rate=chosen.rate, inertial_rate=omega, friction=friction, least_share=least_share)
 
-    def errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
-        """The backstepping signals for the state (q, v) and the reference, all of shape (..., nv).
-
-        Raises ArgumentError when shapes or array kinds do not fit.
-        """
-        return self._errors(*as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref))
-
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
         """τ [N·m]; the ωM part of the damping joins the reference acceleration and costs nothing.
 
@@ -133,29 +127,52 @@ class NeuralBackstepping(ModelLaw):
         tau = feedforward - e.gradient - self.damping.force(e.z2)
         return tau if self.friction is None else tau + self.friction.torque(e.v_r)
 
-    def storage(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
-        """V = Φ(z1) + ½z2ᵀM(q)z2 [J], the Lyapunov function of the closed loop."""
-        q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
-        e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
-        return e.value + 0.5 * _dot(e.z2, matvec(self.dynamics.mass_matrix(q), e.z2))
+    def potential_terms(self, z1: Array, dz: Array) -> tuple[Array, Array, Array]:
+        """Φ, ∇Φ and ∇²Φ dz of the potential network."""
+        return self.potential.terms(z1, dz)
 
-    def dissipation(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
-        """∇ΦᵀΛ∇Φ + z2ᵀ(ωM + D)z2 [W]: the rate at which V falls without disturbance and friction."""
-        q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
-        e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
-        force = self.inertial_rate * matvec(self.dynamics.mass_matrix(q), e.z2) + self.damping.force(e.z2)
-        return _dot(e.gradient, self.rate.like(e.gradient) * e.gradient) + _dot(e.z2, force)
+    def damping_force(self, z2: Array) -> Float[Array, "*batch n"]:
+        """D(z2)z2 [N·m] of the damping network."""
+        return self.damping.force(z2)
 
-    def _errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
-        rate = self.rate.like(q)
-        z1 = self.dynamics.difference(q, q_ref)
-        value, gradient, gradient_rate = self.potential.terms(z1, v - v_ref)
-        v_r = v_ref - rate * gradient
-        return Errors(z1, v - v_r, v_r, a_ref - rate * gradient_rate, gradient, value)
+    def damping_matrix(self, z2: Array) -> Float[Array, "*batch n n"]:
+        """D(z2) [N·m·s/rad] of the damping network."""
+        return self.damping.matrix(z2)
+
+    def rate_like(self, x: Array) -> Float[Array, " n"]:
+        """Λ [rad/s per N·m] in the kind of x."""
+        return self.rate.like(x)
+
+    def extra_stiffness(self, radius: float) -> Interval:
+        """ψ'' of an arm of one joint [N·m/rad]."""
+        return self.potential.curvature(radius)
+
+    def extra_damping(self, radius: float) -> Interval:
+        """T² of an arm of one joint [N·m·s/rad]."""
+        return super().extra_damping(radius) if self.damping.floor is None else self.damping.excess(radius)
+
+    def lyapunov(self) -> Lyapunov:
+        """S, Λ, D₀ and ω, with a claim for ψ, Φ, D, Λ, ω and the friction that is fed forward."""
+        phi, d, n = self.potential, self.damping, self.nv
+        for name, part, kind in (("Φ", phi, Potential), ("D", d, Damping), ("Λ", self.rate, Gain)):
+            check_kind(name, part, kind)
+        check_kind("S", phi.stiffness, Gain)
+        check_kind("D₀", d.floor, Gain | None)
+        check_parts(n, {"Φ": phi.nv, "D": d.nv, "Λ": len(self.rate.nominal)}, self.friction)
+        damping = damping_claims(d)
+        claims = (
+            *potential_claims(phi, self.rate),
+            *damping,
+            *rate_claims(self.rate, self.inertial_rate, n),
+            *friction_claims(self.friction),
+        )
+        floor = damping[0].value * np.eye(n) if d.floor is None else np.asarray(d.floor.numpy())
+        stiffness, rate = np.asarray(phi.stiffness.numpy()), np.asarray(self.rate.numpy())
+        return Lyapunov(stiffness, rate, floor, float(self.inertial_rate), self.coupling, claims)
 
     @property
-    def _is_known(self) -> bool:
-        return type(self) is NeuralBackstepping and self.potential.is_packable and self.damping.is_packable
+    def _has_kernel(self) -> bool:
+        return self.potential.is_packable and self.damping.is_packable
 
     def _packed(self, numpy: bool) -> Packed:
         rate = self.rate.value(numpy=numpy)
@@ -168,10 +185,6 @@ class NeuralBackstepping(ModelLaw):
         )
 
 
-def _dot(x: Array, y: Array) -> Array:
-    return array_namespace(x).sum(x * y, axis=-1)
-
-
 def paper_controller(dynamics: DynamicsProvider, *, m: float = 0.001, seed: int = 0) -> NeuralBackstepping:
     """The paper's controller as its section V-A sets it up: S = I, Λ = I, ψ three 32-wide layers, D = TᵀT.
 
@@ -179,3 +192,14 @@ def paper_controller(dynamics: DynamicsProvider, *, m: float = 0.001, seed: int 
     """
     potential = Potential(np.eye(dynamics.nv), form="paper", seed=seed)
     return NeuralBackstepping(dynamics, potential, Damping(dynamics.nv, form="paper", m=m, seed=seed + 1))
+
+
+def paper_controller_for(
+    robot: Robot, *, bandwidth: float = 8.0, period: float = 0.001, friction: JointFriction | None = None, seed: int = 0
+) -> NeuralBackstepping:
+    """`paper_controller` on the bundled two_link, the paper's networks with this arm's own gains on every other."""
+    if robot.source == "two_link":
+        return paper_controller(PinocchioDynamics(robot), seed=seed)
+    return NeuralBackstepping.for_robot(
+        robot, bandwidth=bandwidth, period=period, friction=friction, seed=seed, potential="paper", damping="paper"
+    )

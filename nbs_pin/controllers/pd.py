@@ -5,7 +5,9 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import Array, as_vectors
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
+from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, stored_gains
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -16,6 +18,8 @@ from nbs_pin.robots.robot import Robot
 FEEDFORWARDS = ("gravity", "reference")
 
 
+@known_code
+@storable(("feedforward",), parts=("dynamics", "friction"), arrays=stored_gains("kp", "kd"))
 class PD(ModelLaw):
     """τ = feedforward − K_p z1 − K_d ż1.
 
@@ -79,8 +83,8 @@ class PD(ModelLaw):
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
 
     @property
-    def _is_known(self) -> bool:
-        return type(self) is PD
+    def _has_kernel(self) -> bool:
+        return True
 
     def _packed(self, numpy: bool) -> Packed:
         kp, kd = self.gains.value(numpy=numpy)

@@ -8,9 +8,11 @@ from torch import nn
 
 from nbs_pin.base.arrays import Array, array_namespace, as_vectors, constant_like, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import is_known, known_code
 from nbs_pin.base.records import Reference
+from nbs_pin.base.storable import storable
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, positive_gains
+from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, positive_gains, stored_gains
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.kernels import layout
 from nbs_pin.kernels.laws import compile_laws, pid
@@ -27,6 +29,8 @@ class PIDMemory(NamedTuple):
     """Filtered ż1 [rad/s]."""
 
 
+@known_code
+@storable(("effort_limit", "filter_time", "continuous"), parts=("robot",), arrays=stored_gains("kp", "ki", "kd"))
 class PID(Controller, nn.Module):
     """τ = −K_p z1 − I − K_d y,  İ = K_i z1,  T_f ẏ = ż1 − y, per joint, with clamping anti-windup.
 
@@ -122,7 +126,7 @@ class PID(Controller, nn.Module):
     @property
     def packable(self) -> bool:
         """Whether this is the law that the kernel knows, and not a subclass."""
-        return type(self) is PID
+        return is_known(self)
 
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """Its six rows of gains (`Controller.packed_law`)."""

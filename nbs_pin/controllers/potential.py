@@ -1,5 +1,8 @@
 """The error potential Φ: strongly convex for every parameter value, with its minimum at zero."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -7,15 +10,27 @@ from torch import nn
 
 from nbs_pin.base.arrays import Array, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.intervals import OUTWARD, Interval
+from nbs_pin.base.known_code import is_known, known_code
+from nbs_pin.base.storable import Tensors, storable
+from nbs_pin.base.tensors import positive_definite, positive_scale
 from nbs_pin.controllers.activations import Activation, SmoothedReLU, Squareplus
 from nbs_pin.controllers.convex import FICNN, convex_terms, rectified
-from nbs_pin.controllers.gain import Gain, positive_definite, positive_scale
+from nbs_pin.controllers.gain import Gain
 from nbs_pin.kernels.convex import subtract_tangent
 from nbs_pin.kernels.layout import Packed, pack_potential
 
 POTENTIALS = ("paper", "smooth")
+_CELLS = 400  # intervals that [−radius, radius] is cut into
 
 
+def _stored(t: Tensors) -> Mapping[str, Any]:
+    gain = {"stiffness": t["stiffness.nominal"], "least_share": float(t["stiffness.least_share"])}
+    return gain | {"scale": t["scale"], "widths": t.widths("network.wx")}
+
+
+@known_code
+@storable({"form": "form"}, parts={"activation": "network.activation"}, arrays=_stored)
 class Potential(nn.Module):
     """Φ(z) = zᵀSz + ψ(z) [J], so that ∇²Φ ⪰ 2S everywhere (docs/theory.md §3).
 
@@ -82,8 +97,7 @@ class Potential(nn.Module):
     @property
     def is_packable(self) -> bool:
         """Whether all parts are the ones the kernels know, and not those of a subclass."""
-        parts = (type(self), type(self.network), type(self.network.activation))
-        return parts[:2] == (Potential, FICNN) and parts[2] in (SmoothedReLU, Squareplus)
+        return all(map(is_known, (self, self.network, self.network.activation)))
 
     def packed(self, *, numpy: bool = True) -> Packed:
         """The weights as the compiled form of `terms` takes them (`runtime/convex.py`).
@@ -100,6 +114,24 @@ class Potential(nn.Module):
             tangent = convex_terms(layers, activation, 0.0 * r, 0.0 * r)[:2]
         packed = pack_potential(layers, activation.kernel, r, self.stiffness.like(r), tangent)
         return subtract_tangent(packed) if self.form == "smooth" and numpy else packed
+
+    def curvature(self, radius: float) -> Interval:
+        """Where ψ'' lies for |z| ≤ radius [rad], for one joint [N·m/rad]: interval arithmetic on small cells.
+
+        Of each layer y = σ(a), y' = σ'(a) a', y'' = σ''(a) a'² + σ'(a) a'', with σ and σ' monotone.
+        """
+        scale, activation = float(self.scale[0]), self.network.activation
+        x = Interval.cells(scale * radius, _CELLS)
+        one = Interval.of(np.ones_like(x.low))
+        y = dy = ddy = Interval.of(np.zeros((0, *x.low.shape[1:])))
+        for wy, wx, bias in self.network.layers(numpy=True):
+            wy = np.zeros((len(wx), 0)) if wy is None else wy
+            a = (x.through(wx) + y.through(wy)) + (np.float64(0.0) if bias is None else bias[:, None])
+            da, dda = one.through(wx) + dy.through(wy), ddy.through(wy)
+            ends = [activation.derivatives(end) for end in (a.low, a.high)]
+            y, slope = Interval(ends[0][0], ends[1][0]), Interval(ends[0][1], ends[1][1])
+            dy, ddy = slope * da, activation.curvature_range(a) * da.squared() + slope * dda
+        return ddy.hull().times(scale * scale).widened(OUTWARD)
 
     def _psi(
         self, x: Float[Array, "*batch n"], dx: Float[Array, "*batch n"]

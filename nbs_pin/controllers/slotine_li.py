@@ -3,9 +3,21 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, as_vectors
-from nbs_pin.controllers.gains import PerJoint, PositiveGains, effective_inertia, gains_for_robot, warn_if_too_fast
-from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.base.arrays import Array, array_namespace, as_vectors
+from nbs_pin.base.claims import Claim, known
+from nbs_pin.base.intervals import Interval
+from nbs_pin.base.known_code import foreign_code, known_code
+from nbs_pin.base.storable import storable
+from nbs_pin.controllers.gains import (
+    PerJoint,
+    PositiveGains,
+    effective_inertia,
+    gains_for_robot,
+    stored_gains,
+    warn_if_too_fast,
+)
+from nbs_pin.controllers.lyapunov_law import Lyapunov, LyapunovLaw
+from nbs_pin.controllers.part_claims import check_parts, friction_claims, positive_gain
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -13,13 +25,20 @@ from nbs_pin.kernels.layout import SLOTINE_LI, Packed
 from nbs_pin.robots.robot import Robot
 
 
-class SlotineLi(ModelLaw):
+@known_code
+@storable(parts=("dynamics", "friction"), arrays=stored_gains("rate", "gain"))
+class SlotineLi(LyapunovLaw):
     """τ = M a_r + C(q, v) v_r + G − K s,  v_r = v_d − λ z1,  a_r = a_d − λ ż1,  s = v − v_r.
+
+    With V = z1ᵀλKz1 + ½sᵀM s:  V̇ = −ż1ᵀKż1 − z1ᵀλKλz1 + sᵀτ_d. In the terms of `LyapunovLaw` Φ = z1ᵀλKz1, Λ = ½K⁻¹,
+    D = K, ω = 0 and ζ = 0.
 
     rate: λ [1/s], (n,). gain: K [N·m·s/rad], (n,). friction: fed forward at v_r, or None.
     Source: Slotine and Li 1987, "On the adaptive control of robot manipulators", without adaptation.
     Raises ArgumentError unless all gains are positive.
     """
+
+    coupling = 0.0
 
     def __init__(
         self,
@@ -68,9 +87,50 @@ class SlotineLi(ModelLaw):
         tau = self.dynamics.reference_torque(q, v, v_r, a_r) - gain * (v - v_r)
         return tau if self.friction is None else tau + self.friction.torque(v_r)
 
+    def potential_terms(self, z1: Array, dz: Array) -> tuple[Array, Array, Array]:
+        """z1ᵀλKz1 [J], 2λKz1 [N·m] and 2λK dz."""
+        rate, gain = self.gains.like(z1)
+        gradient = 2.0 * rate * gain * z1
+        return 0.5 * array_namespace(z1).sum(gradient * z1, axis=-1), gradient, 2.0 * rate * gain * dz
+
+    def damping_force(self, z2: Array) -> Float[Array, "*batch n"]:
+        """K z2 [N·m]."""
+        return self.gains.like(z2)[1] * z2
+
+    def damping_matrix(self, z2: Array) -> Float[Array, "*batch n n"]:
+        """K [N·m·s/rad]."""
+        xp, gain = array_namespace(z2), self.gains.like(z2)[1]
+        return xp.eye(self.nv, dtype=z2.dtype) * gain + 0.0 * z2[..., None]
+
+    def rate_like(self, x: Array) -> Float[Array, " n"]:
+        """Λ = ½K⁻¹ [rad/s per N·m] in the kind of x, so that Λ∇Φ = λz1."""
+        return 0.5 / self.gains.like(x)[1]
+
+    def extra_stiffness(self, radius: float) -> Interval:
+        """None: Φ is quadratic."""
+        return Interval.of(np.float64(0.0))
+
+    def extra_damping(self, radius: float) -> Interval:
+        """None: D is constant."""
+        return Interval.of(np.float64(0.0))
+
+    def lyapunov(self) -> Lyapunov:
+        """S = λK, Λ = ½K⁻¹, D₀ = K, with claims for both gains and the friction that is fed forward."""
+        check_parts(self.nv, {name: len(self.gains.named(name).nominal) for name in ("rate", "gain")}, self.friction)
+        rate, odd_rate = positive_gain("λ", self.gains.named("rate"), self.nv, 1)
+        gain, odd_gain = positive_gain("K", self.gains.named("gain"), self.nv, 1)
+        how = known(odd_rate or odd_gain or foreign_code(self.gains), "constant and diagonal")
+        claims = (
+            Claim("Φ = z1ᵀλKz1 strongly convex, μ", 2.0 * float((rate * gain).min()), "J/rad²", *how),
+            Claim("ρ = least of λ", float(rate.min()), "1/s", *how),
+            Claim("D = K, least", float(gain.min()), "N·m·s/rad", *how),
+            *friction_claims(self.friction),
+        )
+        return Lyapunov(np.diag(rate * gain), 0.5 / gain, np.diag(gain), 0.0, self.coupling, claims)
+
     @property
-    def _is_known(self) -> bool:
-        return type(self) is SlotineLi
+    def _has_kernel(self) -> bool:
+        return True
 
     def _packed(self, numpy: bool) -> Packed:
         rate, gain = self.gains.value(numpy=numpy)

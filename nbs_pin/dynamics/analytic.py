@@ -4,13 +4,19 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import Array, array_namespace
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.claims import Claim, Label, refuse
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.structure import POSITIVE, ROUNDING, ModelClaims, quadratic
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import Link, pack_tree
 from nbs_pin.robots.robot import Robot
 
 
+@known_code
+@storable({"masses": "masses", "lengths": "lengths", "gravity": "gravity_constant"}, parts=("robot",), sequence=tuple)
 class AnalyticDynamics(DynamicsProvider):
     """Two massless rods of lengths l₁, l₂ [m] with point masses m₁, m₂ [kg] at their ends, gravity g [m/s²].
 
@@ -83,6 +89,24 @@ class AnalyticDynamics(DynamicsProvider):
             for parent, start, mass, length in zip((0, 1), (0.0, upper), self.masses, (upper, lower), strict=True)
         ]
         return pack_tree(links, np.array([0.0, -self.gravity_constant, 0.0]))
+
+    def structure_claims(self) -> ModelClaims:
+        """λ_min(M) ≥ det M / trace M ≥ m₁m₂l₁²l₂² / (largest trace), of the numbers that the equations run on.
+
+        Raises CertificateRefused when masses or lengths were changed after the object was made.
+        """
+        try:
+            stated = AnalyticDynamics(self.masses, self.lengths, self.gravity_constant)
+        except ArgumentError as error:
+            raise CertificateRefused(f"the two-link model is none: {error}") from error
+        names = ("_shoulder", "_forearm", "_coupling", "_weights")
+        if any(getattr(stated, name) != getattr(self, name) for name in names):
+            refuse("the two-link model does not move as its masses and lengths say", "build it again from them")
+        (m1, m2), (l1, l2) = self.masses, self.lengths
+        trace = (m1 + m2) * l1 * l1 + 2.0 * m2 * l2 * l2 + 2.0 * m2 * l1 * l2
+        least = (1.0 - ROUNDING) * m1 * m2 * (l1 * l2) ** 2 / trace
+        because = "closed form: least eigenvalue ≥ det M / largest trace"
+        return quadratic(Claim(POSITIVE, least, "kg·m²", Label.PROVED, because))
 
     def potential_energy(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
         """V(q) [J], zero with the arm horizontal."""

@@ -6,16 +6,22 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import nn
 
+from nbs_pin.base.claims import Claim, Label, refuse
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.lagrangian_network import CompiledTorque, LagrangianNetwork, Tensor
+from nbs_pin.dynamics.structure import POSITIVE, ModelClaims, quadratic
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import tree_workspace
 from nbs_pin.kernels.tree_rows import tree_torques
 
 
+@known_code
+@storable(("parents", "prismatic", "epsilon"), sequence=list)
 class Chain(LagrangianNetwork):
     """T̂ = ½ Σ_j ‖Ṫ_j L_j‖² + ½ Σ_j (r_j² + ε) v_j², V̂ = −Σ_j g·T_j L_j(L_jᵀ)₄, T_j = T_parent(j) A_j E(q_j).
 
@@ -79,6 +85,10 @@ class Chain(LagrangianNetwork):
         rates = self._rates(self._frames(q))
         return -torch.einsum("...ijk,k->...i", (rates @ self._moments())[..., :3, 0], self.field)
 
+    def suits(self, parents: Int[np.ndarray, " n"], prismatic: Bool[np.ndarray, " n"]) -> bool:
+        """Whether these are the joints of the chain."""
+        return self.parents == parents.tolist() and self.prismatic == prismatic.tolist()
+
     def packed_tree(self) -> Packed:
         """The same tree for the kernels of `runtime/trees.py`, r² + ε as armature."""
         with torch.no_grad():
@@ -93,6 +103,17 @@ class Chain(LagrangianNetwork):
             place = [rotations[i].numpy(force=True).ravel(), self.positions[i].numpy(force=True)]
             weights += [*place, body[3, 3:], body[:3, 3], body[:3, :3][upper], armature[i : i + 1]]
         return Packed(np.array(layout, dtype=np.int64), np.concatenate(weights))
+
+    def structure_claims(self) -> ModelClaims:
+        """M̂ = Σ_j B_jᵀB_j + diag(r² + ε) ⪰ min(r² + ε) I; raises CertificateRefused for parents that make no tree."""
+        parents, n = list(self.parents), self.nv
+        if len(parents) != n or len(self.prismatic) != n or any(not 0 <= p <= i for i, p in enumerate(parents)):
+            refuse(f"the chain's parents {parents} make no tree of {n} joints", "give parents first, 0 for the base")
+        if not 0.0 < self.epsilon < np.inf:
+            refuse(f"the model's M̂ has ε = {self.epsilon:g}", "εI must be positive, or M̂ may be singular: give ε > 0")
+        least = self.epsilon + float(np.min(self.rotors.numpy(force=True) ** 2))
+        because = "M̂ = Σ_j B_jᵀB_j + diag(r² + ε) ⪰ min(r² + ε)I"
+        return quadratic(Claim(POSITIVE, least, "kg·m²", Label.PROVED, because))
 
     def compiled(self) -> CompiledTorque:
         """`torque` by one Newton–Euler pass per row."""

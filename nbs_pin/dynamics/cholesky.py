@@ -7,12 +7,17 @@ import torch
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import matvec
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.features import JointFeatures
 from nbs_pin.dynamics.lagrangian_network import CompiledTorque, LagrangianNetwork, Tensor
-from nbs_pin.dynamics.scales import Scales
+from nbs_pin.dynamics.scales import Scales, stored_scales
+from nbs_pin.dynamics.structure import ModelClaims, floored, quadratic
 from nbs_pin.dynamics.tanh_network import TanhNetwork
 
 
+@known_code
+@storable(("widths",), arrays=stored_scales, sequence=tuple)
 class CholeskyNetwork(LagrangianNetwork):
     """M̂(q) = R L(q)L(q)ᵀ R + εI ⪰ εI and V̂(q), with L lower triangular; one tanh network gives L and V̂.
 
@@ -23,6 +28,8 @@ class CholeskyNetwork(LagrangianNetwork):
     eigenvalue of the arm's M. inertia, energy: what one unit of the network means (`Scales`). seed: of the first
     parameters. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
     """
+
+    fit_widths = (32, 32)
 
     def __init__(
         self,
@@ -86,6 +93,10 @@ class CholeskyNetwork(LagrangianNetwork):
         in_output = -0.5 * in_factor.flatten(-2, -1) @ self._place.T
         in_output = in_output + self.scales.energy * self._is_potential
         return root * inertial + self.scales.epsilon * a + self.features.pull(x, self.network.pull(tape, in_output))
+
+    def structure_claims(self) -> ModelClaims | None:
+        """M̂ = LLᵀ + εI ⪰ εI; raises CertificateRefused unless ε > 0."""
+        return quadratic(floored(float(self.scales.epsilon), "M̂ = LLᵀ + εI"))
 
     def compiled(self) -> CompiledTorque | None:
         """`torque` as machine code (`runtime/cholesky.py`); None for a subclass, which may have another torque."""

@@ -8,8 +8,10 @@ from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import known_code
 
 
+@known_code
 class JointFeatures(nn.Module):
     """x(q) = (sin q_r, cos q_r, q_p) for the revolute joints r and the prismatic joints p, with its derivative.
 

@@ -7,9 +7,13 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import Array, array_namespace, constant_like
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.robots.robot import Robot
 
 
+@known_code
+@storable(("viscous", "coulomb", "transition"))
 @dataclass(frozen=True, eq=False)
 class JointFriction:
     """Friction torque viscous·v + coulomb·tanh(v / transition) [N·m], against the motion.

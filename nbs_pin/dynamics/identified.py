@@ -10,10 +10,14 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import Array
 from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics, pack_model
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
+from nbs_pin.dynamics.structure import ModelClaims, rigid_tree_claims
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.robots.robot import Robot
 
@@ -21,6 +25,8 @@ _ROUNDING = 1e-9
 """How far below zero an eigenvalue of J, scaled to a unit diagonal, is still taken for a zero that was rounded."""
 
 
+@known_code
+@storable(("parameters", "rotor_inertia", "report"), parts=("robot", "friction"))
 class IdentifiedDynamics(DynamicsProvider):
     """M, C, G of an arm with the joints of `robot` and the inertial parameters given here instead of its own.
 
@@ -96,6 +102,10 @@ class IdentifiedDynamics(DynamicsProvider):
     def packed_tree(self) -> Packed | None:
         """The arm's joints and identified bodies; None for a subclass, which may have changed an equation."""
         return pack_model(self._model) if type(self) is IdentifiedDynamics else None
+
+    def structure_claims(self) -> ModelClaims | None:
+        """Those of a rigid tree."""
+        return rigid_tree_claims(self.packed_tree())
 
 
 def _consistent(parameters: np.ndarray, robot: Robot) -> np.ndarray:

@@ -11,16 +11,22 @@ from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.base.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.base.claims import refuse
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.lagrangian_network import CompiledTorque, LagrangianNetwork
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import tree_workspace
 from nbs_pin.kernels.tree_rows import tree_accelerations
 from nbs_pin.robots.robot import Robot
 
 
+@known_code
+@storable(("report",), parts=("network", "robot", "friction"))
 class LagrangianDynamics(DynamicsProvider, nn.Module):
     """M̂, Ĉ, Ĝ and V̂ of a learned Lagrangian network (docs/theory.md §6).
 
@@ -110,6 +116,18 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
     def packed_tree(self) -> Packed | None:
         """The network as a rigid tree, where it is one; None for a subclass, which may have changed an equation."""
         return self._tree if type(self) is LagrangianDynamics else None
+
+    def suits(self, robot: Robot) -> bool:
+        """Whether the network's joints are those of the arm."""
+        return self.network.suits(robot.parents, robot.prismatic)
+
+    def structure_claims(self) -> ModelClaims | None:
+        """What the network claims of itself; raises CertificateRefused when its machine code is another network's."""
+        if self._tree is not None:
+            now = self.network.packed_tree()
+            if now is None or not all(np.array_equal(x, y) for x, y in zip(self._tree, now, strict=True)):
+                refuse("the model's machine code is not that of its weights", "load the model again")
+        return self.network.structure_claims()
 
     @cached_property
     def _tree(self) -> Packed | None:

@@ -6,11 +6,13 @@ from typing import TypeAlias, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import nn
 from torch.func import grad, jvp
 
 from nbs_pin.base.arrays import matvec
+from nbs_pin.dynamics.features import JointFeatures
+from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
 
 Tensor: TypeAlias = torch.Tensor
@@ -27,6 +29,8 @@ class LagrangianNetwork(nn.Module, ABC):
 
     nv: int
     """Number of joints n."""
+    fit_widths: tuple[int, ...] = (24, 24)
+    """Hidden layers that `fit` takes unless told otherwise: small enough for Levenberg–Marquardt."""
     quadratic: bool = True
     """Whether T̂ is exactly ½ vᵀM̂(q)v, so that Ṁ − 2C is skew and the stability theory holds."""
 
@@ -89,8 +93,17 @@ class LagrangianNetwork(nn.Module, ABC):
         bias = self.torque(q, v, v, torch.zeros_like(v))
         return torch.linalg.solve(self.inertia(q, v), (tau - bias)[..., None])[..., 0]
 
+    def suits(self, parents: Int[np.ndarray, " n"], prismatic: Bool[np.ndarray, " n"]) -> bool:
+        """Whether the network is for an arm of these joints (`Robot.parents`, `Robot.prismatic`)."""
+        seen = [part for part in self.children() if isinstance(part, JointFeatures)]
+        return all(features.prismatic.tolist() == prismatic.tolist() for features in seen)
+
     def packed_tree(self) -> Packed | None:
         """The network as a rigid tree for the kernels of `runtime/trees.py`, or None where it is none."""
+        return None
+
+    def structure_claims(self) -> ModelClaims | None:
+        """What the structure of this very class proves of M̂ and Ĉ (`DynamicsProvider.structure_claims`)."""
         return None
 
     def compiled(self) -> CompiledTorque | None:

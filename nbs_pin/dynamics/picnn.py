@@ -2,11 +2,15 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
 from torch.func import grad
 
+from nbs_pin.base.claims import Claim, Label
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.features import JointFeatures
 from nbs_pin.dynamics.lagrangian_network import (
     GeneralLagrangianNetwork,
@@ -15,11 +19,13 @@ from nbs_pin.dynamics.lagrangian_network import (
     along_every_joint,
     derivative,
 )
-from nbs_pin.dynamics.scales import Scales
+from nbs_pin.dynamics.scales import Scales, stored_scales
 from nbs_pin.dynamics.softplus_network import SoftplusNetwork, paper_spread, softplus
+from nbs_pin.dynamics.structure import SKEW, ModelClaims, floored, quadratic
 from nbs_pin.dynamics.tanh_network import TanhNetwork
 
 
+@known_code
 class PICNN(nn.Module):
     """f(x̃, x), convex in x for every parameter value (paper eq. (7), Amos et al. 2017).
 
@@ -111,6 +117,8 @@ class PICNN(nn.Module):
         return start / (columns if name == "wy" else 1.0 if name == "wx" else columns**0.5)
 
 
+@known_code
+@storable(("widths",), arrays=stored_scales, sequence=tuple)
 class PaperPicnn(GeneralLagrangianNetwork):
     """The paper's L = T̂(q, v) − V̂(q): a PICNN of (q, v), convex in v, and an FCNN, both of softplus.
 
@@ -119,6 +127,8 @@ class PaperPicnn(GeneralLagrangianNetwork):
 
     Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
     """
+
+    fit_widths = (16, 16, 16)
 
     def __init__(
         self,
@@ -149,13 +159,23 @@ class PaperPicnn(GeneralLagrangianNetwork):
         kinetic = self.convex(x, s.root * v) + 0.5 * s.epsilon * (v * v).sum(-1)
         return kinetic - s.energy * self.network(x)
 
+    def structure_claims(self) -> ModelClaims:
+        """∂²T̂/∂v² ⪰ εI, but T̂ is not quadratic; raises CertificateRefused unless ε > 0."""
+        positive = floored(float(self.scales.epsilon), "∂²T̂/∂v² of a PICNN convex in v, gates clipped, and εI")
+        because = "T̂ is not quadratic in v, so V̇ has a term ½z2ᵀ(∂M̂/∂v v̇)z2 that nothing bounds"
+        return ModelClaims(positive, Claim(SKEW, np.inf, "", Label.EMPIRICAL, because))
 
+
+@known_code
+@storable(("widths",), arrays=stored_scales, sequence=tuple)
 class HomogenisedPicnn(LagrangianNetwork):
     """M̂(q) = R ∂²f/∂v²(q, 0) R + εI ⪰ εI of a smooth PICNN f, and V̂ of a tanh network: T̂ is exactly quadratic.
 
     What the paper's network becomes when its M̂ must not depend on v (docs/theory.md §6).
     Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
     """
+
+    fit_widths = (20, 20)
 
     def __init__(
         self,
@@ -208,6 +228,10 @@ class HomogenisedPicnn(LagrangianNetwork):
             return self._inertial(q, v, a) + self.gravity(q)
         ahead = self._inertial(q, 0.5 * (v + w), a)
         return ahead - self._inertial(q, 0.5 * (v - w), torch.zeros_like(a)) + self.gravity(q)
+
+    def structure_claims(self) -> ModelClaims:
+        """M̂ = ∂²f/∂v² + εI ⪰ εI of a convex f; raises CertificateRefused unless ε > 0."""
+        return quadratic(floored(float(self.scales.epsilon), "M̂ = ∂²f/∂v² + εI, f convex with its gates clipped"))
 
     def _inertial(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """M̂ a + Ĉ(q, v) v = d/dt ∂T̂/∂v − ∂T̂/∂q."""

@@ -9,15 +9,16 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import Array, as_vectors, is_torch_array, over_rows
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.claims import refuse
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
+from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.structure import ModelClaims, rigid_tree_claims
 from nbs_pin.kernels.layout import Packed
-from nbs_pin.kernels.tree_layout import Link, pack_tree
 from nbs_pin.robots.robot import Robot
 
 Row: TypeAlias = np.ndarray
-_TURNING = ("JointModelRX", "JointModelRY", "JointModelRZ", "JointModelRevoluteUnaligned")
-_SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismaticUnaligned")
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Quantity:
     """vjp(cotangent, q, …) -> one gradient per argument."""
 
 
+@known_code
+@storable(parts=("robot",))
 class PinocchioDynamics(DynamicsProvider):
     """M, C, G of `robot` by CRBA, Pinocchio's Christoffel Coriolis matrix and RNEA.
 
@@ -95,6 +98,13 @@ class PinocchioDynamics(DynamicsProvider):
     def packed_tree(self) -> Packed | None:
         """The arm's joints and bodies; None for a subclass, which may have changed an equation."""
         return pack_model(self._model) if type(self) is PinocchioDynamics else None
+
+    def structure_claims(self) -> ModelClaims | None:
+        """Those of a rigid tree; raises CertificateRefused when the model is no longer that of `robot`."""
+        tree, own = self.packed_tree(), pack_model(self._robot.model)
+        if tree is not None and not all(np.array_equal(x, y) for x, y in zip(tree, own, strict=True)):
+            refuse(f"the model is not of {self._robot.name}, the arm it names", "build it again from that arm")
+        return rigid_tree_claims(tree)
 
     def _evaluate(self, quantity: Quantity, **arguments: Array) -> Array:
         """The quantity over leading batch axes, in the kind of the arguments."""
@@ -170,23 +180,3 @@ class PinocchioDynamics(DynamicsProvider):
         live = pin.computeRNEADerivatives(model, self._data, q, v, a)  # views into data that the next call overwrites
         dq, dv, mass = (np.array(x) for x in live)
         return dq, dv, mass
-
-
-def pack_model(model: pin.Model) -> Packed:
-    """A Pinocchio model with its gravity and armature as a rigid tree for the kernels of `runtime/trees.py`.
-
-    Raises ArgumentError for a joint that is neither revolute nor prismatic, or whose angle is stored as two numbers.
-    """
-    data, links = model.createData(), []
-    for i in range(1, model.njoints):
-        kind = model.joints[i].shortname()
-        if kind not in _TURNING + _SLIDING or model.idx_vs[i] != i - 1:
-            raise ArgumentError(
-                f"joint '{model.names[i]}' is a {kind}, expected a revolute or prismatic one with one coordinate;"
-                " lock it, or use a joint whose angle is one unbounded number."
-            )
-        motion, slides = np.array(data.joints[i].S), kind in _SLIDING
-        body, at, axis = model.inertias[i], model.jointPlacements[i], motion[:3] if slides else motion[3:]
-        place = (model.parents[i], slides, axis, at.rotation, at.translation)
-        links.append(Link(*place, body.mass, body.lever, body.inertia, float(model.armature[i - 1])))
-    return pack_tree(links, model.gravity.linear)

@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import Array, array_namespace, matvec
+from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.robots.robot import Robot, configuration_difference
 
@@ -59,6 +60,18 @@ class DynamicsProvider(ABC):
 
     def packed_tree(self) -> Packed | None:
         """The model as a rigid tree for the kernels of `runtime/trees.py`, or None when it is none."""
+        return None
+
+    def suits(self, robot: Robot) -> bool:
+        """Whether the model's joints are those of the arm, as far as the model knows its joints."""
+        return True
+
+    def structure_claims(self) -> ModelClaims | None:
+        """What the structure of this very class proves of M and C; None where samples alone can tell.
+
+        Certificates ask it of objects whose code is known (`base/known_code.py`), so a subclass must state its own.
+        Raises CertificateRefused for numbers that give a proof no ground.
+        """
         return None
 
     def forward_dynamics(

@@ -1,6 +1,6 @@
 """An arm that is nearly known: a nominal model and what a network learned to correct in it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,12 +9,17 @@ from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.base.arrays import matvec
+from nbs_pin.base.claims import Claim, refuse
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import foreign_code, known_code
+from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.dynamics.cholesky import CholeskyNetwork
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.lagrangian_network import Tensor
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.scales import stored_scales
+from nbs_pin.dynamics.structure import ModelClaims, quadratic
 
 
 class Terms(NamedTuple):
@@ -28,6 +33,12 @@ class Terms(NamedTuple):
     """G (..., n) [N·m]."""
 
 
+def _stored(t: Tensors) -> Mapping[str, Any]:
+    return {name: x for name, x in stored_scales(t).items() if name != "epsilon"}
+
+
+@known_code
+@storable(("share", "widths"), parts=("nominal",), arrays=_stored, sequence=tuple)
 class ResidualNetwork(CholeskyNetwork):
     """M̂ = κM + (1 − κ)FFᵀ with F = chol M(q) + R ΔL(q), and V̂ = V + ΔV(q); M and V of a nominal model.
 
@@ -38,6 +49,8 @@ class ResidualNetwork(CholeskyNetwork):
     arm, or takes all for revolute. share: κ. inertia, energy: scales as in `CholeskyNetwork`; None takes the nominal
     inertias and gravity torque. Raises ArgumentError for a share outside (0, 1) or another number of joints.
     """
+
+    fit_widths = (24, 24)
 
     def __init__(
         self,
@@ -108,6 +121,17 @@ class ResidualNetwork(CholeskyNetwork):
         slope = torch.einsum("...kij,...i,...j->...k", rates, v, w)
         return matvec(mass, a) + 0.5 * (matvec(along_v, w) + matvec(along_w, v) - slope) + gravity
 
+    def structure_claims(self) -> ModelClaims | None:
+        """M̂ ⪰ κM, with what the nominal model claims of M; raises CertificateRefused for κ outside (0, 1)."""
+        if not 0.0 < self.share < 1.0:
+            refuse(f"the residual keeps a share κ = {self.share} of M", "κ must lie in (0, 1) for M̂ ⪰ κM ≻ 0")
+        inner = None if foreign_code(self.nominal) else self.nominal.structure_claims()
+        if inner is None or not np.isfinite(inner.skew.value):
+            return None
+        m = inner.positive
+        because = f"M̂ ⪰ κM with κ = {self.share:g}, and of the nominal model: {m.because}"
+        return quadratic(Claim(m.name, self.share * m.value, m.unit, m.label, because))
+
     def _correction(self, output: Tensor) -> Tensor:
         """R ΔL."""
         return self.scales.root[:, None] * self._factor(output)
@@ -116,6 +140,8 @@ class ResidualNetwork(CholeskyNetwork):
         return self.share * mass + (1.0 - self.share) * factor @ factor.mT
 
 
+@known_code
+@storable(("report",), parts=("network", "friction"))
 class ResidualDynamics(LagrangianDynamics):
     """A nominal model with what a `ResidualNetwork` learned to correct in it; a model like any other.
 

@@ -1,15 +1,19 @@
 """What one unit of a network means in kg·m² and in joules."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.controllers.gain import positive_scale
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import Tensors
+from nbs_pin.base.tensors import positive_scale
 
 
+@known_code
 class Scales(nn.Module):
     """T̂ = T(q, Rv) + ½ε‖v‖² and V̂ = e V(q): of order one inside, of the arm's order outside.
 
@@ -38,3 +42,9 @@ class Scales(nn.Module):
     def floor(self) -> torch.Tensor:
         """εI (n, n)."""
         return self.epsilon * torch.eye(len(self.root), dtype=self.root.dtype, device=self.root.device)
+
+
+def stored_scales(t: Tensors) -> Mapping[str, Any]:
+    """The arguments of a network that its tensors hold (`base/storable.py`)."""
+    numbers = {name: float(t[f"scales.{name}"]) for name in ("epsilon", "energy")}
+    return numbers | {"prismatic": t["features.prismatic"].tolist(), "inertia": t["scales.inertia"].tolist()}

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
+from nbs_pin.base.known_code import known_code
+
 
 def softplus(x: Float[torch.Tensor, "*shape"]) -> Float[torch.Tensor, "*shape"]:
     """log(1 + eˣ) and its derivatives to the last digit everywhere; torch's own takes x for it from 20 on."""
@@ -23,6 +25,7 @@ def paper_spread(layer: int, sizes: Sequence[int]) -> float:
     return (n if last else 0.58 * layer if layer else 2.2) / n**0.5
 
 
+@known_code
 class SoftplusNetwork(nn.Module):
     """A scalar function by hidden layers of softplus and a linear output; parameters w0, b0, … in float64.
 

@@ -9,10 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
+from nbs_pin.base.known_code import known_code
+
 Tape: TypeAlias = list[torch.Tensor]
 """Slopes of the hidden layers, as `pull` needs them."""
 
 
+@known_code
 class TanhNetwork(nn.Module):
     """Hidden layers of tanh, linear output; parameters w0, b0, w1, b1, … in float64.
 

@@ -5,18 +5,26 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Float
 
+from nbs_pin.base.claims import refuse
+from nbs_pin.base.known_code import known_code
+from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.features import JointFeatures
 from nbs_pin.dynamics.lagrangian_network import GeneralLagrangianNetwork, Tensor
-from nbs_pin.dynamics.scales import Scales
+from nbs_pin.dynamics.scales import Scales, stored_scales
 from nbs_pin.dynamics.softplus_network import SoftplusNetwork
+from nbs_pin.dynamics.structure import ModelClaims
 
 
+@known_code
+@storable(("widths",), arrays=stored_scales, sequence=tuple)
 class UnconstrainedLagrangian(GeneralLagrangianNetwork):
     """L(q, v) = f(x(q), Rv) by one softplus network and ½ε‖v‖²; ∂²L/∂v² may be indefinite or singular.
 
     Source: Cranmer et al. 2020, "Lagrangian Neural Networks", with sine and cosine of angles, and the paper's start.
     Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
     """
+
+    fit_widths = (32, 32)
 
     def __init__(
         self,
@@ -44,3 +52,10 @@ class UnconstrainedLagrangian(GeneralLagrangianNetwork):
         s = self.scales
         value = self.network(torch.cat([self.features(q), s.root * v], dim=-1))
         return s.energy * value + 0.5 * s.epsilon * (v * v).sum(-1)
+
+    def structure_claims(self) -> ModelClaims:
+        """Raises CertificateRefused: nothing makes ∂²L/∂v² positive definite."""
+        refuse(
+            "nothing makes the inertia of an UnconstrainedLagrangian positive definite",
+            "learn a 'chain', 'cholesky' or 'homogenised' model",
+        )

@@ -18,7 +18,7 @@ from nbs_pin.controllers.pd import PD
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import configuration_box, excitation, soft_pd, torque_limits, work
 from nbs_pin.identification.measurement import CLEAN_WINDOW, QUANTISED_WINDOW, Noise, derivative, quantised
 from nbs_pin.motions.references import DesiredMotion, Hold
@@ -101,7 +101,9 @@ def collect(
         "robot": {"source": robot.source, "sha256": robot.sha256, "options": robot.options},
     }
     tau = tau + noise.torque * generator.standard_normal(tau.shape)
-    return Dataset(q, v, a, tau, t, np.repeat(np.arange(len(counts)), counts), *joint_tree(robot), robot.name, about)
+    return Dataset(
+        q, v, a, tau, t, np.repeat(np.arange(len(counts)), counts), robot.parents, robot.prismatic, robot.name, about
+    )
 
 
 class _Idle(MemorylessController):
@@ -183,7 +185,7 @@ class _Instruments:
         window = QUANTISED_WINDOW if self.noise.encoder else CLEAN_WINDOW
         margin = window // 2 if self.differentiated else 0
         record = bench.record(generator, (count - 1) * self.stride + 1 + 2 * margin)
-        q, v, a, tau = quantised(record.q, self.noise.encoder, joint_tree(bench.robot)[1]), *record[2:]
+        q, v, a, tau = quantised(record.q, self.noise.encoder, bench.robot.prismatic), *record[2:]
         if self.noise.encoder:
             v, a = (derivative(q, RECORD_STEP, window, order) for order in (1, 2))
         elif self.differentiated:

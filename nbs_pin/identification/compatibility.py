@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.datasets import Dataset
 from nbs_pin.robots.robot import Robot
 
 
@@ -16,7 +16,7 @@ def arm_fault(data: Dataset, robot: Robot) -> str:
     own name. Two arms of the catalogue by different names, with different fingerprints (`Robot.sha256`, in which other
     effort limits do not count), are a mistake. Data that name no arm are judged by their tree.
     """
-    parents, prismatic = joint_tree(robot)
+    parents, prismatic = robot.parents, robot.prismatic
     if robot.nv != data.nv:
         return f"the data have {data.nv} joints and {robot.name} {robot.nv}; give the arm they are of"
     if not (np.array_equal(data.parents, parents) and np.array_equal(data.prismatic, prismatic)):

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
-from nbs_pin.robots.robot import Robot
 
 DATASET_FORMAT = "nbs_pin dataset 1"
 """What the `format` entry of a data file says."""
@@ -142,12 +141,6 @@ def load_dataset(path: str | Path) -> Dataset:
         return Dataset(**arrays, robot=str(data["robot"]), about=about)
     except (ArgumentError, json.JSONDecodeError) as error:
         raise FileFormatError(f"{path}: {error}") from error
-
-
-def joint_tree(robot: Robot) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Parents (0 for the base, i + 1 for joint i) and which joints slide: all that a `Dataset` says of an arm."""
-    parents = np.array(list(robot.model.parents)[1:], dtype=np.int64)
-    return parents, np.array([joint.prismatic for joint in robot.joints])
 
 
 def trajectory_slices(trajectory: Int[np.ndarray, " samples"]) -> list[slice]:

@@ -17,7 +17,7 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pseudo_inertia import PARAMETERS_OF_COORDINATES, coordinates, inertial_parameters
 from nbs_pin.identification.consistent_fit import ConsistentFit, consistent_fit, in_factors
-from nbs_pin.identification.datasets import Dataset, joint_tree
+from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.regressor import (
     Expected,
     Geometry,
@@ -145,7 +145,7 @@ def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation:
 
 def _check_arm(data: Dataset, robot: Robot) -> None:
     """Raise ArgumentError unless the data have the joints of the robot, and torque."""
-    parents, prismatic = joint_tree(robot)
+    parents, prismatic = robot.parents, robot.prismatic
     if not (np.array_equal(parents, data.parents) and np.array_equal(prismatic, data.prismatic)):
         raise ArgumentError(
             f"{data!r} does not fit {robot!r}: number, kinds or order of the joints differ; give the arm they are of."

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz
 from nbs_pin.identification.compatibility import arm_fault
-from nbs_pin.identification.datasets import DATASET_FORMAT, Dataset, joint_tree, load_dataset, trajectory_slices
+from nbs_pin.identification.datasets import DATASET_FORMAT, Dataset, load_dataset, trajectory_slices
 from nbs_pin.identification.log_files import Columns, columns_of_arrays, columns_of_csv
 from nbs_pin.identification.measurement import ORDER, derivative
 from nbs_pin.robots.robot import Robot
@@ -58,7 +58,7 @@ def load_log(
         columns = columns_of_csv(path, names)
     else:
         raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv or .npz; convert it.")
-    tree = _serial(columns.q.shape[1], prismatic) if robot is None else joint_tree(robot)
+    tree = _serial(columns.q.shape[1], prismatic) if robot is None else (robot.parents, robot.prismatic)
     columns = _in_radians(path, columns, tree[1], degrees, robot)
     data = _dataset(path, columns, tree, window, "" if robot is None else robot.name)
     _check_derivatives(path, data)

@@ -9,11 +9,11 @@ from jaxtyping import Float
 
 from nbs_pin.base.claims import Claim, Label
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.rounding import down, largest_eigenvalue, least_eigenvalue, up
+from nbs_pin.dynamics.rigid_tree import Arm, RigidTree
 from nbs_pin.inertia.lever_arms import lever_arms
 from nbs_pin.inertia.multipliers import largest_by_multipliers, least_by_multipliers
 from nbs_pin.inertia.pose_grid import pose_grid_bound
-from nbs_pin.inertia.rigid_tree import Arm, RigidTree
-from nbs_pin.inertia.rounding import down, largest_eigenvalue, least_eigenvalue, up
 
 POSES = 150_000
 """Poses that `trigonometric_bound` looks at, at most."""

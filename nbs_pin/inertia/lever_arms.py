@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.inertia.rigid_tree import RigidTree
+from nbs_pin.dynamics.rigid_tree import RigidTree
 
 CELLS, CORNERS = 48, 48
 """Cells of a table from the axis outward, and corners of the polygon around a circle."""

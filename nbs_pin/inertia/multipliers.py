@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import sparse
 
-from nbs_pin.inertia.rigid_tree import RigidTree, cross
-from nbs_pin.inertia.rounding import least_eigenvalue
+from nbs_pin.base.rounding import least_eigenvalue
+from nbs_pin.dynamics.rigid_tree import RigidTree, cross
 
 REACH = 1e4
 """Multipliers are kept below this, for forms and energy of size 1: larger ones gain nothing and cost digits."""

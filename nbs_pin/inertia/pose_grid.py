@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.rounding import largest_eigenvalues
+from nbs_pin.dynamics.rigid_tree import RigidTree, cross
 from nbs_pin.inertia.lever_arms import lever_arms
-from nbs_pin.inertia.rigid_tree import RigidTree, cross
-from nbs_pin.inertia.rounding import largest_eigenvalues
 
 FEWEST, MOST = 5, 48
 """Angles per joint."""

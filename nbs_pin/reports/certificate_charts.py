@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from nbs_pin.base.claims import Assumption
 from nbs_pin.certificates.attack import Attack
 from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.monitor import Monitored
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture, stretches, thin
 from nbs_pin.robots.robot import configuration_difference

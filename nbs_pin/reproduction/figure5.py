@@ -20,10 +20,10 @@ from nbs_pin.kernels.layout import Packed
 from nbs_pin.motions.references import paper_reference
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, TORQUE, picture, thin
 from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.simulation import metrics
 from nbs_pin.simulation.costs import squared_error
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
-from nbs_pin.simulation import metrics
 from nbs_pin.simulation.simulate import simulate
 from nbs_pin.training.train import train
 

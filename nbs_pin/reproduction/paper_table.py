@@ -15,9 +15,9 @@ from nbs_pin.controllers.pid import PID
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.motions.references import paper_reference
 from nbs_pin.reproduction.authors import PERIOD, AuthorsLaw, follow_authors, task, train_authors
+from nbs_pin.simulation import metrics
 from nbs_pin.simulation.costs import squared_error
 from nbs_pin.simulation.rollout import Batch, motions, recorded
-from nbs_pin.simulation import metrics
 from nbs_pin.training.train import Regulariser, train
 
 DISTURBANCE = np.array([1.0, 1.0])

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from array_api_compat import device
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from nbs_pin.base.arrays import Array, array_namespace
 from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.exceptions import ArgumentError, RobotError
+from nbs_pin.base.storable import storable
 from nbs_pin.robots.catalogue import find
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
 from nbs_pin.robots.urdf_checks import ZERO_LIMITS
@@ -23,6 +24,7 @@ _SINGULAR = 1e-10
 """Smallest eigenvalue of M scaled to a unit diagonal that still counts as positive."""
 
 
+@storable(("name", "source", "options", "sha256", "effort_limit"))
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot:
     """A fixed-base arm with nq = nv = n joints.
@@ -92,8 +94,7 @@ class Robot:
         one turn about its middle at most; a joint that slides keeps its limits, however long.
         """
         lower, upper = self.sampling_range
-        prismatic = np.array([joint.prismatic for joint in self.joints])
-        longer, middle = ~prismatic & (upper - lower > 2.0 * np.pi), 0.5 * (lower + upper)
+        longer, middle = ~self.prismatic & (upper - lower > 2.0 * np.pi), 0.5 * (lower + upper)
         return np.where(longer, middle - np.pi, lower), np.where(longer, middle + np.pi, upper)
 
     @property
@@ -110,6 +111,16 @@ class Robot:
     def continuous(self) -> Bool[np.ndarray, " n"]:
         """True where the error wraps to (−π, π]."""
         return np.array([joint.continuous for joint in self.joints])
+
+    @property
+    def prismatic(self) -> Bool[np.ndarray, " n"]:
+        """True for joints that slide."""
+        return np.array([joint.prismatic for joint in self.joints])
+
+    @property
+    def parents(self) -> Int[np.ndarray, " n"]:
+        """The joint before each, i + 1 for joint i, 0 for the base."""
+        return np.array(list(self.model.parents)[1:], dtype=np.int64)
 
     @property
     def sha256(self) -> str:
@@ -139,7 +150,7 @@ class Robot:
 def configuration_difference(
     q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"], continuous: Bool[np.ndarray, " n"] | None
 ) -> Float[Array, "*batch n"]:
-    """Q ⊖ q_ref [rad]: plain subtraction, wrapped to (−π, π] where `continuous` is true (None: nowhere).
+    """q ⊖ q_ref [rad]: plain subtraction, wrapped to (−π, π] where `continuous` is true (None: nowhere).
 
     The wrap makes every law that uses it discontinuous at |z1_i| = π (docs/theory.md §1).
     """

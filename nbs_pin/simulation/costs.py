@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import torch
 from jaxtyping import Float
@@ -93,3 +93,19 @@ class TimeOutside:
         """The cost per second."""
         squared = (z1 * z1).sum(-1)
         return squared / (squared + self.threshold) + self.pull * squared
+
+
+CostName: TypeAlias = Literal["torque-aware", "squared-error", "time-outside"]
+"""What `stage_cost` knows."""
+
+
+def stage_cost(name: str, robot: Robot) -> StageCost:
+    """The stage cost of that name, with the arm's effort limits; raises ArgumentError for an unknown name."""
+    known: dict[str, StageCost] = {
+        "torque-aware": TorqueAware.for_robot(robot),
+        "squared-error": squared_error,
+        "time-outside": TimeOutside(),
+    }
+    if name not in known:
+        raise ArgumentError(f"cost '{name}' is unknown; choose one of {', '.join(get_args(CostName))}.")
+    return known[name]

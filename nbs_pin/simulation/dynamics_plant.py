@@ -7,6 +7,7 @@ from nbs_pin.base.arrays import Array, is_torch_array
 from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.integrators import INTEGRATORS, IntegratorName
@@ -31,6 +32,20 @@ class DynamicsPlant(Plant):
         self.integrator = integrator
         self.friction = friction_of_size(friction, dynamics.nv)
         self._step = INTEGRATORS[integrator]
+
+    @classmethod
+    def for_robot(
+        cls, robot: Robot, integrator: IntegratorName | None = None, joint_friction: str = "drop"
+    ) -> "DynamicsPlant":
+        """Pinocchio's dynamics of the arm, by RK4 unless told otherwise, with the joint friction that its URDF states.
+
+        Raises:
+            ArgumentError: For an unknown integrator or a joint_friction other than "drop" and "keep".
+        """
+        if joint_friction not in ("drop", "keep"):
+            raise ArgumentError(f"joint_friction '{joint_friction}' is unknown; give 'drop' or 'keep'.")
+        friction = JointFriction.of(robot) if joint_friction == "keep" else None
+        return cls(PinocchioDynamics(robot), integrator or "rk4", friction)
 
     def __repr__(self) -> str:
         return f"DynamicsPlant({type(self.dynamics).__name__}, {self.integrator})"

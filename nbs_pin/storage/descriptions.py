@@ -1,12 +1,12 @@
 """A controller or a model as settings that JSON can store and tensors, and the same one back.
 
-Every part of it is its class and the arguments of its constructor. `_KINDS` says for each class where each
-argument is found: plain settings and further parts in the description, arrays among the tensors of the `state_dict`.
+Every part of it is its class and the arguments of its constructor. The class says where each argument is found
+(`base/storable.py`): plain settings and further parts in the description, arrays among the tensors of the `state_dict`.
 """
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from typing import Any, TypeAlias, cast
 
@@ -15,26 +15,11 @@ import torch
 from torch import nn
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
-from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.base.storable import RECIPES, Recipe, Tensors
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.damping import Damping
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
-from nbs_pin.controllers.pd import PD
-from nbs_pin.controllers.pid import PID
-from nbs_pin.controllers.potential import Potential
-from nbs_pin.controllers.slotine_li import SlotineLi
-from nbs_pin.dynamics.analytic import AnalyticDynamics
-from nbs_pin.dynamics.chain import Chain
-from nbs_pin.dynamics.cholesky import CholeskyNetwork
-from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.dynamics.identified import IdentifiedDynamics
-from nbs_pin.dynamics.lagrangian import LagrangianDynamics
-from nbs_pin.dynamics.picnn import HomogenisedPicnn, PaperPicnn
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.controllers.registry import LAWS
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
-from nbs_pin.dynamics.unconstrained import UnconstrainedLagrangian
+from nbs_pin.dynamics.registry import NETWORKS, PROVIDERS
 from nbs_pin.robots.robot import Robot
 
 Settings: TypeAlias = dict[str, Any]
@@ -42,37 +27,6 @@ Settings: TypeAlias = dict[str, Any]
 
 Stored: TypeAlias = Controller | DynamicsProvider
 """What files hold: a law, or what one believes of an arm."""
-
-
-class Tensors(dict[str, torch.Tensor]):
-    """Tensors by name; asking for one that is not there raises ArgumentError."""
-
-    def __missing__(self, name: str) -> torch.Tensor:
-        raise ArgumentError(f"there is no tensor '{name}'")
-
-    def below(self, prefix: str) -> "Tensors":
-        """Those whose names begin with the prefix, named without it."""
-        return Tensors({name.removeprefix(prefix): x for name, x in self.items() if name.startswith(prefix)})
-
-    def widths(self, stem: str) -> tuple[int, ...]:
-        """Sizes of the hidden layers; the weights of the layers are named stem0, stem1 and so on."""
-        count = sum(name.startswith(stem) for name in self)
-        return tuple(len(self[f"{stem}{i}"]) for i in range(count))[:-1]
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """Where the arguments of a constructor come from."""
-
-    make: Callable[..., Any]
-    settings: Mapping[str, str] = field(default_factory=dict)
-    """Arguments stored as they are, and the attributes that hold them."""
-    parts: Mapping[str, str] = field(default_factory=dict)
-    """Arguments that are parts or None, and the attributes that hold them."""
-    arrays: Callable[[Tensors], Mapping[str, Any]] = lambda tensors: {}
-    """Arguments that are found among the part's tensors."""
-    sequence: Callable[[list[Any]], Any] = np.array
-    """What a stored list is handed over as."""
 
 
 def describe(stored: Stored) -> tuple[Settings, Tensors]:
@@ -143,9 +97,10 @@ def _described(part: Any) -> Settings | None:
     """The part in JSON, None for None."""
     if part is None:
         return None
-    kind = _KINDS.get(type(part).__name__)
+    kind = RECIPES.get(type(part).__name__)
     if kind is None or kind.make is not type(part):
-        raise ArgumentError(f"a {type(part).__name__} cannot be stored, only {', '.join(_KINDS)} and no subclass")
+        known = ", ".join(_recipes())
+        raise ArgumentError(f"a {type(part).__name__} cannot be stored, only {known} and no subclass")
     settings = {name: _plain(attrgetter(place)(part)) for name, place in kind.settings.items()}
     parts = {name: _described(attrgetter(place)(part)) for name, place in kind.parts.items()}
     return {"kind": type(part).__name__, **settings, **parts}
@@ -163,12 +118,12 @@ def _rebuild(description: Any, tensors: Tensors, robot: Robot | None) -> Any:
     return kind.make(**settings, **parts, **kind.arrays(tensors))
 
 
-def _kind_of(description: Any) -> _Kind:
+def _kind_of(description: Any) -> Recipe:
     """The kind of part that is described; raises ArgumentError unless it is a known one with just its settings."""
     name = description.get("kind") if isinstance(description, dict) else None
-    kind = _KINDS.get(str(name))
+    kind = RECIPES.get(str(name)) or _recipes().get(str(name))
     if kind is None:
-        raise ArgumentError(f"kind {name!r} is unknown; this version knows {', '.join(_KINDS)}")
+        raise ArgumentError(f"kind {name!r} is unknown; this version knows {', '.join(_recipes())}")
     wrong = description.keys() ^ {"kind", *kind.settings, *kind.parts}
     if wrong:
         raise ArgumentError(f"'{min(wrong)}' of {name} is {'unknown' if min(wrong) in description else 'missing'}")
@@ -210,66 +165,8 @@ def _revived(values: list[Any], sequence: Callable[[list[Any]], Any]) -> Any:
     return sequence([math.inf if x is None else x for x in values])
 
 
-def _same(*names: str, **elsewhere: str) -> dict[str, str]:
-    """Arguments that attributes of the same name hold, and those that others do."""
-    return {name: name for name in names} | elsewhere
-
-
-def _gains(*names: str) -> Callable[[Tensors], Mapping[str, Any]]:
-    return lambda t: {name: t[f"gains.{name}.nominal"].numpy(force=True) for name in names}
-
-
-def _backstepping(t: Tensors) -> Mapping[str, Any]:
-    return {"rate": t["rate.nominal"], "least_share": float(t["rate.least_share"])}
-
-
-def _potential(t: Tensors) -> Mapping[str, Any]:
-    gain = {"stiffness": t["stiffness.nominal"], "least_share": float(t["stiffness.least_share"])}
-    return gain | {"scale": t["scale"], "widths": t.widths("network.wx")}
-
-
-def _damping(t: Tensors) -> Mapping[str, Any]:
-    sizes = {"nv": len(t["scale"]), "scale": t["scale"], "widths": t.widths("diagonal.w")}
-    if "floor.nominal" not in t:
-        return sizes
-    return sizes | {"floor": t["floor.nominal"], "least_share": float(t["floor.least_share"])}
-
-
-def _network(t: Tensors) -> Mapping[str, Any]:
-    scales = {name: float(t[f"scales.{name}"]) for name in ("epsilon", "energy")}
-    return scales | {"prismatic": t["features.prismatic"].tolist(), "inertia": t["scales.inertia"].tolist()}
-
-
-def _residual(t: Tensors) -> Mapping[str, Any]:
-    return {name: x for name, x in _network(t).items() if name != "epsilon"}
-
-
-_LAW = _same("dynamics", "friction")
-_WIDE = _same("widths")
-_KINDS: dict[str, _Kind] = {
-    kind.make.__name__: kind
-    for kind in (
-        _Kind(NeuralBackstepping, _same("inertial_rate"), _LAW | _same("potential", "damping"), _backstepping),
-        _Kind(SlotineLi, {}, _LAW, _gains("rate", "gain")),
-        _Kind(ComputedTorque, {}, _LAW, _gains("kp", "kd")),
-        _Kind(PD, _same("feedforward"), _LAW, _gains("kp", "kd")),
-        _Kind(PID, _same("effort_limit", "filter_time", "continuous"), _same("robot"), _gains("kp", "ki", "kd")),
-        _Kind(Potential, _same("form"), _same(activation="network.activation"), _potential),
-        _Kind(Damping, _same("form", "m"), {}, _damping),
-        _Kind(SmoothedReLU, _same("d")),
-        _Kind(Squareplus, _same("b")),
-        _Kind(JointFriction, _same("viscous", "coulomb", "transition")),
-        _Kind(PinocchioDynamics, {}, _same("robot")),
-        _Kind(AnalyticDynamics, _same("masses", "lengths", gravity="gravity_constant"), _same("robot"), sequence=tuple),
-        _Kind(IdentifiedDynamics, _same("parameters", "rotor_inertia", "report"), _same("robot", "friction")),
-        _Kind(LagrangianDynamics, _same("report"), _same("network", "robot", "friction")),
-        _Kind(ResidualDynamics, _same("report"), _same("network", "friction")),
-        _Kind(ResidualNetwork, _same("share") | _WIDE, _same("nominal"), _residual, sequence=tuple),
-        _Kind(Chain, _same("parents", "prismatic", "epsilon"), sequence=list),
-        *(
-            _Kind(network, _WIDE, arrays=_network, sequence=tuple)
-            for network in (CholeskyNetwork, HomogenisedPicnn, PaperPicnn, UnconstrainedLagrangian)
-        ),
-        _Kind(Robot, _same("name", "source", "options", "sha256", "effort_limit")),
-    )
-}
+def _recipes() -> dict[str, Recipe]:
+    """The recipes of all laws, models and networks by name, their modules imported."""
+    for entry in (*LAWS.values(), *PROVIDERS.values(), *NETWORKS.values()):
+        entry.load()
+    return RECIPES

@@ -1,40 +1,30 @@
-"""One law certified, attacked and watched: the study behind `nbs-pin certify`."""
+"""A law certified for one task, attacked, and a run held against the certificate."""
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from nbs_pin.accuracy.mismatch import Mismatch, mismatch
 from nbs_pin.base.checks import PerJoint
-from nbs_pin.base.exceptions import ArgumentError, CertificateRefused, SimulationDiverged
-from nbs_pin.base.files import write_whole
-from nbs_pin.base.pages import plain
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.attack import Attack, attack, random_disturbances
 from nbs_pin.certificates.certify import Certificate, certify
 from nbs_pin.certificates.ensemble import motions_of
-from nbs_pin.certificates.loads import MARGIN, Load, friction, gravity_error, label_of, payload, total
+from nbs_pin.certificates.loads import MARGIN, Load, friction, gravity_error, payload, total
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.certificates.monitor import Monitored, monitor
 from nbs_pin.certificates.propose import PERIODS, Proposal, propose
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import DesiredMotion
-from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
-from nbs_pin.storage.checkpoints import load, save
 
-FILES = ("certificate.png", "run.npz", "summary.json")
-"""What `write_results` always writes, the summary last."""
-MONITOR, DESIGNED = "monitor.png", "controller.nbs"
-"""What it writes beside them when a run was watched or a law designed."""
 TRAJECTORIES = 374
 """Closed-loop motions that a learned model is judged on (`mismatch.py`)."""
 
@@ -102,24 +92,8 @@ class Task:
         return tuple(found)
 
 
-def controller_of(text: str, *, bandwidth: float = 8.0, period: float = 0.001, seed: int = 0) -> NeuralBackstepping:
-    """The controller that a .nbs file holds, or the one that `NeuralBackstepping.for_robot` makes for an arm.
-
-    Raises CertificateRefused for a file with anything but an NBS law, errors of `load` and `load_robot` else.
-    """
-    if not text.endswith(".nbs"):
-        return NeuralBackstepping.for_robot(load_robot(text), bandwidth=bandwidth, period=period, seed=seed)
-    stored = load(text)
-    if not isinstance(stored, NeuralBackstepping):
-        raise CertificateRefused(
-            f"{text} holds a {type(stored).__name__}, of which no Lyapunov function is known here; give a file with an "
-            "NBS law."
-        )
-    return stored
-
-
-def certify_controller(
-    controller: NeuralBackstepping,
+def assess(
+    controller: LyapunovLaw,
     task: Task,
     *,
     thorough: bool = False,
@@ -177,7 +151,7 @@ def design(robot: Robot, task: Task, error: PerJoint, *, period: float | None = 
     )
 
 
-def arm_of(controller: NeuralBackstepping, task: Task) -> Robot:
+def arm_of(controller: LyapunovLaw, task: Task) -> Robot:
     """The true arm; raises ArgumentError where none is known or its joints are of another number."""
     robot = controller.dynamics.robot if task.truth is None else task.truth
     if robot is None:
@@ -197,7 +171,7 @@ def disturbance_of(robot: Robot, task: Task) -> tuple[tuple[Load, ...], Admissib
 
 
 def model_error(
-    controller: NeuralBackstepping, robot: Robot, task: Task, admissible: Admissible, progress: bool = False
+    controller: LyapunovLaw, robot: Robot, task: Task, admissible: Admissible, progress: bool = False
 ) -> Mismatch:
     """δ of the controller's model along its own closed loop on the true arm, from independent starts and disturbances.
 
@@ -252,95 +226,3 @@ def _attacked(certificate: Certificate, task: Task, thorough: bool, progress: bo
     except SimulationDiverged as error:
         return None, str(error)
     return found, ""
-
-
-def figures(result: Certified) -> dict[str, Any]:
-    """Everything found, units in the keys, as JSON can store it; None for what is not finite."""
-    certificate, found, proposal = result.certificate, result.attack, result.proposal
-    numbers: dict[str, Any] = {
-        "arm": None if certificate.robot is None else certificate.robot.name,
-        "certificate": certificate.summary(),
-        "loads": [load.claim.plain() | {"box_Nm": load.admissible.box} for load in result.loads],
-        "disturbance_label": str(label_of(*result.loads)),
-        "attack": None,
-        "attack_diverged": result.diverged or None,
-        "monitor": None,
-        "design": None,
-    }
-    if found is not None:
-        numbers["attack"] = {
-            "error_rad": found.error,
-            "joint_errors_rad": found.joint_errors,
-            "certified_over_found": certificate.error / found.error if found.error > 0.0 else None,
-            "exceeds": result.beaten is not None,
-            "verdict": None if result.beaten is None else result.beaten.verdict,
-            "found_by": found.found_by,
-            "thorough": result.thorough,
-            "duration_s": found.duration,
-            "period_s": found.period,
-        }
-    if result.watched is not None:
-        watched = result.watched
-        numbers["monitor"] = {
-            "verdict": watched.verdict,
-            "is_kept": watched.is_kept,
-            "is_wrong": watched.is_wrong,
-            "broken": watched.broken,
-            "largest_share": float((watched.storage / watched.promise).max()) if watched.promise.all() else None,
-            "largest_error_rad": float(watched.error.max()),
-            "largest_error_bound_rad": float(watched.error_bound.max()),
-        }
-    if proposal is not None:
-        numbers["design"] = {
-            "bandwidth_rad_per_s": proposal.gains.bandwidth,
-            "stiffness_Nm_per_rad": proposal.gains.stiffness,
-            "rate_rad_per_s_per_Nm": proposal.gains.rate,
-            "damping_Nms_per_rad": proposal.gains.damping,
-            "period_s": proposal.period,
-            "error_rad": proposal.error,
-            "joint_errors_rad": proposal.joint_errors,
-            "torque_Nm": proposal.torque,
-            "torque_share": proposal.share,
-        }
-    plained: dict[str, Any] = plain(numbers)
-    return plained
-
-
-def write_results(result: Certified, folder: Path, facts: dict[str, Any]) -> tuple[dict[str, Any], list[Path]]:
-    """Writes `FILES` and what goes with them into the folder; returns the figures and the paths written.
-
-    facts: what summary.json holds beside the figures. Raises OSError when they cannot be written.
-    """
-    from nbs_pin.reports.certificate_charts import plot_certificate, plot_monitor
-
-    found, written = figures(result), [folder / FILES[0]]
-    plot_certificate(result.certificate, result.attack, written[0])
-    if result.attack is not None:
-        result.attack.run.save(folder / FILES[1])
-        written.append(folder / FILES[1])
-    if result.watched is not None:
-        plot_monitor(result.watched, folder / MONITOR)
-        written.append(folder / MONITOR)
-    if result.proposal is not None:
-        save(result.proposal.controller, folder / DESIGNED)
-        written.append(folder / DESIGNED)
-    text = json.dumps(facts | {"figures": found}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    written.append(write_whole(folder / FILES[2], text.encode()))
-    return found, written
-
-
-def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
-    """|τ_d,i| ≤ the numbers, one for all joints or one each, or ‖τ_d‖ ≤ the only one [N·m].
-
-    Raises ArgumentError for another count.
-    """
-    if norm:
-        if len(numbers) != 1:
-            raise ArgumentError(f"a norm is one number and {len(numbers)} were given; give one, or leave out --norm.")
-        return Admissible.of(numbers[0], nv)
-    if len(numbers) not in (1, nv):
-        raise ArgumentError(
-            f"{len(numbers)} torques were given for {nv} joints; give one for every joint, or one for each [N·m]."
-        )
-    box: Float[np.ndarray, " n"] = np.full(nv, numbers, dtype=float)
-    return Admissible.of(box, nv)

@@ -7,6 +7,8 @@ import numpy as np
 
 Numbers: TypeAlias = np.ndarray | np.float64
 """An array, or one number."""
+OUTWARD = 1.0 + 1e-9
+"""Factor that widens a bound by more than the rounding of the operations behind it."""
 
 
 @dataclass(frozen=True, eq=False)

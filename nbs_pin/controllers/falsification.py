@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import matvec
-from nbs_pin.certificates.model_structure import refuse, sample_states, strange
+from nbs_pin.base.claims import refuse
+from nbs_pin.base.known_code import foreign_code
 from nbs_pin.controllers.activations import Activation
 from nbs_pin.controllers.damping import Damping
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.controllers.potential import Potential
 
 _STATES = 48
@@ -97,34 +97,7 @@ def falsify_damping(damping: Damping, floor: Float[np.ndarray, "n n"]) -> float:
     if bad.any():
         at = np.round(z[int(bad.argmax())], 3).tolist()
         refuse(f"D is not symmetric with D ⪰ D₀, or its force is not D z2, at z2 = {at}", "correct the damping")
-    if strange(damping, Damping) or damping.floor is not None:
+    if foreign_code(damping) or damping.floor is not None:
         return float(np.linalg.eigvalsh(d)[:, 0].min())
     r = damping.scale.numpy(force=True)  # of TᵀT by T itself, which knows twice as many digits of small eigenvalues
     return float(np.linalg.svd(damping.factor(r * z) * r, compute_uv=False)[:, -1].min()) ** 2
-
-
-def falsify_law(controller: NeuralBackstepping) -> None:
-    """Raises CertificateRefused with a state at which V falls more slowly than ∇ΦᵀΛ∇Φ + z2ᵀ(ωM + D)z2, undisturbed.
-
-    V̇ = ∇Φᵀ(v − v_d) + z2ᵀ(τ − f(v) − (M a_r + C φ + G)), from the ingredients and not from the law's own signals.
-    """
-    model, phi = controller.dynamics, controller.potential
-    q, z, v, v_ref = sample_states(model, _STATES, seed=2)
-    z, v, v_ref = 0.2 * z, 0.5 * v, 0.5 * v_ref
-    q_ref, a_ref = q - z, v_ref[::-1]
-    z1 = model.difference(q, q_ref)
-    _, gradient, product = phi.terms(z1, v - v_ref)
-    rate, omega = controller.rate.numpy(), controller.inertial_rate
-    v_r, a_r = v_ref - rate * gradient, a_ref - rate * product
-    z2, mass = v - v_r, model.mass_matrix(q)
-    tau = controller.torque(q, v, q_ref, v_ref, a_ref)
-    terms = [matvec(mass, a_r), matvec(model.coriolis_matrix(q, v), v_r), model.gravity(q)]
-    taken = 0.0 * v if controller.friction is None else controller.friction.torque(v)
-    loss = [rate * gradient * gradient, z2 * omega * matvec(mass, z2), z2 * controller.damping.force(z2)]
-    gain = [gradient * (v - v_ref), z2 * tau, -z2 * taken, *(-z2 * term for term in terms)]
-    balance = sum(part.sum(-1) for part in (*gain, *loss))
-    size = sum(np.abs(part).sum(-1) for part in (*gain, *loss))
-    bad = ~(balance <= _TOLERANCE * size)
-    if bad.any():
-        at = np.round(q[int(bad.argmax())], 3).tolist()
-        refuse(f"V falls more slowly than its dissipation at q = {at}, so τ is not the NBS law", "correct the torque")

@@ -1,21 +1,49 @@
-"""Data of an arm, what they cover, and the files they go into: the study behind `nbs-pin collect`."""
+"""`nbs-pin collect`: motions of an arm in MuJoCo, to learn its dynamics from."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.text import Text
 
-from nbs_pin.base.files import write_whole
+from nbs_pin.cli.collect import Collect
+from nbs_pin.cli.values import OptionError
+from nbs_pin.commands.results import SUMMARY, Results, keywords, table
+from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import torque_limits
+from nbs_pin.identification.measurement import Noise
 from nbs_pin.reports.plotting import ACTUAL, LIMIT, TORQUE, picture
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import Robot, load_robot
 
-FILES = ("data.npz", "coverage.png", "summary.json")
-"""What `write_results` writes, the summary last."""
+FILES = ("data.npz", "coverage.png", SUMMARY)
+"""What it writes, the data first and the summary last."""
 _DOTS = 4000
 _AT_LIMIT = 1.0 - 1e-9
+
+
+def run(options: Collect, console: Console, notes: Console) -> None:
+    """Collects, writes and prints; raises NbsPinError and OSError."""
+    with notes.status(f"loading {options.robot}"):
+        robot = load_robot(options.robot)
+    if options.friction and not (robot.damping.any() or robot.friction.any()):
+        raise OptionError(f"--friction was given, but the URDF of {robot.name} states none; leave it out.")
+    results = Results.of(options, robot.name, robot, robot=robot.source)
+    results.check(FILES, options.force, whose="other data")
+    given = keywords(options, collect) | {
+        "noise": Noise(0.0 if options.encoder_bits is None else 2.0**-options.encoder_bits, options.torque_noise),
+        "acceleration": "differentiated" if options.differentiated else None,
+    }
+    with results.made() as folder:
+        data = collect(robot, options.recipe, options.samples, options.seed, **given, progress=True)
+        with notes.status(f"writing into {folder}"):
+            found = figures(data, robot)
+            data.save(folder / FILES[0])
+            plot_coverage(data, folder / FILES[1], robot)
+            results.write_summary(found)
+    _print(console, f"{robot.name}, {options.recipe}", found)
+    results.show(console, FILES)
 
 
 def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
@@ -35,19 +63,6 @@ def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
         "torque_limit_Nm": limit.tolist(),
         "at_torque_limit_fraction": (np.abs(data.tau) >= _AT_LIMIT * limit).mean(axis=0).tolist(),
     }
-
-
-def write_results(data: Dataset, folder: str | Path, robot: Robot, facts: dict[str, Any]) -> dict[str, Any]:
-    """Writes `FILES` into the folder, the data first; returns the figures.
-
-    facts: what summary.json holds beside the figures. Raises OSError when they cannot be written.
-    """
-    folder, numbers = Path(folder), figures(data, robot)
-    data.save(folder / "data.npz")
-    plot_coverage(data, folder / "coverage.png", robot)
-    text = json.dumps(facts | {"figures": numbers}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    write_whole(folder / "summary.json", text.encode())
-    return numbers
 
 
 def plot_coverage(data: Dataset, path: str | Path, robot: Robot) -> Path:
@@ -79,3 +94,16 @@ def plot_coverage(data: Dataset, path: str | Path, robot: Robot) -> Path:
 
 def _rms(x: np.ndarray) -> list[float]:
     return np.sqrt((x**2).mean(axis=0)).tolist()
+
+
+def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
+    """A row per joint; `figures` as the function of that name gives them."""
+    headings = ("q from\n[rad]", "to\n[rad]", "RMS v\n[rad/s]", "RMS acc.\n[rad/s²]", "RMS τ\n[N·m]", "at limit")
+    shown = table(title, *headings)
+    columns = ("q_least_rad", "q_most_rad", "rms_velocity_rad_per_s", "rms_acceleration_rad_per_s2", "rms_torque_Nm")
+    numbers = zip(*(figures[name] for name in columns), strict=True)
+    for joint, row, saturated in zip(figures["joints"], numbers, figures["at_torque_limit_fraction"], strict=True):
+        shown.add_row(Text(joint), *(f"{x:.3g}" for x in row), f"{saturated:.1%}")
+    console.print(shown)
+    plural = "trajectory" if figures["trajectories"] == 1 else "trajectories"
+    console.print(f"{figures['samples']} samples of {figures['trajectories']} {plural}", highlight=False)

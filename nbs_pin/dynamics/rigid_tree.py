@@ -6,8 +6,8 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nbs_pin.dynamics.pinocchio import pack_model
-from nbs_pin.inertia.rounding import least_eigenvalues
+from nbs_pin.base.rounding import least_eigenvalues
+from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY, FIRST, MASS, SECOND
 from nbs_pin.robots.robot import Robot

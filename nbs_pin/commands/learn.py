@@ -1,16 +1,18 @@
-"""A model of an arm from its data, how well it explains them, and the files it goes into: behind `nbs-pin learn`."""
+"""`nbs-pin learn`: a model of an arm from its data, and how well it explains motions that it never saw."""
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.text import Text
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.files import write_whole
 from nbs_pin.base.pages import plain
+from nbs_pin.cli.learn import Learn
+from nbs_pin.commands.results import SUMMARY, Results, sha256_of, table
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
@@ -21,8 +23,35 @@ from nbs_pin.reports.plotting import ACTUAL, LIMIT, REFERENCE, picture
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.checkpoints import save
 
-FILES = ("model.nbs", "learning.png", "summary.json")
-"""What `write_results` writes, the summary last."""
+FILES = ("model.nbs", "learning.png", SUMMARY)
+"""What it writes, the model first and the summary last."""
+_ENDED = {"held out": "no better on what was held out", "iterations": "all iterations done"}
+
+
+def run(options: Learn, console: Console, notes: Console) -> None:
+    """Learns, writes and prints; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
+    with notes.status(f"loading {options.data}"):
+        data, robot = data_and_arm(options.data, options.robot)
+    name = options.data.stem if robot is None else robot.name
+    # The same data in another place are the same data: their fingerprint counts, not their path.
+    results = Results.of(options, name, robot, data=None, data_sha256=sha256_of(options.data))
+    results.check(FILES, options.force, whole={"interrupted": False}, whose="another model")
+    given = {name: getattr(options, name) for name in ("optimiser", "iterations")}
+    given["loss"] = None if options.loss == "torque" else options.loss  # which every model minimises
+    given = {name: value for name, value in given.items() if value is not None}
+    common = {"held_out": options.held_out, "friction": options.friction, "progress": True}
+    with results.made() as folder:
+        result = learn(data, options.model, robot, options.seed, **common, **given)
+        interrupted = result.report.stopped == "interrupted"
+        with notes.status(f"writing into {folder}"):
+            found = figures(result)
+            save(result.model, folder / FILES[0], info={"learned": results.facts | {"interrupted": interrupted}})
+            plot_learning(result, folder / FILES[1])
+            results.write_summary(found, interrupted=interrupted)
+    _print(console, f"{name}, {options.model}", found)
+    results.show(console, FILES)
+    if interrupted:
+        raise KeyboardInterrupt
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,19 +123,6 @@ def figures(result: Learned) -> dict[str, Any]:
     )
 
 
-def write_results(result: Learned, folder: Path, facts: dict[str, Any]) -> dict[str, Any]:
-    """Writes `FILES` into the folder, the model first; returns the figures.
-
-    facts: what summary.json holds beside the figures. Raises OSError when they cannot be written.
-    """
-    numbers = figures(result)
-    save(result.model, folder / "model.nbs", info={"learned": facts})
-    plot_learning(result, folder / "learning.png")
-    text = json.dumps(facts | {"figures": numbers}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    write_whole(folder / "summary.json", text.encode())
-    return numbers
-
-
 def plot_learning(result: Learned, path: str | Path) -> Path:
     """Draws how the fit went and writes the picture (PNG); returns its path.
 
@@ -148,3 +164,38 @@ def _draw_errors(axes: Any, result: Learned) -> None:
 
 def _errors(result: Learned, data: Dataset) -> np.ndarray:
     return np.sqrt(np.square(torque_errors(result.model, data, result.friction)).mean(axis=0))
+
+
+def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
+    """A row per joint, then what counts for the whole arm."""
+    headings = ("torque\ndeviation [N·m]", "error [N·m]", "error, held\nout [N·m]", "friction\n[N·m·s, N·m]")
+    shown = table(title, *headings)
+    for i, joint in enumerate(figures["joints"]):
+        test, viscous = figures["rms_test_torque_error_Nm"], figures["viscous_friction"]
+        shown.add_row(
+            Text(joint),
+            f"{figures['torque_deviation_Nm'][i]:.4g}",
+            f"{figures['rms_torque_error_Nm'][i]:.2e}",
+            "none" if test is None else f"{test[i]:.2e}",
+            "none" if viscous is None else f"{viscous[i]:.3g}, {figures['coulomb_friction_Nm'][i]:.3g}",
+        )
+    console.print(shown)
+    for line in _lines(figures):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _lines(figures: dict[str, Any]) -> list[str]:
+    train, test = (figures[name] for name in ("train_nmse", "test_nmse"))
+    shown, more = figures["unexcited"][:3], len(figures["unexcited"]) - 3
+    return [
+        f"mean square of the torque error over the torque's variance: {_short(train)} on {figures['samples']} samples"
+        + ("" if test is None else f", {_short(test)} on {figures['test_samples']} of trajectories held out"),
+        f"{figures['parameters']} numbers learned in {figures['seconds']:.1f} s "
+        f"({_ENDED.get(figures['stopped'], figures['stopped'])})",
+        *(f"the data leave open: {text}" for text in shown),
+        *([f"… and {more} more in {SUMMARY}"] if more > 0 else []),
+    ]
+
+
+def _short(value: float | None) -> str:
+    return "none" if value is None else f"{value:.2e}"

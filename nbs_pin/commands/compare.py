@@ -1,37 +1,63 @@
-"""A model of an arm held against another: the study behind `nbs-pin compare`."""
+"""`nbs-pin compare`: how far a model of an arm is from Pinocchio's."""
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
 
 from nbs_pin.accuracy.compare import ModelErrors, compare
 from nbs_pin.accuracy.error_maps import ErrorMap, error_map, telling_joints
 from nbs_pin.accuracy.relative_errors import check_joints
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
-from nbs_pin.base.files import write_whole
 from nbs_pin.base.pages import plain, write_csv
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
+from nbs_pin.cli.compare import Compare
+from nbs_pin.cli.values import SAVED, OptionError
+from nbs_pin.commands.results import SUMMARY, Results, keywords, table
 from nbs_pin.controllers.gains import gains_for_robot
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.identification.datasets import load_dataset
 from nbs_pin.motions.references import Sinusoid
+from nbs_pin.reports.error_charts import plot_model_errors
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
 from nbs_pin.storage.checkpoints import load
 
-FILES = ("errors.png", "errors.csv", "summary.json")
+FILES = ("errors.png", "errors.csv", SUMMARY)
 """What `write_results` writes, the summary last."""
 TRAJECTORIES = 374
 """Starts for which the bound on δ holds for 95 % of further ones, but for one chance in a million (`mismatch.py`)."""
 _ENDINGS = ("", ".nbs", ".urdf", ".xacro", ".xml")
+
+
+_PRINTED = {"mass_matrix": "M", "coriolis": "C v", "gravity": "G", "inverse": "torque", "forward": "acceleration"}
+
+
+def run(options: Compare, console: Console, notes: Console) -> None:
+    """Compares, writes and prints; raises NbsPinError and OSError."""
+    with notes.status(f"loading {options.model}"):
+        model = model_of(options.model)
+        robot = _arm(options, model)
+        region = _region(options, robot)
+        recorded = None if options.along is None else Run.load(options.along)
+    results = Results.of(options, robot.name, robot, against=robot.source)
+    results.check(FILES, options.force, whose="another comparison")
+    given = keywords(options, compare_models) | region | {"joints": _pair(options, robot.nv), "run": recorded}
+    title = f"{Path(options.model).name} against {robot.name}"
+    with results.made() as folder:
+        result = compare_models(model, robot, **given, progress=True)
+        with notes.status(f"drawing the page into {folder}"):
+            found = write_results(result, robot, results, title)
+    _print(console, title, found)
+    results.show(console, FILES)
 
 
 class Comparison(NamedTuple):
@@ -185,20 +211,14 @@ def figures(result: Comparison, robot: Robot) -> dict[str, Any]:
     return found
 
 
-def write_results(result: Comparison, robot: Robot, folder: Path, facts: dict[str, Any], title: str) -> dict[str, Any]:
-    """Writes `FILES` into the folder; returns the figures.
-
-    facts: what summary.json holds beside the figures. Raises OSError when they cannot be written.
-    """
-    from nbs_pin.reports.error_charts import plot_model_errors
-
-    found = figures(result, robot)
+def write_results(result: Comparison, robot: Robot, results: Results, title: str) -> dict[str, Any]:
+    """Writes `FILES`; returns the figures. Raises OSError when they cannot be written."""
+    found, folder = figures(result, robot), results.folder
     labels = [f"{joint.name} [{'m' if joint.prismatic else 'rad'}]" for joint in robot.joints]
     why = result.missing or "no closed loop was run"
     plot_model_errors(result.errors, result.heat, folder / FILES[0], title=title, joints=labels, missing=why)
     write_csv(folder / FILES[1], ("figure", "where", "value"), list(_rows(found, robot)))
-    text = json.dumps(facts | {"figures": found}, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    write_whole(folder / FILES[2], text.encode())
+    results.write_summary(found)
     return found
 
 
@@ -227,3 +247,72 @@ def _rows(found: dict[str, Any], robot: Robot) -> Iterator[tuple[str, str, Any]]
                 yield "mismatch_rms_Nm", joint, torque
         else:
             yield f"mismatch_{name}", "closed loop", value
+
+
+def _arm(options: Compare, model: DynamicsProvider) -> Robot:
+    """The true arm; raises OptionError when neither the file nor the options name one."""
+    if options.against is not None:
+        return load_robot(options.against)
+    if model.robot is None or not options.model.endswith(SAVED):
+        raise OptionError(f"'{options.model}' does not say what to compare with; give --against ROBOT, the true arm.")
+    return model.robot
+
+
+def _region(options: Compare, robot: Robot) -> dict[str, Any]:
+    """Where to compare: the box of the data, or the arm's."""
+    if options.data is None:
+        return {"speed": 2.0 if options.speed is None else options.speed}
+    data = load_dataset(options.data)
+    if data.nv != robot.nv:
+        raise OptionError(f"--data '{options.data}' has {data.nv} joints and {robot.name} {robot.nv}; give its own.")
+    lower, upper, fastest = data.q.min(axis=0), data.q.max(axis=0), abs(data.v).max(axis=0)
+    return {"box": (lower, upper), "speed": fastest if options.speed is None else options.speed}
+
+
+def _pair(options: Compare, nv: int) -> tuple[int, int] | None:
+    """The joints of the maps, counted from 0."""
+    if options.joints is None:
+        return None
+    first, second = (int(part) for part in options.joints.split(","))
+    if first == second or max(first, second) > nv:
+        raise OptionError(f"--joints is '{options.joints}'; give two different ones of 1 to {nv}.")
+    return first - 1, second - 1
+
+
+def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
+    """Errors over the box and along the run side by side, then what counts for the whole model."""
+    along = figures["along_run"]
+    shown = table(title, "box", *([] if along is None else ["closed loop"]), first="relative error of")
+    for key, name in _PRINTED.items():
+        values = (figures["relative_error"], *([] if along is None else [along]))
+        shown.add_row(name, *(_number(of[key]) for of in values))
+    console.print(shown)
+    low, high = figures["mass_ratio"]
+    for line in (
+        f"torque nMSE {_number(figures['torque_nmse'])}; least eigenvalue of the model's M "
+        f"{_number(figures['eigenvalue_margin_kgm2'])} kg·m²; {_number(low)} M ≤ model's M ≤ {_number(high)} M",
+        f"torque × {figures['scale_factor']:.6g} fits best, and leaves a relative error of "
+        f"{_number(figures['scale_error'])}",
+        f"free motion: true energy drifts by {_number(figures['energy_drift'])} of the kinetic energy "
+        f"(integrator alone {_number(figures['energy_drift_floor'])})",
+        *_mismatch_lines(figures),
+    ):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _mismatch_lines(figures: dict[str, Any]) -> list[str]:
+    found = figures["mismatch"]
+    if found is None:
+        return [" ".join(figures["no_closed_loop_because"].split())]
+    constants = (_number(found[name]) for name in ("a_Nm_per_rad", "b_Nms_per_rad", "c_Nm"))
+    bound = "closed loop: ‖δ‖ ≤ {} ‖q‖ + {} ‖v‖ + {} N·m".format(*constants)
+    if found["violation_chance"] >= 1.0:
+        return [f"{bound} on this run; {found['trajectories']} starts say nothing of further ones"]
+    return [
+        f"{bound} on {found['trajectories']} starts; a further one breaks it with a chance of at most "
+        f"{found['violation_chance']:.2%}, confidence 1 − {found['doubt']:g} (probabilistic, for starts drawn alike)"
+    ]
+
+
+def _number(value: float | None) -> str:
+    return "not finite" if value is None else f"{value:.3g}"

@@ -1,0 +1,39 @@
+"""Which classes the proofs and the kernels speak of.
+
+A proof reads the code of a class, and a kernel repeats it. Neither says anything of a subclass, which may have replaced
+a method, nor of an object with a method of its own.
+"""
+
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+_Class = TypeVar("_Class", bound=type)
+_KNOWN: set[type] = set()
+_HOOKS = ("_forward_hooks", "_forward_pre_hooks")
+
+
+def known_code(cls: _Class) -> _Class:
+    """Class decorator: proofs and kernels may rely on the code of exactly this class."""
+    _KNOWN.add(cls)
+    return cls
+
+
+def is_known(part: Any) -> bool:
+    """Whether the part's class is one that proofs and kernels know."""
+    return type(part) in _KNOWN
+
+
+def foreign_code(part: Any) -> str:
+    """Why the part's code may be another than the known one: its class, a replaced method or a hook; empty if none."""
+    kind = type(part)
+    if kind not in _KNOWN:
+        return f"the code of {kind.__name__} is not known"
+    own = getattr(part, "__dict__", {})
+    replaced = sorted(n for n in own if callable(own[n]) and callable(getattr(kind, n, None)))
+    hooks = [name.strip("_") for name in _HOOKS if own.get(name)]
+    return f"'{(replaced + hooks)[0]}' of this {kind.__name__} was replaced" if replaced + hooks else ""
+
+
+def first_foreign(parts: Iterable[Any]) -> str:
+    """The first reason that `foreign_code` finds, empty if there is none."""
+    return next((why for why in map(foreign_code, parts) if why), "")

@@ -1,0 +1,35 @@
+"""Checked arguments as float64 tensors of their own."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nbs_pin.base.arrays import Array, is_torch_array
+from nbs_pin.base.exceptions import ArgumentError
+
+
+def positive_definite(name: str, matrix: Float[Array, "n n"]) -> Float[torch.Tensor, "n n"]:
+    """The matrix as a float64 tensor; raises ArgumentError unless it is symmetric positive definite."""
+    tensor = _copied(matrix)
+    square = tensor.ndim == 2 and tensor.shape[0] == tensor.shape[1]
+    if not square or not bool(torch.isfinite(tensor).all()) or not torch.equal(tensor, tensor.T):
+        raise ArgumentError(
+            f"{name} of shape {tuple(tensor.shape)} is not a finite symmetric matrix; give an n × n one."
+        )
+    smallest = float(torch.linalg.eigvalsh(tensor)[0])
+    if not smallest > 0.0:
+        raise ArgumentError(f"{name} has the eigenvalue {smallest:.3g}; give a positive definite matrix.")
+    return tensor
+
+
+def positive_scale(name: str, scale: Float[Array, " n"] | None, nv: int) -> Float[torch.Tensor, " n"]:
+    """The scale as a float64 tensor of shape (nv,), ones for None; raises ArgumentError unless all are positive."""
+    tensor = torch.ones(nv, dtype=torch.float64) if scale is None else _copied(scale)
+    if tensor.shape != (nv,) or not bool((tensor > 0.0).all() & torch.isfinite(tensor).all()):
+        raise ArgumentError(f"{name} is {tensor.tolist()}; give {nv} positive numbers.")
+    return tensor
+
+
+def _copied(x: Array) -> torch.Tensor:
+    """A float64 tensor of its own; numpy copies first, because torch warns of arrays that cannot be written."""
+    return x.detach().clone().double() if is_torch_array(x) else torch.from_numpy(np.array(x, dtype=float))

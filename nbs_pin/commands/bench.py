@@ -1,0 +1,84 @@
+"""`nbs-pin bench`: what the laws and plants cost on this machine."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from nbs_pin.base.files import write_whole
+from nbs_pin.benchmarks import bench
+from nbs_pin.cli.bench import Bench
+from nbs_pin.cli.values import OptionError
+from nbs_pin.commands.results import SUMMARY, summary_text, table
+from nbs_pin.reports.charts import plot_scaling
+
+_COLUMNS = {
+    "control step": {
+        "p50\n[µs]": "p50_us",
+        "p99\n[µs]": "p99_us",
+        "p99.9\n[µs]": "p99.9_us",
+        "max\n[µs]": "max_us",
+        "÷ two\nRNEA": "over_two_rnea",
+        "torch\n÷ it": "torch_over_compiled",
+    },
+    "plant step": {"p50\n[µs]": "p50_us"},
+    "simulate": {"steps\nper s": "steps_per_s", "recorded\n[MB]": "recorded_MB"},
+    "model torque": {"p50\n[µs]": "p50_us", "÷ pinocchio": "over_pinocchio"},
+    "joints": {"joints": "joints", "p50\n[µs]": "p50_us", "÷ two\nRNEA": "over_two_rnea"},
+    "training epoch": {"p50\n[ms]": "p50_ms", "torch\n÷ it": "torch_over_kernels"},
+    "endurance": {
+        "motion\n[s]": "duration_s",
+        "wall\n[s]": "wall_s",
+        "memory\ngrowth [MB]": "memory_growth_MB",
+        "error, last\n÷ first": "last_over_first_error",
+    },
+    "workers": {"starts": "starts", "1 process\n[s]": "one_s", "2 processes\n[s]": "two_s", "speed-up": "speed_up"},
+}
+
+
+def run(options: Bench, console: Console, notes: Console) -> None:
+    """Measures, writes and prints; raises NbsPinError or OSError."""
+    known = None if options.compare is None else bench.rows_of(_read(options.compare))
+    rows = []
+    with notes.status("measuring; leave the machine alone") as status:
+        for row in bench.bench(options.arms, calls=options.calls, long=options.long):
+            rows.append(row)
+            status.update(f"measured {row.key}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_whole(options.out / SUMMARY, summary_text(bench.summary(rows)).encode())
+    chain = [row.figures for row in rows if row.what == "joints"]
+    lines = {"compiled law": "p50_us", "two RNEA": "two_rnea_us"}
+    series = {name: [figures[key] for figures in chain] for name, key in lines.items()}
+    plot_scaling([figures["joints"] for figures in chain], series, options.out / "joints.png")
+    for what, columns in _COLUMNS.items():
+        if any(row.what == what for row in rows):
+            console.print(_shown(what, columns, [row for row in rows if row.what == what]))
+    if known is not None:
+        console.print(_moved(bench.compare(rows, known)))
+    console.print(str(options.out / SUMMARY), str(options.out / "joints.png"), sep="\n", highlight=False)
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise OptionError(f"--compare '{path}' is no JSON ({error}); give the summary.json of another bench.") from None
+
+
+def _shown(what: str, columns: dict[str, str], rows: list[bench.Row]) -> Table:
+    shown = table(what, "what", *columns, first="arm")
+    for row in rows:
+        values = (row.figures.get(column) for column in columns.values())
+        shown.add_row(row.arm, row.how, *("" if value is None else f"{value:.4g}" for value in values))
+    return shown
+
+
+def _moved(moved: list[tuple[str, str, float, float]]) -> Table | str:
+    if not moved:
+        return "nothing moved by more than a tenth"
+    shown = table("moved by more than a tenth", "figure", "before", "now", "now / before", first="row")
+    for key, name, before, now in moved:
+        shown.add_row(key, name, f"{before:.4g}", f"{now:.4g}", f"{now / before:.2f}" if before else "")
+    return shown

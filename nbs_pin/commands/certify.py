@@ -1,0 +1,207 @@
+"""`nbs-pin certify`: what a controller promises before the arm moves, and the worst that an adversary finds."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
+from nbs_pin.base.pages import plain
+from nbs_pin.base.records import Run
+from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design
+from nbs_pin.certificates.loads import MARGIN, label_of
+from nbs_pin.certificates.model_structure import is_exact
+from nbs_pin.cli.certify import Certify
+from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
+from nbs_pin.commands.certificate_tables import print_certificate
+from nbs_pin.commands.results import SUMMARY, Results
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.controllers.registry import build_law
+from nbs_pin.motions.by_name import motion_of
+from nbs_pin.reports.certificate_charts import plot_certificate, plot_monitor
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.storage.checkpoints import load, save
+
+FILES = ("certificate.png", "run.npz", SUMMARY)
+"""What `write_results` always writes, the summary last."""
+MONITOR, DESIGNED = "monitor.png", "controller.nbs"
+"""What it writes beside them when a run was watched or a law designed."""
+
+
+def run(options: Certify, console: Console, notes: Console) -> None:
+    """Certifies, writes and prints; raises NbsPinError and OSError."""
+    if options.wanted is not None and options.controller.endswith(SAVED):
+        raise OptionError(f"--wanted designs a controller for an arm, and '{options.controller}' is one; give an arm.")
+    with notes.status(f"loading {options.controller}"):
+        controller = _controller(options)
+        task = _task(options, controller)
+        robot = arm_of(controller, task)
+        watched = None if options.monitor is None else Run.load(options.monitor)
+    results = Results.of(options, robot.name, robot, against=robot.source)
+    results.check((*FILES, MONITOR, DESIGNED), options.force, whose="another certificate")
+    with results.made() as folder:
+        proposal = None
+        if options.wanted is not None:
+            wanted = plain_numbers(options.wanted) or []
+            proposal = design(robot, task, wanted[0] if len(wanted) == 1 else wanted, period=options.period)
+            controller, task = proposal.controller, dataclasses.replace(task, period=proposal.period)
+        result = assess(controller, task, thorough=options.attack, run=watched, proposal=proposal, progress=True)
+        with notes.status(f"drawing the picture into {folder}"):
+            found, written = write_results(result, results)
+    law = Path(options.controller).name if options.controller.endswith(SAVED) else "a law made for it"
+    print_certificate(console, f"{robot.name}, {law}", found)
+    results.show(console, written)
+
+
+def _controller(options: Certify) -> LyapunovLaw:
+    """The controller that a .nbs file holds, or the one that the law's `for_robot` makes for an arm.
+
+    Raises CertificateRefused for a law without a storage function, errors of `load` and `load_robot` else.
+    """
+    settings = {"bandwidth": options.bandwidth, "period": options.period or 0.001, "seed": options.seed}
+    name = options.controller
+    law: Any = load(name) if name.endswith(SAVED) else build_law(options.law, load_robot(name), **settings)
+    if not isinstance(law, LyapunovLaw):
+        what = f"{name} holds a {type(law).__name__}" if name.endswith(SAVED) else f"--law {options.law}"
+        raise CertificateRefused(
+            f"{what}, of which no Lyapunov function is known here; give a law that has one, such as nbs or slotine-li."
+        )
+    return law
+
+
+def _task(options: Certify, controller: LyapunovLaw) -> Task:
+    """Where and against what to certify; raises OptionError for options that do not fit each other."""
+    _check_options(options)
+    period = options.period or 0.001
+    truth = None if options.against is None else load_robot(options.against)
+    blank = Task(reference=_no_motion, truth=truth)
+    robot = arm_of(controller, blank)
+    if options.trajectories is not None and is_exact(controller.dynamics, robot):
+        raise OptionError(
+            f"--trajectories is about a model that is not exact, and this one is that of {robot.name} itself; "
+            "leave it out, or give the true arm with --against."
+        )
+    motion, duration = motion_of(options.reference, robot, frequency=options.frequency, period=period)
+    coefficients = None if options.friction in (None, "urdf") else plain_numbers(str(options.friction)) or []
+    numbers = None if options.disturbance is None else plain_numbers(options.disturbance) or []
+    return dataclasses.replace(
+        blank,
+        reference=motion,
+        duration=duration,
+        period=period,
+        disturbance=None if numbers is None else box_or_ball(numbers, robot.nv, norm=options.norm),
+        payload=options.payload,
+        link=options.link,
+        friction=options.friction if coefficients is None else (coefficients[0], coefficients[1]),
+        gravity_error=options.gravity_error,
+        margin=MARGIN if options.margin is None else options.margin,
+        start_error=options.start_error,
+        trajectories=options.trajectories or TRAJECTORIES,
+        seed=options.seed,
+    )
+
+
+def _check_options(options: Certify) -> None:
+    """Raises OptionError for options about others that were not given."""
+    loads = {"--payload": options.payload, "--friction": options.friction, "--gravity-error": options.gravity_error}
+    if options.norm and options.disturbance is None:
+        raise OptionError("--norm is about --disturbance; give that too.")
+    if options.link is not None and options.payload is None:
+        raise OptionError("--link is about --payload; give that too.")
+    if options.margin is not None and all(load is None for load in loads.values()):
+        raise OptionError(f"--margin is about {', '.join(loads)}; give one of them too.")
+
+
+def figures(result: Certified) -> dict[str, Any]:
+    """Everything found, units in the keys, as JSON can store it; None for what is not finite."""
+    certificate, found, proposal = result.certificate, result.attack, result.proposal
+    numbers: dict[str, Any] = {
+        "arm": None if certificate.robot is None else certificate.robot.name,
+        "certificate": certificate.summary(),
+        "loads": [load.claim.plain() | {"box_Nm": load.admissible.box} for load in result.loads],
+        "disturbance_label": str(label_of(*result.loads)),
+        "attack": None,
+        "attack_diverged": result.diverged or None,
+        "monitor": None,
+        "design": None,
+    }
+    if found is not None:
+        numbers["attack"] = {
+            "error_rad": found.error,
+            "joint_errors_rad": found.joint_errors,
+            "certified_over_found": certificate.error / found.error if found.error > 0.0 else None,
+            "exceeds": result.beaten is not None,
+            "verdict": None if result.beaten is None else result.beaten.verdict,
+            "found_by": found.found_by,
+            "thorough": result.thorough,
+            "duration_s": found.duration,
+            "period_s": found.period,
+        }
+    if result.watched is not None:
+        watched = result.watched
+        numbers["monitor"] = {
+            "verdict": watched.verdict,
+            "is_kept": watched.is_kept,
+            "is_wrong": watched.is_wrong,
+            "broken": watched.broken,
+            "largest_share": float((watched.storage / watched.promise).max()) if watched.promise.all() else None,
+            "largest_error_rad": float(watched.error.max()),
+            "largest_error_bound_rad": float(watched.error_bound.max()),
+        }
+    if proposal is not None:
+        numbers["design"] = {
+            "bandwidth_rad_per_s": proposal.gains.bandwidth,
+            "stiffness_Nm_per_rad": proposal.gains.stiffness,
+            "rate_rad_per_s_per_Nm": proposal.gains.rate,
+            "damping_Nms_per_rad": proposal.gains.damping,
+            "period_s": proposal.period,
+            "error_rad": proposal.error,
+            "joint_errors_rad": proposal.joint_errors,
+            "torque_Nm": proposal.torque,
+            "torque_share": proposal.share,
+        }
+    plained: dict[str, Any] = plain(numbers)
+    return plained
+
+
+def write_results(result: Certified, results: Results) -> tuple[dict[str, Any], list[str]]:
+    """Writes `FILES` and what goes with them; returns the figures and the names of the files written.
+
+    Raises OSError when they cannot be written.
+    """
+    found, folder, written = figures(result), results.folder, [FILES[0]]
+    plot_certificate(result.certificate, result.attack, folder / FILES[0])
+    if result.attack is not None:
+        result.attack.run.save(folder / FILES[1])
+        written.append(FILES[1])
+    if result.watched is not None:
+        plot_monitor(result.watched, folder / MONITOR)
+        written.append(MONITOR)
+    if result.proposal is not None:
+        save(result.proposal.controller, folder / DESIGNED)
+        written.append(DESIGNED)
+    results.write_summary(found)
+    return found, [*written, SUMMARY]
+
+
+def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
+    """|τ_d,i| ≤ the numbers, one for all joints or one each, or ‖τ_d‖ ≤ the only one [N·m].
+
+    Raises ArgumentError for another count.
+    """
+    if norm:
+        if len(numbers) != 1:
+            raise ArgumentError(f"a norm is one number and {len(numbers)} were given; give one, or leave out --norm.")
+        return Admissible.of(numbers[0], nv)
+    if len(numbers) not in (1, nv):
+        raise ArgumentError(
+            f"{len(numbers)} torques were given for {nv} joints; give one for every joint, or one for each [N·m]."
+        )
+    return Admissible.of(np.full(nv, numbers, dtype=float), nv)
+
+
+def _no_motion(t: Any) -> Any:
+    raise OptionError("no reference was chosen; give --reference.")

@@ -1,0 +1,37 @@
+"""What several commands are given: an arm with its limits, a law by name or from a file."""
+
+import math
+from typing import Any
+
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.cli.track import Track
+from nbs_pin.cli.train import Train
+from nbs_pin.cli.values import SAVED, OptionError
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.registry import build_law
+from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.storage.checkpoints import load
+
+
+def arm_of(options: Track | Train) -> Robot:
+    """The arm with the effort limits of the options; raises OptionError when they contradict each other."""
+    if options.no_effort_limit and options.effort_limit is not None:
+        raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
+    robot = load_robot(options.robot)
+    if options.no_effort_limit or options.effort_limit is not None:
+        return robot.with_effort_limit(options.effort_limit or math.inf)
+    return robot
+
+
+def law_of(name: str, robot: Robot, **settings: Any) -> Controller:
+    """The law of that name (`build_law`), or the one that a .nbs file holds, whatever the settings say.
+
+    Raises:
+        ArgumentError: For an unknown name, a file that holds a model, or a file for another arm; errors of `load` else.
+    """
+    if not name.endswith(SAVED):
+        return build_law(name, robot, **settings)
+    stored = load(name, robot)
+    if not isinstance(stored, Controller):
+        raise ArgumentError(f"{name} holds a {type(stored).__name__}, a model; give a file of a controller.")
+    return stored

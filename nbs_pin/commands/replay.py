@@ -1,0 +1,27 @@
+"""`nbs-pin replay`: a recorded run as a page that plays in the browser."""
+
+import webbrowser
+
+from rich.console import Console
+
+from nbs_pin.base.records import Run
+from nbs_pin.cli.replay import Replay
+from nbs_pin.cli.values import OptionError
+from nbs_pin.reports.replay import replay
+from nbs_pin.robots.robot import load_robot
+
+
+def run(options: Replay, console: Console, notes: Console) -> None:
+    """Writes the page and says where; raises NbsPinError or OSError."""
+    source = options.run_file / "run.npz" if options.run_file.is_dir() else options.run_file
+    page = options.out or source.with_name("replay.html")
+    if page.is_dir():
+        raise OptionError(f"--out '{page}' is a folder; give a file such as '{page / 'replay.html'}'.")
+    if options.out and page.exists() and not options.force:
+        raise OptionError(f"'{page}' exists; give another --out, or --force to replace it.")
+    with notes.status(f"drawing {page}"):
+        robot = None if options.robot is None else load_robot(options.robot)
+        replay(Run.load(source), page, robot, start=options.start)
+    console.print(str(page), soft_wrap=True, highlight=False, markup=False)
+    if options.open and not webbrowser.open(page.resolve().as_uri()):
+        notes.print(f"nbs-pin: no browser could be opened; open {page} yourself.", soft_wrap=True, markup=False)

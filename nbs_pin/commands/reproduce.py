@@ -1,0 +1,46 @@
+"""`nbs-pin reproduce`: the paper's experiments again, on one page."""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from nbs_pin.base.files import write_whole
+from nbs_pin.base.pages import page
+from nbs_pin.benchmarks.fair import fair_part
+from nbs_pin.cli.reproduce import Reproduce
+from nbs_pin.commands.results import SUMMARY, Results
+from nbs_pin.reproduction.certificate_study import reproduce_certificates
+from nbs_pin.reproduction.learned_loop import reproduce_learned
+from nbs_pin.reproduction.model_study import reproduce_models
+from nbs_pin.reproduction.paper import reproduce_paper
+
+FILES = ("report.md", SUMMARY)
+"""What it writes beside the files of its parts."""
+PARTS: dict[str, Callable[[Path, int, bool], Sequence[Any]]] = {
+    "paper": reproduce_paper,
+    "fair": fair_part,
+    "lnn": reproduce_learned,
+    "models": reproduce_models,
+    "certificates": reproduce_certificates,
+}
+"""Each writes its files into a folder and gives sections of the page."""
+
+
+def run(options: Reproduce, console: Console, notes: Console) -> None:
+    """Runs, writes and prints; raises NbsPinError or OSError."""
+    results = Results.of(options, "paper", None)
+    results.check(FILES, options.force)
+    chosen = list(PARTS) if options.part == "all" else [options.part]
+    began = time.perf_counter()
+    with results.made() as folder:
+        sections = [section for name in chosen for section in PARTS[name](folder, options.seed, True)]
+        wall_time = time.perf_counter() - began
+        lead = f"Made by `nbs-pin reproduce --part {options.part} --seed {options.seed}` in {wall_time:.0f} s."
+        write_whole(folder / FILES[0], page("The paper's experiments, run again", lead, sections).encode())
+        figures = {name: value for section in sections for name, value in section.figures.items()}
+        results.write_summary(figures, wall_time_s=wall_time)
+    console.print(f"{', '.join(chosen)}: done in {wall_time:.0f} s", highlight=False)
+    results.show(console, FILES)

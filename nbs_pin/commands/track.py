@@ -1,0 +1,235 @@
+"""`nbs-pin track`: an arm follows a motion; run, summary, picture and replay land in a folder."""
+
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.npz import LARGEST
+from nbs_pin.base.progress import waiting
+from nbs_pin.base.records import Reference, Run
+from nbs_pin.cli.track import Track
+from nbs_pin.cli.values import OptionError, parse_disturbance, plain_numbers
+from nbs_pin.commands.inputs import arm_of, law_of
+from nbs_pin.commands.results import SUMMARY, Results, keywords, summary_text, table
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.gains import sample_configurations
+from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.motions.by_name import motion_of
+from nbs_pin.motions.disturbances import Disturbance
+from nbs_pin.motions.references import DesiredMotion, Sinusoid, check_reference
+from nbs_pin.reports.plotting import plot_tracking
+from nbs_pin.reports.replay import replay
+from nbs_pin.robots.robot import Robot
+from nbs_pin.simulation import metrics
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.loop import LONGEST_PLANT_STEP
+from nbs_pin.simulation.plant import Plant
+from nbs_pin.simulation.registry import build_plant
+from nbs_pin.simulation.simulate import simulate
+
+FILES = ("run.npz", "tracking.png", "replay.html", SUMMARY)
+"""What `write_results` writes, the summary last."""
+_NOTICEABLE = 1.0  # seconds of compilation that are worth a line
+_ROWS_OF_ARRAYS = 8  # the arrays of a Run with a number per row and joint
+
+
+def run(options: Track, console: Console, notes: Console) -> None:
+    """Tracks, writes and prints; raises NbsPinError or OSError."""
+    if options.start is not None and options.start_error:
+        raise OptionError("--start and --start-error were both given; choose one.")
+    with notes.status(f"loading {options.robot}"):
+        robot = arm_of(options)
+    motion, length = motion_of(options.reference, robot, frequency=options.frequency, period=options.period)
+    duration = options.duration or length
+    results = Results.of(options, robot.name, robot, robot=robot.source, duration=duration)
+    results.check(FILES, options.force)
+    given = keywords(options, track) | {
+        "reference": motion,
+        "duration": duration,
+        "start": _start(options, robot.nv),
+        "disturbance": parse_disturbance(options.disturbance).build(robot.nv, options.period, options.seed),
+    }
+    with results.made() as folder:
+        recorded, compile_time, wall_time = track(robot, **given, progress=True)
+        recorded.info.update(reference=options.reference, **results.facts)
+        found = figures(recorded, robot)
+        with notes.status(f"drawing picture and replay into {folder}"):
+            times = {"compile_time_s": compile_time, "wall_time_s": wall_time}
+            summary = results.facts | {"seed": options.seed, **times, "figures": found}
+            write_results(recorded, folder, robot, summary)
+    _print(console, f"{robot.name}, {options.controller} in {options.plant}", found, compile_time, wall_time)
+    results.show(console, FILES)
+
+
+class Tracked(NamedTuple):
+    """A run and what it took."""
+
+    run: Run
+    compile_time: float
+    """Time to compile the law, or to load its machine code from disk [s]."""
+    wall_time: float
+    """Time to simulate [s]."""
+
+
+def track(
+    robot: Robot,
+    *,
+    plant: Plant | str = "mujoco",
+    controller: Controller | str = "nbs",
+    reference: DesiredMotion | None = None,
+    duration: float = 10.0,
+    period: float = 0.001,
+    bandwidth: float = 8.0,
+    start_error: float = 0.0,
+    start: Sequence[float] | None = None,
+    disturbance: Disturbance | None = None,
+    joint_friction: str = "drop",
+    integrator: str | None = None,
+    plant_step: float | None = None,
+    lookahead: float | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Tracked:
+    """The arm following a motion it is able to follow; `Robot.with_effort_limit` gives its drives other limits.
+
+    plant, controller: by name (`build_plant`, `law_of`) or built. reference: None takes
+    `Sinusoid.for_robot(robot)`. start_error: added to every joint with alternating sign, the arm then starting at rest;
+    0 starts on the reference. start: the configuration [rad] to start from at rest, in place of `start_error`.
+    joint_friction: "keep" lets the URDF's friction act, fed forward by laws that model it. integrator: of a plant by
+    name, None its usual one. plant_step, lookahead [s]: as in `simulate`. seed: of the network weights.
+    Raises ArgumentError for a motion outside the arm's position, velocity or effort limits, or settings that do not
+    fit, and SimulationDiverged when the arm leaves the finite numbers.
+    """
+    friction = JointFriction.of(robot) if joint_friction == "keep" else None
+    reference = Sinusoid.for_robot(robot) if reference is None else reference
+    _check_size(robot.nv, duration, period)
+    check_reference(reference, robot, duration)
+    if not isinstance(controller, Controller):
+        controller = law_of(controller, robot, bandwidth=bandwidth, period=period, friction=friction, seed=seed)
+    if not isinstance(plant, Plant):
+        plant = build_plant(plant, robot, integrator=integrator, joint_friction=joint_friction)
+    if start is None and start_error:
+        start = Reference(*reference(0.0)).q + start_error * (-1.0) ** np.arange(robot.nv)
+    begun = time.perf_counter()
+    with waiting("compiling the law", progress):
+        controller.compile()  # so that what `simulate` takes is simulation alone
+    before = time.perf_counter()
+    run = simulate(
+        plant,
+        controller,
+        reference,
+        duration,
+        period,
+        q0=start,
+        plant_step=_plant_step(plant, robot, period) if plant_step is None else plant_step,
+        effort_limit=robot.effort_limit,
+        lookahead=lookahead,
+        disturbance=disturbance,
+        progress=progress,
+    )
+    return Tracked(run, before - begun, time.perf_counter() - before)
+
+
+def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
+    """`metrics.summary` of the run and the RMS error over its last 30 % [rad], as JSON can store them.
+
+    robot: adds how far each joint went beyond its position range [rad]; no plant of ours has joint stops.
+    """
+    values = metrics.summary(run)
+    values["rms_error_last_30_percent_rad"] = metrics.rms_error(run, 0.7 * float(run.t[-1])).tolist()
+    if robot is not None:
+        beyond = np.maximum(robot.lower - run.q, run.q - robot.upper).reshape(-1, run.nv)
+        values["outside_position_range_rad"] = np.maximum(beyond.max(axis=0), 0.0).tolist()
+    return values
+
+
+def write_results(run: Run, folder: str | Path, robot: Robot, summary: dict[str, Any]) -> Path:
+    """Writes `FILES` for the run into the folder, all drawn before the first takes its place; returns the folder.
+
+    summary: what summary.json holds. Files of those names are replaced, and left alone when drawing or writing fails.
+    Raises OSError when they cannot be written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as drafts:
+        draft = Path(drafts)
+        run.save(draft / "run.npz")
+        plot_tracking(run, draft / "tracking.png")
+        replay(run, draft / "replay.html", robot)
+        (draft / SUMMARY).write_text(summary_text(summary), encoding="utf-8")
+        for name in FILES:
+            os.replace(draft / name, folder / name)
+    return folder
+
+
+def _check_size(nv: int, duration: float, period: float) -> None:
+    size = _ROWS_OF_ARRAYS * 8.0 * nv * duration / period
+    if size > LARGEST:
+        raise ArgumentError(
+            f"{duration:g} s at a period of {period:g} s would record {size / 1e9:.3g} GB, at most "
+            f"{LARGEST / 1e9:.3g} GB are kept; give a shorter duration or a longer period."
+        )
+
+
+def _plant_step(plant: Plant, robot: Robot, period: float) -> float | None:
+    """A step [s] short enough for RK4 to follow the plant's joint friction, or None for the usual one."""
+    if not isinstance(plant, DynamicsPlant) or plant.friction is None:
+        return None
+    # Friction is a damper of this slope near rest; RK4 is stable up to 2.78 of its fastest time constant.
+    slope = plant.friction.viscous + plant.friction.coulomb / plant.friction.transition
+    mass = plant.dynamics.mass_matrix(sample_configurations(robot, 200))
+    fastest = float(np.linalg.eigvals(np.linalg.solve(mass, np.diag(slope))).real.max())
+    return period / int(np.ceil(period / min(LONGEST_PLANT_STEP, 2.0 / max(fastest, 1.0)) - 1e-9))
+
+
+def _start(options: Track, nv: int) -> list[float] | None:
+    """The configuration to start from [rad], or None; raises OptionError for another number of joints."""
+    start = None if options.start is None else plain_numbers(options.start)
+    if start is not None and len(start) != nv:
+        raise OptionError(f"--start '{options.start}' has {len(start)} numbers for {nv} joints; give one for each.")
+    return start
+
+
+def _print(console: Console, title: str, figures: dict[str, Any], compile_time: float, wall_time: float) -> None:
+    """A row per joint, then what counts for the whole arm; `figures` as the function of that name gives them."""
+    after = figures["late_after_s"]
+    late = f"after {after:g} s\n[rad]"
+    shown = table(title, "RMS error\n[rad]", late, "last 30 %\n[rad]", "peak\n[N·m]", "limit\n[N·m]")
+    columns = ("rms_error_rad", "rms_error_late_rad", "rms_error_last_30_percent_rad")
+    torques = zip(figures["joint_peak_torque_Nm"], figures["effort_limit_Nm"], strict=True)
+    for joint, errors, (peak, limit) in zip(
+        figures["joints"], zip(*(figures[name] for name in columns), strict=True), torques, strict=True
+    ):
+        shown.add_row(
+            Text(joint), *(f"{e:.2e}" for e in errors), f"{peak:.4g}", "none" if limit is None else f"{limit:.4g}"
+        )
+    console.print(shown)
+    for line in _lines(figures, compile_time, wall_time):
+        console.print(line, highlight=False, markup=False)
+
+
+def _converged(figures: dict[str, Any]) -> str:
+    """When the error came to stay below the paper's threshold, in words."""
+    time = figures["convergence_time_s"]
+    return "not within the run" if time is None else f"{time:.3f} s"
+
+
+def _lines(figures: dict[str, Any], compile_time: float, wall_time: float) -> list[str]:
+    saturated, late = figures["saturated_fraction"], figures["saturated_fraction_late"]
+    outside = zip(figures["joints"], figures["outside_position_range_rad"], strict=True)
+    return [
+        f"converged (‖error‖ < 0.1 rad to the end): {_converged(figures)}",
+        f"some joint at its effort limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
+        *(f"{joint} went {excess:.3g} rad beyond its range: the plant has no joint stops" for joint, excess in outside
+          if excess > 0.0),
+        *([f"compiled the law in {compile_time:.1f} s, once on this machine"] if compile_time > _NOTICEABLE else []),
+        f"simulated {figures['duration_s']:g} s in {wall_time:.1f} s",
+    ]  # fmt: skip

@@ -1,0 +1,176 @@
+"""`nbs-pin train`: a controller learns through the closed loop, and says what it gained on starts it never saw."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.text import Text
+
+from nbs_pin.base.pages import plain
+from nbs_pin.base.records import Run
+from nbs_pin.cli.train import Train
+from nbs_pin.cli.values import plain_numbers
+from nbs_pin.commands.inputs import arm_of, law_of
+from nbs_pin.commands.results import SUMMARY, Results, keywords, table
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.motions.references import Sinusoid, check_reference
+from nbs_pin.reports.charts import plot_training
+from nbs_pin.robots.robot import Robot
+from nbs_pin.simulation.costs import stage_cost
+from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.loop import Loop
+from nbs_pin.storage.checkpoints import save
+from nbs_pin.training.evaluation import compared, fresh_batch, fresh_figures
+from nbs_pin.training.train import Training, train
+
+CHECKPOINT = "training.ckpt"
+"""What `train_robot` keeps up to date in its folder."""
+FILES = ("controller.nbs", "learning.png", SUMMARY)
+"""What `write_results` writes, the summary last."""
+_LONGER = 3.0  # fresh motions last this many times longer than those trained on
+
+
+def run(options: Train, console: Console, notes: Console) -> None:
+    """Trains, writes and prints; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
+    with notes.status(f"loading {options.robot}"):
+        robot = arm_of(options)
+    results = Results.of(options, robot.name, robot, robot=robot.source)
+    if not options.resume:
+        whose, remedy = "another or an unfinished training", "give another --out, --resume to go on with it"
+        names, whole = (CHECKPOINT, *FILES), {"interrupted": False}
+        results.check(names, options.force, whole=whole, whose=whose, remedy=remedy)
+    given = keywords(options, train_robot) | {
+        "frequencies": tuple(plain_numbers(options.frequencies) or ()),
+        "gains": not options.fixed_gains,
+        **{name: getattr(options, name) for name in ("epochs", "optimiser", "learning_rate", "patience", "resume")},
+    }
+    with results.made() as folder:
+        result = train_robot(robot, **given, folder=folder, progress=True)
+        interrupted = result.training.stopped == "interrupted"
+        with notes.status(f"drawing the picture into {folder}"):
+            found = write_results(result, results, interrupted=interrupted)
+    _print(console, f"{robot.name}, {options.controller}", found)
+    results.show(console, FILES)
+    if interrupted:
+        raise KeyboardInterrupt
+
+
+class Trained(NamedTuple):
+    """A training, and the same fresh motions under the controller before and after it."""
+
+    training: Training
+    before: Run
+    after: Run
+
+
+def train_robot(
+    robot: Robot,
+    *,
+    controller: Controller | str = "nbs",
+    bandwidth: float = 8.0,
+    frequencies: tuple[float, ...] = (0.5, 1.0, 2.0),
+    starts: int = 32,
+    start_error: float = 0.3,
+    duration: float = 1.0,
+    period: float = 0.005,
+    cost: str = "torque-aware",
+    seed: int = 0,
+    folder: Path | None = None,
+    **settings: Any,
+) -> Trained:
+    """A law for the arm, trained on sinusoids of these frequencies [rad/s] within the arm's effort limits.
+
+    controller: a law by name, a .nbs file (`law_of`), or one that is built. starts: in all, shared out over
+    the frequencies. cost: by name (`stage_cost`). folder: where `CHECKPOINT` is kept, None for nowhere. duration,
+    period [s], start_error [rad], and settings (epochs, optimiser, resume, …): as `train` has them.
+    The fresh motions last three times longer, from `FRESH_STARTS` starts per frequency that training never saw.
+    Raises ArgumentError for settings that do not fit and a motion outside the arm's limits, KeyboardInterrupt when
+    Ctrl-C comes before the first epoch is over; errors of `train` else.
+    """
+    references = [Sinusoid.for_robot(robot, frequency) for frequency in frequencies]
+    for reference in references:
+        check_reference(reference, robot, _LONGER * duration)
+    if not isinstance(controller, Controller):
+        controller = law_of(controller, robot, bandwidth=bandwidth, period=period, seed=seed)
+    plant = DynamicsPlant(PinocchioDynamics(robot))
+    training = train(
+        controller,
+        plant,
+        references,
+        starts=max(1, round(starts / len(references))),
+        start_error=start_error,
+        duration=duration,
+        period=period,
+        effort_limit=robot.effort_limit,
+        cost=stage_cost(cost, robot),
+        seed=seed,
+        checkpoint=None if folder is None else folder / CHECKPOINT,
+        **settings,
+    )
+    if not training.history.size:
+        raise KeyboardInterrupt
+    steps = _LONGER * round(duration / period)
+    loop = Loop.of(plant, robot.nv, steps * period, period, plant_step=period, effort_limit=None, lookahead=None)
+    fresh = fresh_batch(loop, references, start_error, seed)
+    return Trained(training, compared(controller, fresh), compared(training.controller, fresh))
+
+
+def figures(result: Trained) -> dict[str, Any]:
+    """What training changed, as JSON can store it; None for a time that never came and for what is not finite."""
+    training = result.training
+    held_out, best = training.held_out, training.best_epoch
+    numbers: dict[str, Any] = plain(
+        {
+            "epochs": len(training.history) - (training.stopped != "interrupted"),
+            "best_epoch": best,
+            "stopped": training.stopped,
+            "training_cost": [training.history[0], training.history[best]],
+            "held_out_cost": [held_out[0], held_out[best]],
+            "held_out_cost_lowered_by": 1.0 - held_out[best] / held_out[0],
+            "seconds": training.seconds,
+            "fresh_starts": result.before.q.shape[1],
+            "before": fresh_figures(result.before),
+            "after": fresh_figures(result.after),
+        }
+    )
+    return numbers
+
+
+def write_results(result: Trained, results: Results, *, interrupted: bool) -> dict[str, Any]:
+    """Writes `FILES`, the trained controller first; returns the figures. Raises OSError when they cannot be written."""
+    numbers, training = figures(result), result.training
+    save(training.controller, results.folder / FILES[0], info={"trained": results.facts | {"interrupted": interrupted}})
+    shown = training.history, training.held_out, training.best_epoch, result.before, result.after
+    plot_training(*shown, results.folder / FILES[1])
+    curves = plain({"history": training.history, "held_out": training.held_out})
+    results.write_summary(numbers, interrupted=interrupted, **curves)
+    return numbers
+
+
+def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
+    """What training changed, a row per figure; `figures` as `figures` gives them."""
+    shown = table(title, "before", "after", first="")
+    for name in ("training", "held-out"):
+        costs = figures[f"{name.replace('-', '_')}_cost"]
+        shown.add_row(Text(f"mean cost of {name} motions"), *(_number(cost, ".4g") for cost in costs))
+    both = figures["before"], figures["after"]
+    for name in ("median", "worst"):
+        times = (on[f"convergence_time_{name}_s"] for on in both)
+        shown.add_row(Text(f"converged, {name} [s]"), *("never" if t is None else f"{t:.3f}" for t in times))
+    shown.add_row(Text("peak torque [N·m]"), *(_number(on["peak_torque_Nm"], ".4g") for on in both))
+    shown.add_row(Text("RMS torque [N·m]"), *(_number(on["rms_torque_Nm"], ".4g") for on in both))
+    shown.add_row(Text("some joint at its limit"), *(_number(on["saturated_fraction"], ".2%") for on in both))
+    console.print(shown)
+    ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
+    for line in (
+        f"held-out cost lowered by {_number(figures['held_out_cost_lowered_by'], '.1%')}; "
+        f"converged is ‖error‖ < 0.1 rad to the end, from {figures['fresh_starts']} fresh starts",
+        f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
+        f"the best after {figures['best_epoch']}",
+    ):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "not finite" if value is None else format(value, form)

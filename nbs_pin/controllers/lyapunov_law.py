@@ -1,0 +1,129 @@
+"""Laws with a storage function: what certificates, monitors and adversaries read of a controller."""
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arrays import Array, array_namespace, as_vectors, matvec
+from nbs_pin.base.claims import Claim
+from nbs_pin.base.intervals import Interval
+from nbs_pin.controllers.model_law import ModelLaw
+
+
+class Errors(NamedTuple):
+    """The signals of one step of a backstepping or sliding law, each of shape (..., nv) but the value."""
+
+    z1: Array
+    """q ⊖ q_d [rad]."""
+    z2: Array
+    """v − v_r [rad/s]."""
+    v_r: Array
+    """Reference velocity φ = v_d − Λ∇Φ(z1) [rad/s]."""
+    a_r: Array
+    """Reference acceleration φ̇ = a_d − Λ∇²Φ(z1)(v − v_d) [rad/s²]."""
+    gradient: Array
+    """∇Φ(z1) [N·m]."""
+    value: Array
+    """Φ(z1) [J], shape (...)."""
+
+
+class Lyapunov(NamedTuple):
+    """The constants of V and of its decay as they now stand, and the claims that support them."""
+
+    stiffness: Float[np.ndarray, "n n"]
+    """S, with Φ(z1) ≥ z1ᵀSz1 and zᵀ∇²Φz ≥ 2zᵀSz [J/rad²]."""
+    rate: Float[np.ndarray, " n"]
+    """Diagonal of Λ [rad/s per N·m]."""
+    floor: Float[np.ndarray, "n n"]
+    """D₀, with D(z2) ⪰ D₀ [N·m·s/rad]."""
+    inertial_rate: float
+    """ω [1/s]."""
+    coupling: float
+    """ζ: 1 for a law that feeds −∇Φ back, 0 for one that does not."""
+    claims: tuple[Claim, ...]
+    """How each of these is known, and everything else that V̇ rests on."""
+
+
+class LyapunovLaw(ModelLaw):
+    """A law with V = Φ(z1) + ½z2ᵀM(q)z2, where z2 = v − v_r and v_r = v_d − Λ∇Φ(z1).
+
+    V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ(ωM + D(z2))z2 + (1 − ζ)z2ᵀ∇Φ + z2ᵀτ_d.
+
+    A law states here what its Φ, Λ, D, ω and ζ are and how that is known; `certify`, `monitor` and `attack` ask for
+    nothing else. Source: docs/theory.md §2, docs/certificates.md §2.
+    """
+
+    inertial_rate: float = 0.0
+    """ω [1/s]."""
+    coupling: float = 1.0
+    """ζ of the feedback −ζ∇Φ(z1)."""
+
+    @abstractmethod
+    def potential_terms(self, z1: Array, dz: Array) -> tuple[Array, Array, Array]:
+        """Φ(z1) [J] of shape (...), ∇Φ(z1) [N·m] and ∇²Φ(z1)dz of shape (..., nv)."""
+
+    @abstractmethod
+    def damping_force(self, z2: Array) -> Float[Array, "*batch n"]:
+        """D(z2)z2 [N·m], without the part ωM z2."""
+
+    @abstractmethod
+    def damping_matrix(self, z2: Array) -> Float[Array, "*batch n n"]:
+        """D(z2) [N·m·s/rad], without the part ωM."""
+
+    @abstractmethod
+    def rate_like(self, x: Array) -> Float[Array, " n"]:
+        """The diagonal of Λ [rad/s per N·m] in the kind of x."""
+
+    @abstractmethod
+    def lyapunov(self) -> Lyapunov:
+        """S, Λ, D₀, ω, ζ read from the numbers as they now stand, with a claim for each.
+
+        Raises:
+            CertificateRefused: Where the numbers give the proof no ground.
+        """
+
+    def errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
+        """The signals z1, z2, v_r, a_r, ∇Φ and Φ for the state (q, v) and the reference, all of shape (..., nv).
+
+        Raises:
+            ArgumentError: When shapes or array kinds do not fit.
+        """
+        return self._errors(*as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref))
+
+    def storage(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
+        """V = Φ(z1) + ½z2ᵀM(q)z2 [J], the Lyapunov function of the closed loop."""
+        q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
+        e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
+        return e.value + 0.5 * _dot(e.z2, matvec(self.dynamics.mass_matrix(q), e.z2))
+
+    def dissipation(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
+        """The rate at which V falls without disturbance and friction [W]: the sum of `losses`."""
+        q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
+        in_potential, in_damping = self.losses(q, self._errors(q, v, q_ref, v_ref, 0.0 * v_ref))
+        return in_potential + in_damping
+
+    def losses(self, q: Array, e: Errors) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        """∇ΦᵀΛ∇Φ and z2ᵀ(ωM + D)z2 − (1 − ζ)z2ᵀ∇Φ [W]."""
+        force = self.inertial_rate * matvec(self.dynamics.mass_matrix(q), e.z2) + self.damping_force(e.z2)
+        force = force - (1.0 - self.coupling) * e.gradient
+        return _dot(e.gradient, self.rate_like(e.gradient) * e.gradient), _dot(e.z2, force)
+
+    def extra_stiffness(self, radius: float) -> Interval:
+        """Of one joint: where Φ'' − 2S lies for |z1| ≤ radius [rad] [N·m/rad]; ≥ 0 unless more is known."""
+        return Interval(np.float64(0.0), np.float64(np.inf))
+
+    def extra_damping(self, radius: float) -> Interval:
+        """Of one joint: where D − D₀ lies for |z2| ≤ radius [rad/s] [N·m·s/rad]; ≥ 0 unless more is known."""
+        return Interval(np.float64(0.0), np.float64(np.inf))
+
+    def _errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
+        rate, z1 = self.rate_like(q), self.dynamics.difference(q, q_ref)
+        value, gradient, gradient_rate = self.potential_terms(z1, v - v_ref)
+        v_r = v_ref - rate * gradient
+        return Errors(z1, v - v_r, v_r, a_ref - rate * gradient_rate, gradient, value)
+
+
+def _dot(x: Array, y: Array) -> Array:
+    return array_namespace(x).sum(x * y, axis=-1)

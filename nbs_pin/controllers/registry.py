@@ -1,0 +1,37 @@
+"""Laws by name: what the shell offers, and `build_law` makes."""
+
+from typing import TYPE_CHECKING, Any
+
+from nbs_pin.base.registry import Entry, entry
+
+if TYPE_CHECKING:
+    from nbs_pin.controllers.controller import Controller
+    from nbs_pin.robots.robot import Robot
+
+_LAWS = "nbs_pin.controllers"
+LAWS: dict[str, Entry] = {
+    "nbs": Entry(f"{_LAWS}.neural_backstepping:NeuralBackstepping.for_robot"),
+    "nbs-paper": Entry(f"{_LAWS}.neural_backstepping:paper_controller_for"),
+    "slotine-li": Entry(f"{_LAWS}.slotine_li:SlotineLi.for_robot"),
+    "computed-torque": Entry(f"{_LAWS}.computed_torque:ComputedTorque.for_robot"),
+    "pd-plus": Entry(f"{_LAWS}.pd:PD.for_robot", {"feedforward": "reference"}),
+    "pd-gravity": Entry(f"{_LAWS}.pd:PD.for_robot", {"feedforward": "gravity"}),
+    "pid": Entry(f"{_LAWS}.pid:PID.for_robot"),
+}
+"""Every law by name. A function here takes a robot, and by name whatever it can use of `build_law`'s settings."""
+
+
+def build_law(name: str, robot: "Robot", **settings: Any) -> "Controller":
+    """The law of that name, tuned for the arm.
+
+    Args:
+        name: One of `LAWS`.
+        robot: The arm.
+        settings: bandwidth [rad/s], period [s], friction (a `JointFriction` to feed forward), dynamics, seed; a law
+            takes those it knows.
+
+    Raises:
+        ArgumentError: For an unknown name or numbers out of range.
+    """
+    law: Controller = entry("controller", name, LAWS, ", a .nbs file, or build one").make(robot, **settings)
+    return law
