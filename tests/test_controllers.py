@@ -355,10 +355,7 @@ def test_pid_removes_the_offset_of_an_unknown_load():
         (lambda r, d: PD(d, feedforward="gravity", kp=np.array([1.0, -1.0]), kd=1.0), "kp is"),
         (lambda r, d: SlotineLi(d, rate=np.ones(3), gain=1.0), "rate is"),
         (lambda r, d: ComputedTorque(d, kp=np.nan, kd=1.0), "kp is nan"),
-        (
-            lambda r, d: PID(kp=np.ones(2), ki=1.0, kd=1.0, effort_limit=1.0, filter_time=-1.0),
-            "filter_time is -1.0 s",
-        ),
+        (lambda r, d: PID(kp=np.ones(2), ki=1.0, kd=1.0, effort_limit=1.0, filter_time=-1.0), "filter_time is -1.0 s"),
         (lambda r, d: paper_controller(d).torque(*[np.zeros(3)] * 5), r"q has shape \(3,\), expected \(\.\.\., 2\)"),
     ],
 )

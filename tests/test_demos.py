@@ -36,11 +36,7 @@ def test_three_arms_meet_their_reference_and_leave_replays(tmp_path):
     results, printed = run_demo("three_arms", tmp_path, "main(duration=2.0)")
     for name in ("two_link", "three_link", "panda"):
         folder = tmp_path / "out" / "demo" / name
-        assert sorted(path.name for path in folder.iterdir()) == [
-            "replay.html",
-            "run.npz",
-            "tracking.png",
-        ]
+        assert sorted(path.name for path in folder.iterdir()) == ["replay.html", "run.npz", "tracking.png"]
         assert results[name]["near_after_s"] < 0.2
         assert results[name]["steady_error_rad"] < 1e-5
         assert results[name]["saturated_s"] < 0.2

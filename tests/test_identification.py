@@ -134,15 +134,7 @@ def test_bodies_stay_bodies_where_plain_least_squares_leaves_them():
 
 
 @pytest.mark.parametrize(
-    ("name", "base"),
-    [
-        ("two_link", 6),
-        ("three_link", 9),
-        ("ur5", 36),
-        ("panda", 43),
-        ("xarm7", 43),
-        (GANTRY, 11),
-    ],
+    ("name", "base"), [("two_link", 6), ("three_link", 9), ("ur5", 36), ("panda", 43), ("xarm7", 43), (GANTRY, 11)]
 )
 def test_clean_data_give_the_arm_to_rounding_and_its_own_bodies_are_not_looked_at(name, base):
     robot = load_robot(name)

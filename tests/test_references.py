@@ -276,10 +276,7 @@ def ramp(t):
     ("q", "reason"),
     [
         (lambda t: 0.5 * np.c_[t, (2.0 - t) ** 2], "velocity jump 2 .* of elbow at t = 0 s, where the motion starts"),
-        (
-            lambda t: 1.5 * np.c_[t**2, t],
-            "velocity jump 6 rad/s of shoulder at t = 2 s, where the motion ends",
-        ),
+        (lambda t: 1.5 * np.c_[t**2, t], "velocity jump 6 rad/s of shoulder at t = 2 s, where the motion ends"),
         (lambda t: ramp(with_rest(lambda s: s, t)), r"velocity jump .* of shoulder at t = 1 s \(row 11\); smooth"),
         (ramp, r"velocity jump 4 rad/s of shoulder at t = 1 s \(row 11\); smooth"),
         (lambda t: with_rest(wave, t) + 0.5 * (np.arange(21) == 7)[:, None], "velocity jump .* at t = 0.7"),

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from nbs_pin.accuracy.energy_drift import FreeMotion, free_motion
 from nbs_pin.accuracy.mismatch import Mismatch, accelerations, mismatch
 from nbs_pin.accuracy.relative_errors import Box, Errors, check_joints, judge, share
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
@@ -60,9 +61,9 @@ class ModelErrors:
     """The same of the acceleration under the true torque for those v̇."""
     torque_nmse: float
     """Mean over joints of the torque's mean squared error ÷ variance."""
-    torque_rms: Float[np.ndarray, " n"]
+    torque_rms: JointArray
     """Root mean square of the torque error per joint [N·m]."""
-    torque_deviation: Float[np.ndarray, " n"]
+    torque_deviation: JointArray
     """Standard deviation of the true torque per joint [N·m]."""
     eigenvalue_margin: float
     """Least eigenvalue of M̂ over the samples [kg·m²]; positive, or the model is none."""

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.optimize import linprog
 from scipy.special import betainccinv
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.dynamics.equations import inverse_dynamics
@@ -43,7 +44,7 @@ class Mismatch(NamedTuple):
     """β."""
     trajectories: int
     """Independent starts: those with different states in the first row, as copies of one say nothing new."""
-    rms: Float[np.ndarray, " n"]
+    rms: JointArray
     """Root mean square of δ per joint [N·m]."""
     t: Float[np.ndarray, " rows"]
     """Time [s]."""

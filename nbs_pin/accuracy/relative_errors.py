@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import matvec
+from nbs_pin.base.arrays import JointArray, Vectors, matvec
 from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.equations import inverse_dynamics
@@ -46,9 +46,9 @@ class Box:
     lower, upper: (n,) [rad, m for a prismatic joint]. speed: [rad/s, m/s], one number or one per joint.
     """
 
-    lower: Float[np.ndarray, " n"]
-    upper: Float[np.ndarray, " n"]
-    speed: Float[np.ndarray, " n"]
+    lower: JointArray
+    upper: JointArray
+    speed: JointArray
 
     @classmethod
     def of(cls, lower: PerJoint, upper: PerJoint, speed: PerJoint, nv: int) -> "Box":
@@ -81,7 +81,7 @@ class Box:
         q, v, a = rng.uniform(-1.0, 1.0, (3, count, len(self.lower)))
         return self.at(q), self.speed * v, ACCELERATION * a
 
-    def at(self, u: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n"]:
+    def at(self, u: Vectors) -> Vectors:
         """The configuration [rad] at u, where the box is [−1, 1]ⁿ."""
         return 0.5 * (self.lower + self.upper) + 0.5 * (self.upper - self.lower) * u
 

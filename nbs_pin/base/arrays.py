@@ -5,13 +5,35 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from array_api_compat import array_namespace, is_torch_array
+from jaxtyping import Float
 
 from nbs_pin.base.exceptions import ArgumentError
 
 Array: TypeAlias = Any
 """A `numpy.ndarray` or a `torch.Tensor`; shapes are annotated with jaxtyping around it."""
 
-__all__ = ["Array", "array_namespace", "as_vectors", "constant_like", "is_torch_array", "matvec", "over_rows"]
+Vectors: TypeAlias = Float[Array, "*batch n"]
+"""One number per joint, (..., n) over any leading batch axes."""
+Matrices: TypeAlias = Float[Array, "*batch n n"]
+"""A matrix of the joints, (..., n, n)."""
+Scalars: TypeAlias = Float[Array, "*batch"]
+"""One number per state, (...)."""
+JointArray: TypeAlias = Float[np.ndarray, " n"]
+"""One number per joint, a numpy array (n,)."""
+
+__all__ = [
+    "Array",
+    "JointArray",
+    "Matrices",
+    "Scalars",
+    "Vectors",
+    "array_namespace",
+    "as_vectors",
+    "constant_like",
+    "is_torch_array",
+    "matvec",
+    "over_rows",
+]
 
 
 def matvec(matrix: Array, vector: Array) -> Array:

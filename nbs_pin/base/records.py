@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nbs_pin.base.arrays import Array
+from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 
@@ -54,7 +54,7 @@ class Run:
     """Desired velocity [rad/s]."""
     a_ref: Float[np.ndarray, "rows *batch n"]
     """Desired acceleration [rad/s²]."""
-    effort_limit: Float[np.ndarray, " n"]
+    effort_limit: JointArray
     """Largest |τ| per joint [N·m], inf where none."""
     continuous: Bool[np.ndarray, " n"]
     """True for joints whose error is wrapped to (−π, π]."""

@@ -3,22 +3,24 @@
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import Matrices, Scalars
+
 SLACK = 1e-9
 """Relative allowance for the rounding of everything that leads to a bound: about 1e6 times what such sums lose."""
 
 
-def spectrum_slack(matrix: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
+def spectrum_slack(matrix: Matrices) -> Scalars:
     """8 n ε ‖A‖_F: more than the symmetric eigenvalue solver's error, by Weyl's inequality."""
     n = matrix.shape[-1]
     return np.asarray(8.0 * n * np.finfo(float).eps * np.linalg.norm(matrix, axis=(-2, -1)))
 
 
-def least_eigenvalues(matrices: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
+def least_eigenvalues(matrices: Matrices) -> Scalars:
     """At most λ_min of each symmetric matrix."""
     return np.asarray(np.linalg.eigvalsh(matrices)[..., 0] - spectrum_slack(matrices))
 
 
-def largest_eigenvalues(matrices: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch"]:
+def largest_eigenvalues(matrices: Matrices) -> Scalars:
     """At least λ_max of each symmetric matrix."""
     return np.asarray(np.linalg.eigvalsh(matrices)[..., -1] + spectrum_slack(matrices))
 

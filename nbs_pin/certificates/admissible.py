@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray, Vectors
 from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.exceptions import ArgumentError
 
@@ -16,7 +17,7 @@ _LEAST, _GREATEST = 1e-100, 1e100
 class Admissible:
     """|τ_d,i| ≤ box_i for every joint or ‖τ_d‖ ≤ radius [N·m], at every instant; nothing else is asked of τ_d(t)."""
 
-    box: Float[np.ndarray, " n"] | None = None
+    box: JointArray | None = None
     """Largest |τ_d,i| [N·m]."""
     radius: float | None = None
     """Largest ‖τ_d‖ [N·m]."""
@@ -65,13 +66,13 @@ class Admissible:
         """Whether only τ_d = 0 is admissible."""
         return not self.radius if self.box is None else not self.box.any()
 
-    def contains(self, tau_d: Float[np.ndarray, "*batch n"]) -> bool:
+    def contains(self, tau_d: Vectors) -> bool:
         """Whether every torque is admissible, to twelve digits."""
         if self.box is not None:
             return bool((np.abs(tau_d) <= self.box * (1.0 + 1e-12)).all())
         return bool((np.linalg.norm(tau_d, axis=-1) <= (self.radius or 0.0) * (1.0 + 1e-12)).all())
 
-    def towards(self, direction: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n"]:
+    def towards(self, direction: Vectors) -> Vectors:
         """The admissible torque of greatest inner product with each direction: a corner of the box, or d·g/‖g‖."""
         if self.box is not None:
             return self.box * np.sign(direction)

@@ -141,13 +141,7 @@ def design(robot: Robot, task: Task, error: PerJoint, *, period: float | None = 
     _, admissible = disturbance_of(robot, task)
     periods = PERIODS if period is None else (period,)
     return propose(
-        robot,
-        admissible,
-        error,
-        reference=task.reference,
-        duration=task.duration,
-        periods=periods,
-        seed=task.seed,
+        robot, admissible, error, reference=task.reference, duration=task.duration, periods=periods, seed=task.seed
     )
 
 

@@ -12,6 +12,7 @@ from numbers import Integral
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
@@ -32,7 +33,7 @@ class Attack:
 
     error: float
     """Largest ‖z1(t)‖ [rad] of all motions tried."""
-    joint_errors: Float[np.ndarray, " n"]
+    joint_errors: JointArray
     """Largest |z1_i(t)| [rad], each over all motions tried."""
     disturbance: Float[np.ndarray, "steps n"]
     """The τ_d [N·m] that reached `error`, held over each period."""
@@ -174,16 +175,12 @@ class _Pack:
     """How much of what the gradient promises the next step takes."""
     peaks: Peaks
     """Of every torque."""
-    joint_errors: Float[np.ndarray, " n"]
+    joint_errors: JointArray
     """Largest |z1_i| [rad] of all that was tried."""
 
     @classmethod
     def of(
-        cls,
-        motion: Int[np.ndarray, " waves"],
-        waves: Float[np.ndarray, "waves steps n"],
-        peaks: Peaks,
-        starts: int,
+        cls, motion: Int[np.ndarray, " waves"], waves: Float[np.ndarray, "waves steps n"], peaks: Peaks, starts: int
     ) -> "_Pack":
         """The worst wave of every motion, then the second worst …, and for each joint the one that moves it most."""
         order = np.argsort(-peaks.error, kind="stable")

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.accuracy.mismatch import Mismatch
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, positive
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
@@ -63,7 +64,7 @@ class Certificate:
     """Φ∞ [J]: Φ(z1) ≤ max(V(0), Φ∞) at all times, and ≤ Φ∞ in the limit."""
     error: float
     """Bound of ‖z1‖ [rad], at all times from z1 = z2 = 0, and in the limit from other starts."""
-    joint_errors: Float[np.ndarray, " n"]
+    joint_errors: JointArray
     """The same of each |z1_i| [rad]."""
     printed_error: float
     """What the paper's Theorem 3 would print for ‖z1‖ [rad]; false for torques that vary (docs/theory.md §5)."""
@@ -81,7 +82,7 @@ class Certificate:
     """The true arm, None where none is known."""
     mismatch: Mismatch | None = None
     """The model's error that the bounds count in."""
-    overshoot: tuple[float, Float[np.ndarray, " n"]] | None = None
+    overshoot: tuple[float, JointArray] | None = None
     """Bounds of ‖z1‖ and each |z1_i| at all times from the start that was given [rad]."""
 
     @property
@@ -109,7 +110,7 @@ class Certificate:
         """What V(t) never exceeds from V(0) = `initial` [J]: e^{−ct}V(0) + V∞, nor max(V(0), V∞). t [s]."""
         return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
 
-    def from_start(self, initial: float) -> tuple[float, Float[np.ndarray, " n"]]:
+    def from_start(self, initial: float) -> tuple[float, JointArray]:
         """Bounds of ‖z1‖ and of each |z1_i| at all times from V(0) = `initial` [J]: the overshoot [rad].
 
         Φ never exceeds max(V(0), Φ∞) (docs/certificates.md §3).
@@ -208,7 +209,7 @@ def _check_arguments(
     v0: Any,
     mismatch: Mismatch | None,
     period: float | None,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]] | None:
+) -> tuple[JointArray, JointArray] | None:
     """The start (q, v), None without one."""
     positive("duration", duration, "s")
     if period is not None:
@@ -260,7 +261,7 @@ def _along(
     certificate: Certificate,
     reference: DesiredMotion | None,
     duration: float,
-    start: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]] | None,
+    start: tuple[JointArray, JointArray] | None,
 ) -> Certificate:
     """The certificate with the overshoot from a start and what the arm's limits say of it and of the reference."""
     law, robot, joints = certificate.controller, certificate.robot, certificate.joint_errors
@@ -302,7 +303,7 @@ def _with_bounds(certificate: Certificate, source: str) -> Certificate:
     return replace(certificate, lines=(*lines, *certificate.lines))
 
 
-def _no_wrap(robot: Robot | None, joints: Float[np.ndarray, " n"], label: Label) -> tuple[Condition, ...]:
+def _no_wrap(robot: Robot | None, joints: JointArray, label: Label) -> tuple[Condition, ...]:
     if robot is None or not robot.continuous.any():
         return ()
     largest = float(joints[robot.continuous].max())

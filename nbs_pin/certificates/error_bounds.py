@@ -5,6 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.rounding import least_eigenvalue
 from nbs_pin.certificates import one_joint
 from nbs_pin.certificates.comparison_system import ComparisonSystem
@@ -15,7 +16,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 
 def errors(
     controller: LyapunovLaw, constants: Constants, comparison: ComparisonSystem, storage: float, potential: float
-) -> tuple[float, Float[np.ndarray, " n"], str]:
+) -> tuple[float, JointArray, str]:
     """Bounds of ‖z1‖ and each |z1_i| [rad], and where they come from."""
     size, joints = radians(constants.stiffness, potential)
     exact = math.inf
@@ -45,7 +46,7 @@ def _of_one_joint(
     return one_joint.worst_error(loop, comparison.t * math.sqrt(loop.damping), controller, within)
 
 
-def radians(stiffness: Float[np.ndarray, "n n"], potential: float) -> tuple[float, Float[np.ndarray, " n"]]:
+def radians(stiffness: Float[np.ndarray, "n n"], potential: float) -> tuple[float, JointArray]:
     """√(Φ/λ_min(S)) and √(Φ (S⁻¹)_ii), which bound ‖z1‖ and |z1_i| where Φ ≥ z1ᵀSz1 is at most `potential`."""
     joints = np.sqrt(potential * np.diag(above_inverse(stiffness)))
     # The joints together are never further than the ellipsoid is long, nor than the corner of their own bounds.

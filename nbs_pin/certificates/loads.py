@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, positive
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError
@@ -151,7 +152,7 @@ def _place(robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | N
     return int(bodies[name].parentJoint), np.array(bodies[name].placement.act(at))
 
 
-def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> Float[np.ndarray, " n"]:
+def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> JointArray:
     """Per joint the greatest |torque| that a unit force at a point of body `joint` can have, in any posture [m].
 
     A joint that turns: the distance of the point from its axis, at most the sum of the link lengths between them; one
@@ -191,12 +192,7 @@ def _rnea(model: pin.Model, desired: Reference) -> list[np.ndarray]:
 
 
 def _along(
-    what: str,
-    peak: Float[np.ndarray, " n"],
-    margin: float,
-    duration: float,
-    constant: PerJoint = 0.0,
-    most: PerJoint = np.inf,
+    what: str, peak: JointArray, margin: float, duration: float, constant: PerJoint = 0.0, most: PerJoint = np.inf
 ) -> Load:
     """The bound margin × peak + constant, or `most` where that is less."""
     if not 1.0 <= margin < np.inf:
@@ -208,12 +204,12 @@ def _along(
     return _load(what, np.minimum(margin * peak + constant, most), Label.EMPIRICAL, because)
 
 
-def _load(what: str, box: Float[np.ndarray, " n"], label: Label, because: str) -> Load:
+def _load(what: str, box: JointArray, label: Label, because: str) -> Load:
     largest = Claim(f"{what}, the largest |τ_d,i|", float(box.max()), "N·m", label, because, Group.LOADS)
     return Load(Admissible.of(box, len(box)), largest)
 
 
-def _one_each(name: str, value: PerJoint, nv: int) -> Float[np.ndarray, " n"]:
+def _one_each(name: str, value: PerJoint, nv: int) -> JointArray:
     array = floats(name, value)
     if array.shape not in ((), (nv,)):
         raise ArgumentError(f"{name} is {value}, expected one number or {nv}, one per joint; correct it.")

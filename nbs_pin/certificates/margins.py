@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, refuse
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.claims import Condition
@@ -59,9 +60,7 @@ def headroom(
     return (Condition(name, float(robot.effort_limit[worst]), float(total[worst]), "N·m", Label.EMPIRICAL, because),)
 
 
-def room(
-    robot: Robot, errors: Float[np.ndarray, " n"], reference: DesiredMotion, duration: float
-) -> tuple[Condition, ...]:
+def room(robot: Robot, errors: JointArray, reference: DesiredMotion, duration: float) -> tuple[Condition, ...]:
     """Whether the reference with the errors around it stays inside the position limits, for the joint with least room.
 
     Raises CertificateRefused where the reference alone leaves them: the box is too small for it.
@@ -84,10 +83,10 @@ def units(robot: Robot | None, nv: int = 0) -> tuple[str, ...]:
 
 def check_box(
     positions: Float[np.ndarray, "rows n"],
-    low: Float[np.ndarray, " n"],
-    high: Float[np.ndarray, " n"],
+    low: JointArray,
+    high: JointArray,
     *,
-    error: Float[np.ndarray, " n"] | float = 0.0,
+    error: JointArray | float = 0.0,
     box: str = "the joint limits",
 ) -> Claim:
     """How far the reference with its tube stays inside a box [rad, m]: the least distance to a side, over the rows.

@@ -140,7 +140,7 @@ def _check_routes(provider: DynamicsProvider, skew: Claim) -> None:
 def _finite(function: Callable[..., np.ndarray], *arguments: np.ndarray) -> np.ndarray:
     try:
         value = function(*arguments)
-    except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+    except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
         refuse(f"an inertia of the model is not positive definite ({error})", "load or build it again")
     if not np.isfinite(value).all():
         refuse("the model gives numbers that are not finite", "load the last sound checkpoint or build it again")

@@ -7,6 +7,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.assumptions import (
@@ -62,9 +63,9 @@ class Watched(NamedTuple):
     """‖z1‖ [rad]."""
     error_bound: float
     """What ‖z1‖ is not to exceed [rad]."""
-    joint_errors: Float[np.ndarray, " n"]
+    joint_errors: JointArray
     """|z1_i| [rad]."""
-    joint_bounds: Float[np.ndarray, " n"]
+    joint_bounds: JointArray
     """What each is not to exceed [rad]."""
     excesses: tuple[str, ...]
     """What is beyond its bound now: "V", "‖z1‖" or "|z1| of" a joint by name."""
@@ -112,11 +113,11 @@ class Watch:
         self,
         memory: WatchMemory | None,
         t: float,
-        q: Float[np.ndarray, " n"],
-        v: Float[np.ndarray, " n"],
+        q: JointArray,
+        v: JointArray,
         reference: Reference,
-        tau: Float[np.ndarray, " n"],
-        tau_command: Float[np.ndarray, " n"],
+        tau: JointArray,
+        tau_command: JointArray,
     ) -> tuple[Watched, WatchMemory]:
         """What is to be said at time t [s], and what to remember; memory is None at first, tau acts from t on [N·m].
 

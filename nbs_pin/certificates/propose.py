@@ -11,8 +11,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, positive
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
@@ -51,9 +51,9 @@ class Proposal:
     """The law with these gains and fresh networks; the bound holds for every weight of theirs."""
     error: float
     """Bound of ‖z1‖ [rad]; `certify` gives this or less."""
-    joint_errors: Float[np.ndarray, " n"]
+    joint_errors: JointArray
     """Bound of every |z1_i| [rad]."""
-    torque: Float[np.ndarray, " n"]
+    torque: JointArray
     """|τ_ref| + disturbance + K_i·(bound of |z1_i|), the stiffness at its bound, per joint [N·m]."""
     share: float
     """The largest share of an effort limit in `torque`; 0 without limits."""

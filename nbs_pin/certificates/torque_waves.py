@@ -50,11 +50,7 @@ def square(
 
 
 def in_step(
-    admissible: Admissible,
-    t: Float[np.ndarray, " steps"],
-    n: int,
-    rng: np.random.Generator,
-    rate: float | None = None,
+    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator, rate: float | None = None
 ) -> Float[np.ndarray, "steps n"]:
     """A square wave of one rate [rad/s] on all joints, with or against each other."""
     rate = float(_rates(1, rng)[0]) if rate is None else rate

@@ -7,15 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from nbs_pin.cli.values import (
-    SAVED,
-    choice,
-    configuration,
-    default,
-    disturbance_text,
-    integer,
-    number,
-)
+from nbs_pin.cli.values import SAVED, choice, configuration, default, disturbance_text, integer, number
 from nbs_pin.controllers.registry import LAWS
 from nbs_pin.simulation.registry import INTEGRATORS, PLANTS
 
@@ -61,11 +53,7 @@ class Track:
     """Largest torque of every joint [N·m]."""
     no_effort_limit: bool = False
     """Let torques grow without limit."""
-    integrator: Annotated[
-        str | None,
-        choice("--integrator", INTEGRATORS),
-        default("the plant's usual one"),
-    ] = None
+    integrator: Annotated[str | None, choice("--integrator", INTEGRATORS), default("the plant's usual one")] = None
     """How the plant is integrated. mujoco: rk4, euler (semi-implicit), implicitfast; pinocchio: rk4, euler (explicit),
     semi_implicit_euler."""
     plant_step: Annotated[

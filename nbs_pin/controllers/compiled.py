@@ -3,9 +3,8 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.base.arrays import Array, Vectors, as_vectors, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -51,7 +50,7 @@ class CompiledController(MemorylessController):
         """Number of joints."""
         return self.dynamics.nv
 
-    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[np.ndarray, "*batch n"]:
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ [N·m]; arguments (..., nv), fastest as contiguous float64 vectors (nv,).
 
         Raises ArgumentError when shapes do not fit, or for tensors: those belong to the controller this one came from.
@@ -78,7 +77,7 @@ class CompiledController(MemorylessController):
         tau[:] = self.dynamics.reference_torque(q, v, v_r, a_r) + feedback
         return True
 
-    def _torques(self, *states: Array) -> Float[np.ndarray, "*batch n"]:
+    def _torques(self, *states: Array) -> Vectors:
         if is_torch_array(states[0]):
             raise ArgumentError(
                 "a compiled controller was given torch tensors, expected numpy arrays; call the controller that"

@@ -1,9 +1,8 @@
 """Computed torque: the model inverted, the error a chosen linear system."""
 
 import numpy as np
-from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, as_vectors
+from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.gains import (
@@ -33,12 +32,7 @@ class ComputedTorque(ModelLaw):
     """
 
     def __init__(
-        self,
-        dynamics: DynamicsProvider,
-        *,
-        kp: PerJoint,
-        kd: PerJoint,
-        friction: JointFriction | None = None,
+        self, dynamics: DynamicsProvider, *, kp: PerJoint, kd: PerJoint, friction: JointFriction | None = None
     ) -> None:
         super().__init__(dynamics, friction)
         self.gains = PositiveGains(dynamics.nv, kp=kp, kd=kd)
@@ -61,16 +55,16 @@ class ComputedTorque(ModelLaw):
         return cls(dynamics, kp=kp, kd=2.0 * np.sqrt(kp), friction=friction)
 
     @property
-    def kp(self) -> Float[np.ndarray, " n"]:
+    def kp(self) -> JointArray:
         """k_p [1/s²]."""
         return self.gains.numpy("kp")
 
     @property
-    def kd(self) -> Float[np.ndarray, " n"]:
+    def kd(self) -> JointArray:
         """k_d [1/s]."""
         return self.gains.numpy("kd")
 
-    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         kp, kd = self.gains.like(q)

@@ -3,9 +3,7 @@
 from abc import ABC, abstractmethod
 from typing import Any
 
-from jaxtyping import Float
-
-from nbs_pin.base.arrays import Array
+from nbs_pin.base.arrays import Array, Vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.kernels.layout import Packed
@@ -20,13 +18,11 @@ class Controller(ABC):
         """Number of joints."""
 
     @abstractmethod
-    def initial_memory(self, q: Float[Array, "*batch n"]) -> Any:
+    def initial_memory(self, q: Vectors) -> Any:
         """What the law remembers before its first step, for a start at q; None for a law without memory."""
 
     @abstractmethod
-    def step(
-        self, memory: Any, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], reference: Reference, period: float
-    ) -> tuple[Float[Array, "*batch n"], Any]:
+    def step(self, memory: Any, q: Vectors, v: Vectors, reference: Reference, period: float) -> tuple[Vectors, Any]:
         """Torque τ [N·m] to hold for the next period [s], and the memory for the step after it."""
 
     @property
@@ -55,20 +51,13 @@ class MemorylessController(Controller):
     """A law whose torque depends on the present state and reference alone."""
 
     @abstractmethod
-    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """Torque τ [N·m] for the state (q, v) and the reference (q_ref, v_ref, a_ref), all of shape (..., nv)."""
 
-    def initial_memory(self, q: Float[Array, "*batch n"]) -> None:
+    def initial_memory(self, q: Vectors) -> None:
         """None: nothing is remembered."""
         return None
 
-    def step(
-        self,
-        memory: None,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        reference: Reference,
-        period: float,
-    ) -> tuple[Float[Array, "*batch n"], None]:
+    def step(self, memory: None, q: Vectors, v: Vectors, reference: Reference, period: float) -> tuple[Vectors, None]:
         """`torque` at the present state; memory and period are not used."""
         return self.torque(q, v, reference.q, reference.v, reference.a), None

@@ -4,10 +4,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, is_torch_array
+from nbs_pin.base.arrays import Array, Scalars, Vectors, is_torch_array
 from nbs_pin.base.known_code import known_code
 from nbs_pin.controllers.activations import Activation
 
@@ -55,16 +54,14 @@ class FICNN(nn.Module):
             for i in range(self.depth)
         )
 
-    def terms(
-        self, x: Float[Array, "*batch n"], dx: Float[Array, "*batch n"]
-    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch n"], Float[Array, "*batch n"]]:
+    def terms(self, x: Vectors, dx: Vectors) -> tuple[Scalars, Vectors, Vectors]:
         """f(x), ∇f(x) and ∇²f(x) dx, in the kind of x; no Hessian matrix is formed."""
         return convex_terms(self.layers(numpy=not is_torch_array(x)), self.activation, x, dx)
 
 
 def convex_terms(
-    layers: tuple[ConvexLayer, ...], activation: Activation, x: Float[Array, "*batch n"], dx: Float[Array, "*batch n"]
-) -> tuple[Float[Array, "*batch"], Float[Array, "*batch n"], Float[Array, "*batch n"]]:
+    layers: tuple[ConvexLayer, ...], activation: Activation, x: Vectors, dx: Vectors
+) -> tuple[Scalars, Vectors, Vectors]:
     """f(x), ∇f(x), ∇²f(x) dx of a FICNN: one forward pass with its tangent ẏ, one reverse pass with its tangent λ̇.
 
     With a the pre-activations and λ = ∂f/∂y:  y = σ(a), ẏ = σ'(a) ȧ;  δ = σ'(a) λ, δ̇ = σ''(a) ȧ λ + σ'(a) λ̇;

@@ -11,7 +11,7 @@ from array_api_compat import device
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, array_namespace, is_torch_array, matvec
+from nbs_pin.base.arrays import Array, Matrices, Vectors, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import OUTWARD, Interval
 from nbs_pin.base.known_code import is_known, known_code
@@ -87,7 +87,7 @@ class Damping(nn.Module):
         """Number of joints."""
         return len(self.scale)
 
-    def factor(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def factor(self, x: Vectors) -> Matrices:
         """T at the scaled error x = Rz, lower triangular."""
         xp = array_namespace(x)
         diagonal = self.diagonal.output(x)
@@ -98,14 +98,14 @@ class Damping(nn.Module):
         t[..., *self._lower_index] = self.lower.output(x)
         return t
 
-    def matrix(self, z: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def matrix(self, z: Vectors) -> Matrices:
         """D(z)."""
         xp = array_namespace(z)
         d0, r = self._constants(numpy=not is_torch_array(z))
         t = self.factor(r * z) * r
         return d0 + xp.matrix_transpose(t) @ t
 
-    def force(self, z: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def force(self, z: Vectors) -> Vectors:
         """D(z) z [N·m]."""
         d0, r = self._constants(numpy=not is_torch_array(z))
         t = self.factor(r * z)
@@ -158,7 +158,7 @@ class _FCNN(nn.Module):
         named = {k: p.numpy(force=True) if numpy else p for k, p in self._parameters.items() if p is not None}
         return [(named[f"w{i}"], named[f"b{i}"]) for i in range(self.depth)]
 
-    def output(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
+    def output(self, x: Vectors) -> Float[Array, "*batch m"]:
         xp = array_namespace(x)
         for i, (weight, bias) in enumerate(self.layers(numpy=not is_torch_array(x))):
             x = x @ weight.T + bias

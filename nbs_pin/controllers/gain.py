@@ -26,11 +26,7 @@ class Gain(nn.Module):
     least_share: torch.Tensor
 
     def __init__(
-        self,
-        nominal: Float[Array, " n"] | Float[Array, "n n"],
-        *,
-        least_share: float = 0.0,
-        name: str = "the gain",
+        self, nominal: Float[Array, " n"] | Float[Array, "n n"], *, least_share: float = 0.0, name: str = "the gain"
     ) -> None:
         super().__init__()
         if not 0.0 <= least_share < 1.0:

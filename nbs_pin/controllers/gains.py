@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, is_torch_array
+from nbs_pin.base.arrays import Array, JointArray, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import Tensors
@@ -17,7 +17,7 @@ from nbs_pin.controllers.gain import Gain
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robots.robot import Robot
 
-PerJoint: TypeAlias = float | Float[np.ndarray, " n"]
+PerJoint: TypeAlias = float | JointArray
 """One number for all joints, or one per joint (n,)."""
 
 
@@ -27,13 +27,13 @@ class Gains:
 
     bandwidth: float
     """ω [rad/s]."""
-    stiffness: Float[np.ndarray, " n"]
+    stiffness: JointArray
     """Diagonal of K [N·m/rad]."""
-    damping: Float[np.ndarray, " n"]
+    damping: JointArray
     """Diagonal of D₀ [N·m·s/rad]."""
 
     @property
-    def rate(self) -> Float[np.ndarray, " n"]:
+    def rate(self) -> JointArray:
         """Diagonal of Λ = ωK⁻¹ [rad/s per N·m]."""
         return self.bandwidth / self.stiffness
 
@@ -65,7 +65,7 @@ def gains_for_robot(
 
 def pd_gains(
     robot: Robot, dynamics: DynamicsProvider, *, bandwidth: float, period: float
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[JointArray, JointArray]:
     """K_p [N·m/rad], that of `gains_for_robot`, and K_d [N·m·s/rad], critical for the largest inertia each joint moves.
 
     K_d stays at or below ½M_e/h, a quarter of what makes a sampled damper on that inertia alone chatter (2M_e/h).
@@ -76,7 +76,7 @@ def pd_gains(
     return kp, np.minimum(critical, 0.5 * effective_inertia(robot, dynamics) / period)
 
 
-def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndarray, " n"]:
+def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> JointArray:
     """M_e,i = min_q 1/(M(q)⁻¹)_ii [kg·m²] over sampled configurations: the least inertia a torque at joint i moves.
 
     The other joints are free to give way, which is what a light direction of M feels (docs/theory.md §2).
@@ -85,7 +85,7 @@ def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndar
     return (1.0 / np.diagonal(inverse, axis1=-2, axis2=-1)).min(axis=0)
 
 
-def largest_inertia(robot: Robot, dynamics: DynamicsProvider) -> Float[np.ndarray, " n"]:
+def largest_inertia(robot: Robot, dynamics: DynamicsProvider) -> JointArray:
     """max_q M_ii(q) [kg·m²] over sampled configurations: the most inertia joint i moves with the others held."""
     return np.diagonal(dynamics.mass_matrix(sample_configurations(robot)), axis1=-2, axis2=-1).max(axis=0)
 
@@ -122,7 +122,7 @@ def warn_if_too_fast(robot: Robot, dynamics: DynamicsProvider, bandwidth: float,
         )
 
 
-def positive_gains(nv: int, **gains: PerJoint) -> tuple[Float[np.ndarray, " n"], ...]:
+def positive_gains(nv: int, **gains: PerJoint) -> tuple[JointArray, ...]:
     """The gains as float arrays (nv,), a number for all joints broadcast; raises ArgumentError unless positive."""
     arrays = {name: np.asarray(gain, dtype=float) for name, gain in gains.items()}
     for name, gain in arrays.items():
@@ -150,7 +150,7 @@ class PositiveGains(nn.ModuleDict):
         """All gains in the kind of x."""
         return self.value(numpy=not is_torch_array(x))
 
-    def numpy(self, name: str) -> Float[np.ndarray, " n"]:
+    def numpy(self, name: str) -> JointArray:
         """The gain of that name."""
         return self.named(name).numpy()
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, array_namespace, as_vectors, matvec
+from nbs_pin.base.arrays import Array, JointArray, Matrices, Scalars, Vectors, array_namespace, as_vectors, matvec
 from nbs_pin.base.claims import Claim
 from nbs_pin.base.intervals import Interval
 from nbs_pin.controllers.model_law import ModelLaw
@@ -34,7 +34,7 @@ class Lyapunov(NamedTuple):
 
     stiffness: Float[np.ndarray, "n n"]
     """S, with Φ(z1) ≥ z1ᵀSz1 and zᵀ∇²Φz ≥ 2zᵀSz [J/rad²]."""
-    rate: Float[np.ndarray, " n"]
+    rate: JointArray
     """Diagonal of Λ [rad/s per N·m]."""
     floor: Float[np.ndarray, "n n"]
     """D₀, with D(z2) ⪰ D₀ [N·m·s/rad]."""
@@ -65,11 +65,11 @@ class LyapunovLaw(ModelLaw):
         """Φ(z1) [J] of shape (...), ∇Φ(z1) [N·m] and ∇²Φ(z1)dz of shape (..., nv)."""
 
     @abstractmethod
-    def damping_force(self, z2: Array) -> Float[Array, "*batch n"]:
+    def damping_force(self, z2: Array) -> Vectors:
         """D(z2)z2 [N·m], without the part ωM z2."""
 
     @abstractmethod
-    def damping_matrix(self, z2: Array) -> Float[Array, "*batch n n"]:
+    def damping_matrix(self, z2: Array) -> Matrices:
         """D(z2) [N·m·s/rad], without the part ωM."""
 
     @abstractmethod
@@ -92,19 +92,19 @@ class LyapunovLaw(ModelLaw):
         """
         return self._errors(*as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref))
 
-    def storage(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
+    def storage(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Scalars:
         """V = Φ(z1) + ½z2ᵀM(q)z2 [J], the Lyapunov function of the closed loop."""
         q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
         e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
         return e.value + 0.5 * _dot(e.z2, matvec(self.dynamics.mass_matrix(q), e.z2))
 
-    def dissipation(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Float[Array, "*batch"]:
+    def dissipation(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Scalars:
         """The rate at which V falls without disturbance and friction [W]: the sum of `losses`."""
         q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
         in_potential, in_damping = self.losses(q, self._errors(q, v, q_ref, v_ref, 0.0 * v_ref))
         return in_potential + in_damping
 
-    def losses(self, q: Array, e: Errors) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    def losses(self, q: Array, e: Errors) -> tuple[Scalars, Scalars]:
         """∇ΦᵀΛ∇Φ and z2ᵀ(ωM + D)z2 − (1 − ζ)z2ᵀ∇Φ [W]."""
         force = self.inertial_rate * matvec(self.dynamics.mass_matrix(q), e.z2) + self.damping_force(e.z2)
         force = force - (1.0 - self.coupling) * e.gradient

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, as_vectors
+from nbs_pin.base.arrays import Array, Matrices, Vectors, as_vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import known_code
@@ -116,7 +116,7 @@ class NeuralBackstepping(LyapunovLaw):
         omega = chosen.bandwidth if damping == "inertial" else 0.0
         return cls(dynamics, phi, d, rate=chosen.rate, inertial_rate=omega, friction=friction, least_share=least_share)
 
-    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ [N·m]; the ωM part of the damping joins the reference acceleration and costs nothing.
 
         Raises ArgumentError when shapes or array kinds do not fit.
@@ -131,11 +131,11 @@ class NeuralBackstepping(LyapunovLaw):
         """Φ, ∇Φ and ∇²Φ dz of the potential network."""
         return self.potential.terms(z1, dz)
 
-    def damping_force(self, z2: Array) -> Float[Array, "*batch n"]:
+    def damping_force(self, z2: Array) -> Vectors:
         """D(z2)z2 [N·m] of the damping network."""
         return self.damping.force(z2)
 
-    def damping_matrix(self, z2: Array) -> Float[Array, "*batch n n"]:
+    def damping_matrix(self, z2: Array) -> Matrices:
         """D(z2) [N·m·s/rad] of the damping network."""
         return self.damping.matrix(z2)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, is_torch_array
+from nbs_pin.base.arrays import Array, JointArray, is_torch_array
 from nbs_pin.base.claims import Claim, Known, Label, known, refuse
 from nbs_pin.base.known_code import first_foreign, foreign_code
 from nbs_pin.base.rounding import least_eigenvalue
@@ -127,7 +127,7 @@ def positive_gain(name: str, gain: Gain, n: int, axes: int) -> tuple[Float[np.nd
     return value, foreign_code(gain)
 
 
-def _scale(name: str, scale: Float[np.ndarray, " n"]) -> None:
+def _scale(name: str, scale: JointArray) -> None:
     if not (scale > 0.0).all():
         refuse(f"the scale R of {name} is {scale.tolist()}", "all its numbers must be positive")
 

@@ -1,9 +1,6 @@
 """Proportional-derivative control with a model: gravity compensation, or the full PD+ feedforward."""
 
-import numpy as np
-from jaxtyping import Float
-
-from nbs_pin.base.arrays import Array, as_vectors
+from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
@@ -61,16 +58,16 @@ class PD(ModelLaw):
         return cls(dynamics, feedforward=feedforward, kp=kp, kd=kd, friction=friction)
 
     @property
-    def kp(self) -> Float[np.ndarray, " n"]:
+    def kp(self) -> JointArray:
         """K_p [N·m/rad]."""
         return self.gains.numpy("kp")
 
     @property
-    def kd(self) -> Float[np.ndarray, " n"]:
+    def kd(self) -> JointArray:
         """K_d [N·m·s/rad]."""
         return self.gains.numpy("kd")
 
-    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         z1, dz1 = self.dynamics.difference(q, q_ref), v - v_ref

@@ -3,10 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, array_namespace, as_vectors, constant_like, is_torch_array
+from nbs_pin.base.arrays import Array, JointArray, Vectors, array_namespace, as_vectors, constant_like, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import is_known, known_code
 from nbs_pin.base.records import Reference
@@ -44,7 +43,7 @@ class PID(Controller, nn.Module):
     def __init__(
         self,
         *,
-        kp: Float[np.ndarray, " n"],
+        kp: JointArray,
         ki: PerJoint,
         kd: PerJoint,
         effort_limit: PerJoint,
@@ -86,33 +85,28 @@ class PID(Controller, nn.Module):
         return len(self.effort_limit)
 
     @property
-    def kp(self) -> Float[np.ndarray, " n"]:
+    def kp(self) -> JointArray:
         """K_p [N·m/rad]."""
         return self.gains.numpy("kp")
 
     @property
-    def ki(self) -> Float[np.ndarray, " n"]:
+    def ki(self) -> JointArray:
         """K_i [N·m/(rad·s)]."""
         return self.gains.numpy("ki")
 
     @property
-    def kd(self) -> Float[np.ndarray, " n"]:
+    def kd(self) -> JointArray:
         """K_d [N·m·s/rad]."""
         return self.gains.numpy("kd")
 
-    def initial_memory(self, q: Float[Array, "*batch n"]) -> PIDMemory:
+    def initial_memory(self, q: Vectors) -> PIDMemory:
         """No integral, derivative at rest, in the kind of q."""
         xp = array_namespace(q)
         return PIDMemory(xp.zeros_like(q), xp.zeros_like(q))
 
     def step(
-        self,
-        memory: PIDMemory,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        reference: Reference,
-        period: float,
-    ) -> tuple[Float[Array, "*batch n"], PIDMemory]:
+        self, memory: PIDMemory, q: Vectors, v: Vectors, reference: Reference, period: float
+    ) -> tuple[Vectors, PIDMemory]:
         """τ [N·m] for the next period [s], and the memory after it; torch in, differentiable torch out."""
         xp, (kp, ki, kd) = array_namespace(q), self.gains.like(q)
         z1 = configuration_difference(q, reference.q, self.continuous)
@@ -157,13 +151,13 @@ class CompiledPID(Controller):
         """Number of joints."""
         return int(self.gains.shape[1])
 
-    def initial_memory(self, q: Float[np.ndarray, "*batch n"]) -> PIDMemory:
+    def initial_memory(self, q: Vectors) -> PIDMemory:
         """No integral, derivative at rest."""
         return PIDMemory(np.zeros_like(q), np.zeros_like(q))
 
     def step(
         self, memory: PIDMemory, q: Array, v: Array, reference: Reference, period: float
-    ) -> tuple[Float[np.ndarray, "*batch n"], PIDMemory]:
+    ) -> tuple[Vectors, PIDMemory]:
         """τ [N·m] for the next period [s], and the memory after it.
 
         Raises ArgumentError when shapes do not fit, or for tensors.
@@ -180,7 +174,7 @@ class CompiledPID(Controller):
 
     def _steps(
         self, memory: PIDMemory, q: Array, v: Array, reference: Reference, period: float
-    ) -> tuple[Float[np.ndarray, "*batch n"], PIDMemory]:
+    ) -> tuple[Vectors, PIDMemory]:
         given = as_vectors(
             self.nv,
             integral=memory.integral,

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, array_namespace, is_torch_array, matvec
+from nbs_pin.base.arrays import Array, Scalars, Vectors, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import OUTWARD, Interval
 from nbs_pin.base.known_code import is_known, known_code
@@ -84,9 +84,7 @@ class Potential(nn.Module):
         """μ = 2 λ_min(S) for the present S: Φ is μ-strongly convex [J/rad²]."""
         return 2.0 * float(np.linalg.eigvalsh(self.stiffness.numpy())[0])
 
-    def terms(
-        self, z: Float[Array, "*batch n"], dz: Float[Array, "*batch n"]
-    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch n"], Float[Array, "*batch n"]]:
+    def terms(self, z: Vectors, dz: Vectors) -> tuple[Scalars, Vectors, Vectors]:
         """Φ(z) [J], ∇Φ(z) [N·m] and ∇²Φ(z) dz, in the kind of z."""
         xp = array_namespace(z)
         s, r = self.stiffness.like(z), self.scale if is_torch_array(z) else self.scale.numpy(force=True)
@@ -133,9 +131,7 @@ class Potential(nn.Module):
             dy, ddy = slope * da, activation.curvature_range(a) * da.squared() + slope * dda
         return ddy.hull().times(scale * scale).widened(OUTWARD)
 
-    def _psi(
-        self, x: Float[Array, "*batch n"], dx: Float[Array, "*batch n"]
-    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch n"], Float[Array, "*batch n"]]:
+    def _psi(self, x: Vectors, dx: Vectors) -> tuple[Scalars, Vectors, Vectors]:
         if self.form == "paper":
             return self.network.terms(x, dx)
         xp = array_namespace(x)

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, array_namespace, as_vectors
+from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, array_namespace, as_vectors
 from nbs_pin.base.claims import Claim, known
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import foreign_code, known_code
@@ -41,12 +41,7 @@ class SlotineLi(LyapunovLaw):
     coupling = 0.0
 
     def __init__(
-        self,
-        dynamics: DynamicsProvider,
-        *,
-        rate: PerJoint,
-        gain: PerJoint,
-        friction: JointFriction | None = None,
+        self, dynamics: DynamicsProvider, *, rate: PerJoint, gain: PerJoint, friction: JointFriction | None = None
     ) -> None:
         super().__init__(dynamics, friction)
         self.gains = PositiveGains(dynamics.nv, rate=rate, gain=gain)
@@ -69,16 +64,16 @@ class SlotineLi(LyapunovLaw):
         return cls(dynamics, rate=np.full(robot.nv, bandwidth), gain=gain, friction=friction)
 
     @property
-    def rate(self) -> Float[np.ndarray, " n"]:
+    def rate(self) -> JointArray:
         """λ [1/s]."""
         return self.gains.numpy("rate")
 
     @property
-    def gain(self) -> Float[np.ndarray, " n"]:
+    def gain(self) -> JointArray:
         """K [N·m·s/rad]."""
         return self.gains.numpy("gain")
 
-    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         rate, gain = self.gains.like(q)
@@ -93,11 +88,11 @@ class SlotineLi(LyapunovLaw):
         gradient = 2.0 * rate * gain * z1
         return 0.5 * array_namespace(z1).sum(gradient * z1, axis=-1), gradient, 2.0 * rate * gain * dz
 
-    def damping_force(self, z2: Array) -> Float[Array, "*batch n"]:
+    def damping_force(self, z2: Array) -> Vectors:
         """K z2 [N·m]."""
         return self.gains.like(z2)[1] * z2
 
-    def damping_matrix(self, z2: Array) -> Float[Array, "*batch n n"]:
+    def damping_matrix(self, z2: Array) -> Matrices:
         """K [N·m·s/rad]."""
         xp, gain = array_namespace(z2), self.gains.like(z2)[1]
         return xp.eye(self.nv, dtype=z2.dtype) * gain + 0.0 * z2[..., None]

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, array_namespace
+from nbs_pin.base.arrays import Array, Scalars, array_namespace
 from nbs_pin.base.claims import Claim, Label, refuse
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.known_code import known_code
@@ -108,7 +108,7 @@ class AnalyticDynamics(DynamicsProvider):
         because = "closed form: least eigenvalue ≥ det M / largest trace"
         return quadratic(Claim(POSITIVE, least, "kg·m²", Label.PROVED, because))
 
-    def potential_energy(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+    def potential_energy(self, q: Float[Array, "*batch 2"]) -> Scalars:
         """V(q) [J], zero with the arm horizontal."""
         xp = array_namespace(q)
         return self._weights[0] * xp.sin(q[..., 0]) + self._weights[1] * xp.sin(q[..., 0] + q[..., 1])

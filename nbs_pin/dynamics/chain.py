@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import nn
 
+from nbs_pin.base.arrays import Matrices, Scalars, Vectors
 from nbs_pin.base.claims import Claim, Label, refuse
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
@@ -69,18 +70,18 @@ class Chain(LagrangianNetwork):
             setattr(self, name, nn.Parameter(torch.from_numpy(value)))
         self.rotors = nn.Parameter(torch.zeros(self.nv, dtype=torch.float64))
 
-    def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M̂(q) = Σ_j B_jᵀB_j + diag(r² + ε) [kg·m²], column i of B_j being ∂_iT_j L_j."""
         frames = self._frames(q)
         rates = self._rates(frames)  # (…, n joints, n bodies, 4, 4)
         columns = (rates @ self.factors.tril()).flatten(-2).flatten(-2)
         return columns @ columns.mT + torch.diag(self.rotors.square() + self.epsilon)
 
-    def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def potential(self, q: Vectors) -> Scalars:
         """V̂(q) [J]."""
         return -(self._frames(q) @ self._moments())[..., :3, 0].sum(-2) @ self.field
 
-    def gravity(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    def gravity(self, q: Vectors) -> Vectors:
         """Ĝ(q) [N·m], by −g·∂_iT_j of the first moments."""
         rates = self._rates(self._frames(q))
         return -torch.einsum("...ijk,k->...i", (rates @ self._moments())[..., :3, 0], self.field)

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
-from nbs_pin.base.arrays import matvec
+from nbs_pin.base.arrays import Matrices, Scalars, Vectors, matvec
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.features import JointFeatures
@@ -61,22 +60,16 @@ class CholeskyNetwork(LagrangianNetwork):
         """Sizes of the hidden layers."""
         return tuple(len(bias) for _, bias in self.network.layers()[:-1])
 
-    def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M̂(q) [kg·m²]."""
         factor = self.scales.root[:, None] * self._factor(self.network(self.features(q)))
         return factor @ factor.mT + self.scales.floor
 
-    def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def potential(self, q: Vectors) -> Scalars:
         """V̂(q) [J]."""
         return self.scales.energy * self.network(self.features(q))[..., -1]
 
-    def torque(
-        self,
-        q: Float[Tensor, "*batch n"],
-        v: Float[Tensor, "*batch n"],
-        w: Float[Tensor, "*batch n"],
-        a: Float[Tensor, "*batch n"],
-    ) -> Float[Tensor, "*batch n"]:
+    def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors) -> Vectors:
         """M̂ a + Ĉ(q, v) w + Ĝ [N·m] by one pass forward with tangents along v and w, and one pass back.
 
         Of vᵀLLᵀw the gradient in L is v(Lᵀw)ᵀ + w(Lᵀv)ᵀ.

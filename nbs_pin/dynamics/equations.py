@@ -1,14 +1,10 @@
 """The equations of motion, written once for every `DynamicsProvider`; shapes are checked here (docs/theory.md §1)."""
 
-from jaxtyping import Float
-
-from nbs_pin.base.arrays import Array, array_namespace, as_vectors, matvec
+from nbs_pin.base.arrays import Array, Scalars, Vectors, array_namespace, as_vectors, matvec
 from nbs_pin.dynamics.provider import DynamicsProvider
 
 
-def reference_torque(
-    dynamics: DynamicsProvider, q: Array, v: Array, v_r: Array, a_r: Array
-) -> Float[Array, "*batch n"]:
+def reference_torque(dynamics: DynamicsProvider, q: Array, v: Array, v_r: Array, a_r: Array) -> Vectors:
     """M(q) a_r + C(q, v) v_r + G(q) [N·m], for a reference velocity v_r [rad/s] and acceleration a_r [rad/s²].
 
     All arguments have shape (..., nv). Raises ArgumentError on other shapes. Source: docs/theory.md §1.
@@ -16,30 +12,30 @@ def reference_torque(
     return dynamics.reference_torque(*as_vectors(dynamics.nv, q=q, v=v, v_r=v_r, a_r=a_r))
 
 
-def inverse_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, a: Array) -> Float[Array, "*batch n"]:
+def inverse_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, a: Array) -> Vectors:
     """τ = M(q) a + C(q, v) v + G(q) [N·m]: the torque that produces the acceleration a [rad/s²]."""
     q, v, a = as_vectors(dynamics.nv, q=q, v=v, a=a)
     return dynamics.reference_torque(q, v, v, a)
 
 
-def forward_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, tau: Array) -> Float[Array, "*batch n"]:
+def forward_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, tau: Array) -> Vectors:
     """v̇ = M(q)⁻¹(τ − C(q, v) v − G(q)) [rad/s²]: the acceleration that the torque τ [N·m] produces."""
     return dynamics.forward_dynamics(*as_vectors(dynamics.nv, q=q, v=v, tau=tau))
 
 
-def bias(dynamics: DynamicsProvider, q: Array, v: Array) -> Float[Array, "*batch n"]:
+def bias(dynamics: DynamicsProvider, q: Array, v: Array) -> Vectors:
     """C(q, v) v + G(q) [N·m]: the torque that keeps the velocity constant."""
     q, v = as_vectors(dynamics.nv, q=q, v=v)
     return dynamics.reference_torque(q, v, v, 0.0 * v)
 
 
-def kinetic_energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Float[Array, "*batch"]:
+def kinetic_energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
     """½ vᵀM(q)v [J]."""
     q, v = as_vectors(dynamics.nv, q=q, v=v)
     return 0.5 * array_namespace(v).sum(v * matvec(dynamics.mass_matrix(q), v), axis=-1)
 
 
-def energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Float[Array, "*batch"]:
+def energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
     """E = ½ vᵀM(q)v + V(q) [J]; along every motion dE/dt = vᵀτ."""
     q, v = as_vectors(dynamics.nv, q=q, v=v)
     return kinetic_energy(dynamics, q, v) + dynamics.potential_energy(q)

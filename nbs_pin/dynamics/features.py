@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
+from nbs_pin.base.arrays import Vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 
@@ -49,22 +50,18 @@ class JointFeatures(nn.Module):
         """Number of features."""
         return self.nv + self.turning
 
-    def forward(self, q: Float[torch.Tensor, "*batch n"]) -> Float[torch.Tensor, "*batch m"]:
+    def forward(self, q: Vectors) -> Float[torch.Tensor, "*batch m"]:
         """x(q)."""
         angles, positions = self._split(q)
         return torch.cat([torch.sin(angles), torch.cos(angles), positions], dim=-1)
 
-    def push(
-        self, x: Float[torch.Tensor, "*batch m"], dq: Float[torch.Tensor, "*batch n"]
-    ) -> Float[torch.Tensor, "*batch m"]:
+    def push(self, x: Float[torch.Tensor, "*batch m"], dq: Vectors) -> Float[torch.Tensor, "*batch m"]:
         """ẋ = ∂x/∂q q̇ at the features x."""
         sine, cosine = self._waves(x)
         angles, positions = self._split(dq)
         return torch.cat([cosine * angles, -sine * angles, positions], dim=-1)
 
-    def pull(
-        self, x: Float[torch.Tensor, "*batch m"], gradient: Float[torch.Tensor, "*batch m"]
-    ) -> Float[torch.Tensor, "*batch n"]:
+    def pull(self, x: Float[torch.Tensor, "*batch m"], gradient: Float[torch.Tensor, "*batch m"]) -> Vectors:
         """(∂x/∂q)ᵀ of a gradient in the features x."""
         (sine, cosine), r = self._waves(x), self.turning
         angles = cosine * gradient[..., :r] - sine * gradient[..., r : 2 * r]

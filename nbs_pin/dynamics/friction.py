@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, array_namespace, constant_like
+from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, constant_like
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
@@ -22,9 +21,9 @@ class JointFriction:
     near v = 0 it is a damper of coulomb / transition, and a step h is stable for h·coulomb / (transition·M) < 2.
     """
 
-    viscous: Float[np.ndarray, " n"]
+    viscous: JointArray
     """Viscous coefficient per joint [N·m·s/rad]."""
-    coulomb: Float[np.ndarray, " n"]
+    coulomb: JointArray
     """Coulomb torque per joint [N·m]."""
     transition: float = 0.01
     """Speed at which 76 % of the Coulomb torque is reached [rad/s]."""
@@ -49,7 +48,7 @@ class JointFriction:
         """The friction that the arm's URDF states (`<dynamics damping friction>`); zero where it states none."""
         return cls(robot.damping, robot.friction, transition)
 
-    def torque(self, v: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def torque(self, v: Vectors) -> Vectors:
         """Torque [N·m] that friction takes at the velocity v [rad/s]; numpy in numpy out, torch in torch out."""
         viscous, coulomb = constant_like(v, self.viscous), constant_like(v, self.coulomb)
         return viscous * v + coulomb * array_namespace(v).tanh(v / self.transition)

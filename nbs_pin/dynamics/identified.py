@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array
+from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors
 from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
@@ -67,35 +67,27 @@ class IdentifiedDynamics(DynamicsProvider):
         """The arm as its file describes it."""
         return self._robot
 
-    def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M(q) [kg·m²]."""
         return self._rigid.mass_matrix(q)
 
-    def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
         """C(q, v) [N·m·s], the Christoffel one."""
         return self._rigid.coriolis_matrix(q, v)
 
-    def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def gravity(self, q: Vectors) -> Vectors:
         """G(q) [N·m]."""
         return self._rigid.gravity(q)
 
-    def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    def potential_energy(self, q: Vectors) -> Scalars:
         """V(q) [J], up to a constant."""
         return self._rigid.potential_energy(q)
 
-    def reference_torque(
-        self,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        v_r: Float[Array, "*batch n"],
-        a_r: Float[Array, "*batch n"],
-    ) -> Float[Array, "*batch n"]:
+    def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
         """M a_r + C(q, v) v_r + G [N·m] by two RNEA."""
         return self._rigid.reference_torque(q, v, v_r, a_r)
 
-    def forward_dynamics(
-        self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
-    ) -> Float[Array, "*batch n"]:
+    def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ [rad/s²] by the articulated body algorithm."""
         return self._rigid.forward_dynamics(q, v, tau)
 

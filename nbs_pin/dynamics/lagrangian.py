@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, as_vectors, is_torch_array
+from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, is_torch_array
 from nbs_pin.base.claims import refuse
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
@@ -70,29 +69,23 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         """The arm, if one was given."""
         return self._robot
 
-    def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M̂(q) [kg·m²]."""
         return self._evaluate(self.network.mass_matrix, q=q)
 
-    def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
         """Ĉ(q, v) [N·m·s], the Christoffel one of M̂(q)."""
         return self._evaluate(self.network.coriolis_matrix, q=q, v=v)
 
-    def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def gravity(self, q: Vectors) -> Vectors:
         """Ĝ(q) [N·m]."""
         return self._evaluate(self.network.gravity, q=q)
 
-    def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    def potential_energy(self, q: Vectors) -> Scalars:
         """V̂(q) [J], up to a constant."""
         return self._evaluate(self.network.potential, q=q)
 
-    def reference_torque(
-        self,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        v_r: Float[Array, "*batch n"],
-        a_r: Float[Array, "*batch n"],
-    ) -> Float[Array, "*batch n"]:
+    def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
         """M̂ a_r + Ĉ(q, v) v_r + Ĝ [N·m], in numpy by the network's machine code where it has one."""
         vectors = as_vectors(self.nv, q=q, v=v, v_r=v_r, a_r=a_r)
         if is_torch_array(vectors[0]) or self._machine_code is None:
@@ -100,9 +93,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         rows = (np.ascontiguousarray(x).reshape(-1, self.nv) for x in vectors)
         return self._machine_code(*rows).reshape(vectors[0].shape)
 
-    def forward_dynamics(
-        self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
-    ) -> Float[Array, "*batch n"]:
+    def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ [rad/s²] that the torque τ [N·m] produces, in numpy by machine code where the network is a rigid tree."""
         vectors = as_vectors(self.nv, q=q, v=v, tau=tau)
         tree = None if is_torch_array(vectors[0]) else self._tree

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import nn
 from torch.func import grad, jvp
 
-from nbs_pin.base.arrays import matvec
+from nbs_pin.base.arrays import Matrices, Scalars, Vectors, matvec
 from nbs_pin.dynamics.features import JointFeatures
 from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
@@ -35,45 +35,37 @@ class LagrangianNetwork(nn.Module, ABC):
     """Whether T̂ is exactly ½ vᵀM̂(q)v, so that Ṁ − 2C is skew and the stability theory holds."""
 
     @abstractmethod
-    def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M̂(q) [kg·m²]; for a T̂ that is not quadratic the one at v = 0."""
 
     @abstractmethod
-    def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def potential(self, q: Vectors) -> Scalars:
         """V̂(q) [J], up to a constant."""
 
-    def kinetic(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def kinetic(self, q: Vectors, v: Vectors) -> Scalars:
         """T̂(q, v) [J], zero at v = 0."""
         return 0.5 * (v * matvec(self.mass_matrix(q), v)).sum(-1)
 
-    def inertia(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    def inertia(self, q: Vectors, v: Vectors) -> Matrices:
         """∂²T̂/∂v² at (q, v) [kg·m²], which is M̂(q) where T̂ is quadratic."""
         return self.mass_matrix(q)
 
-    def gravity(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    def gravity(self, q: Vectors) -> Vectors:
         """Ĝ(q) = ∂V̂/∂q [N·m]."""
         return grad(lambda x: self.potential(x).sum())(q)
 
-    def mass_rates(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "n *batch n n"]:
+    def mass_rates(self, q: Vectors) -> Float[Tensor, "n *batch n n"]:
         """∂M̂/∂q_k, stacked over k first."""
         return along_every_joint(self.mass_matrix, q)
 
-    def coriolis_matrix(
-        self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]
-    ) -> Float[Tensor, "*batch n n"]:
+    def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
         """Christoffel Ĉ(q, v) [N·m·s] of `mass_matrix`: C_ij = ½ Σ_k (∂_k M_ij + ∂_j M_ik − ∂_i M_jk) v_k."""
         rates = self.mass_rates(q)
         along = torch.einsum("k...ij,...k->...ij", rates, v)
         turned = torch.einsum("j...ik,...k->...ij", rates, v)
         return 0.5 * (along + turned - turned.mT)
 
-    def torque(
-        self,
-        q: Float[Tensor, "*batch n"],
-        v: Float[Tensor, "*batch n"],
-        w: Float[Tensor, "*batch n"],
-        a: Float[Tensor, "*batch n"],
-    ) -> Float[Tensor, "*batch n"]:
+    def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors) -> Vectors:
         """M̂(q) a + Ĉ(q, v) w + Ĝ(q) [N·m]; cheaper when w is the very tensor v.
 
         Ĉ(q, v) w = ½(∂_v M̂ w + ∂_w M̂ v − ∇_q vᵀM̂w): two directional derivatives of M̂ and one gradient.
@@ -86,9 +78,7 @@ class LagrangianNetwork(nn.Module, ABC):
 
         return matvec(mass, a) + 0.5 * (matvec(along_v, w) + matvec(along_w, v)) - grad(lagrangian)(q)
 
-    def acceleration(
-        self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"], tau: Float[Tensor, "*batch n"]
-    ) -> Float[Tensor, "*batch n"]:
+    def acceleration(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ [rad/s²] that the torque τ [N·m] produces; torch.linalg.LinAlgError where the inertia is singular."""
         bias = self.torque(q, v, v, torch.zeros_like(v))
         return torch.linalg.solve(self.inertia(q, v), (tau - bias)[..., None])[..., 0]
@@ -122,37 +112,31 @@ class GeneralLagrangianNetwork(LagrangianNetwork):
     quadratic = False
 
     @abstractmethod
-    def lagrangian(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def lagrangian(self, q: Vectors, v: Vectors) -> Scalars:
         """L(q, v) [J]."""
 
-    def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """∂²L/∂v² at v = 0 [kg·m²]."""
         return self.inertia(q, torch.zeros_like(q))
 
-    def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def potential(self, q: Vectors) -> Scalars:
         """−L(q, 0) [J]."""
         return -self.lagrangian(q, torch.zeros_like(q))
 
-    def kinetic(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def kinetic(self, q: Vectors, v: Vectors) -> Scalars:
         """L(q, v) − L(q, 0) [J]."""
         return self.lagrangian(q, v) + self.potential(q)
 
-    def momentum(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    def momentum(self, q: Vectors, v: Vectors) -> Vectors:
         """∂L/∂v [N·m·s]."""
         return grad(lambda x: self.lagrangian(q, x).sum())(v)
 
-    def inertia(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    def inertia(self, q: Vectors, v: Vectors) -> Matrices:
         """∂²L/∂v² at (q, v) [kg·m²]."""
         columns = along_every_joint(lambda x: self.momentum(q.expand(x.shape), x), v)
         return columns.movedim(0, -1)
 
-    def torque(
-        self,
-        q: Float[Tensor, "*batch n"],
-        v: Float[Tensor, "*batch n"],
-        w: Float[Tensor, "*batch n"],
-        a: Float[Tensor, "*batch n"],
-    ) -> Float[Tensor, "*batch n"]:
+    def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors) -> Vectors:
         """d/dt ∂L/∂v − ∂L/∂q + Ĉ (w − v) [N·m]; much cheaper when w is the very tensor v."""
         rate = derivative(self.momentum, (q, v), (v, a))
         exact = rate - grad(lambda x: self.lagrangian(x, v).sum())(q)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import nn
 from torch.func import grad
 
+from nbs_pin.base.arrays import Matrices, Scalars, Vectors
 from nbs_pin.base.claims import Claim, Label
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
@@ -60,7 +61,7 @@ class PICNN(nn.Module):
         """Sizes of the hidden layers."""
         return tuple(len(getattr(self, f"b{i}")) for i in range(self.depth - 1))
 
-    def forward(self, context: Float[Tensor, "*batch m"], x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def forward(self, context: Float[Tensor, "*batch m"], x: Vectors) -> Scalars:
         """f(x̃, x)."""
         y = x[..., :0]
         for i, u in enumerate(self._contexts(context)):
@@ -70,7 +71,7 @@ class PICNN(nn.Module):
             y = softplus(a) if i < self.depth - 1 else a
         return y[..., 0]
 
-    def curvature(self, context: Float[Tensor, "*batch m"], x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def curvature(self, context: Float[Tensor, "*batch m"], x: Vectors) -> Scalars:
         """d²/ds² of f(x̃, sx) at s = 0: one pass forward with both derivatives ẏ and ÿ of every neuron.
 
         ẏ = σ'(a) ȧ and ÿ = σ''(a) ȧ² + σ'(a) ä.
@@ -153,7 +154,7 @@ class PaperPicnn(GeneralLagrangianNetwork):
         """Sizes of the hidden layers."""
         return self.network.widths
 
-    def lagrangian(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def lagrangian(self, q: Vectors, v: Vectors) -> Scalars:
         """T̂(q, v) − V̂(q) [J]."""
         x, s = self.features(q), self.scales
         kinetic = self.convex(x, s.root * v) + 0.5 * s.epsilon * (v * v).sum(-1)
@@ -200,26 +201,20 @@ class HomogenisedPicnn(LagrangianNetwork):
         """Sizes of the hidden layers."""
         return self.convex.widths
 
-    def kinetic(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def kinetic(self, q: Vectors, v: Vectors) -> Scalars:
         """T̂(q, v) = ½ vᵀM̂(q)v [J], without M̂."""
         curvature = self.convex.curvature(self.features(q), self.scales.root * v)
         return 0.5 * (curvature + self.scales.epsilon * (v * v).sum(-1))
 
-    def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M̂(q) [kg·m²]."""
         return along_every_joint(lambda v: self._momentum(q.expand(v.shape), v), torch.zeros_like(q)).movedim(0, -1)
 
-    def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def potential(self, q: Vectors) -> Scalars:
         """V̂(q) [J]."""
         return self.scales.energy * self.network(self.features(q))[..., 0]
 
-    def torque(
-        self,
-        q: Float[Tensor, "*batch n"],
-        v: Float[Tensor, "*batch n"],
-        w: Float[Tensor, "*batch n"],
-        a: Float[Tensor, "*batch n"],
-    ) -> Float[Tensor, "*batch n"]:
+    def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors) -> Vectors:
         """M̂ a + Ĉ(q, v) w + Ĝ [N·m] from T̂ alone; half the work when w is the very tensor v.
 
         With h(x) = Ĉ(q, x) x: Ĉ(q, v) w = h((v + w)/2) − h((v − w)/2) (docs/theory.md §1).

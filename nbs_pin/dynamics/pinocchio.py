@@ -6,9 +6,8 @@ from typing import TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, as_vectors, is_torch_array, over_rows
+from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, is_torch_array, over_rows
 from nbs_pin.base.claims import refuse
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
@@ -59,29 +58,23 @@ class PinocchioDynamics(DynamicsProvider):
         """The arm."""
         return self._robot
 
-    def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M(q) [kg·m²] by the composite rigid body algorithm."""
         return self._evaluate(Quantity(self._mass_matrix, self._mass_matrix_vjp), q=q)
 
-    def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
         """C(q, v) [N·m·s], the Christoffel one."""
         return self._evaluate(Quantity(self._coriolis_matrix, self._coriolis_matrix_vjp), q=q, v=v)
 
-    def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def gravity(self, q: Vectors) -> Vectors:
         """G(q) [N·m]."""
         return self._evaluate(Quantity(self._gravity, self._gravity_vjp), q=q)
 
-    def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    def potential_energy(self, q: Vectors) -> Scalars:
         """V(q) [J], zero where all masses lie at the height of the base."""
         return self._evaluate(Quantity(self._potential_energy, self._potential_energy_vjp), q=q)
 
-    def reference_torque(
-        self,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        v_r: Float[Array, "*batch n"],
-        a_r: Float[Array, "*batch n"],
-    ) -> Float[Array, "*batch n"]:
+    def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
         """M a_r + C(q, v) v_r + G [N·m] by two RNEA and no matrix.
 
         C(q, v) w is bilinear and symmetric in (v, w), so with h(x) = C(q, x) x:
@@ -89,9 +82,7 @@ class PinocchioDynamics(DynamicsProvider):
         """
         return self._evaluate(Quantity(self._reference_torque, self._reference_torque_vjp), q=q, v=v, v_r=v_r, a_r=a_r)
 
-    def forward_dynamics(
-        self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
-    ) -> Float[Array, "*batch n"]:
+    def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ [rad/s²] by the articulated body algorithm."""
         return self._evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q=q, v=v, tau=tau)
 

@@ -2,9 +2,7 @@
 
 from abc import ABC, abstractmethod
 
-from jaxtyping import Float
-
-from nbs_pin.base.arrays import Array, array_namespace, matvec
+from nbs_pin.base.arrays import Matrices, Scalars, Vectors, array_namespace, matvec
 from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.robots.robot import Robot, configuration_difference
@@ -29,32 +27,26 @@ class DynamicsProvider(ABC):
         return None
 
     @abstractmethod
-    def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M(q) [kg·m²], symmetric positive definite."""
 
     @abstractmethod
-    def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
         """Christoffel C(q, v) [N·m·s]: Ṁ − 2C is skew and C(q, v) w = C(q, w) v."""
 
     @abstractmethod
-    def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def gravity(self, q: Vectors) -> Vectors:
         """G(q) = ∂V/∂q [N·m]: the torque that holds the arm still."""
 
     @abstractmethod
-    def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    def potential_energy(self, q: Vectors) -> Scalars:
         """V(q) [J], up to a constant."""
 
-    def difference(self, q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def difference(self, q: Vectors, q_ref: Vectors) -> Vectors:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on the continuous joints of `robot`."""
         return configuration_difference(q, q_ref, None if self.robot is None else self.robot.continuous)
 
-    def reference_torque(
-        self,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        v_r: Float[Array, "*batch n"],
-        a_r: Float[Array, "*batch n"],
-    ) -> Float[Array, "*batch n"]:
+    def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
         """M(q) a_r + C(q, v) v_r + G(q) [N·m], the one quantity a passivity-based law needs (docs/theory.md §1)."""
         return matvec(self.mass_matrix(q), a_r) + matvec(self.coriolis_matrix(q, v), v_r) + self.gravity(q)
 
@@ -74,9 +66,7 @@ class DynamicsProvider(ABC):
         """
         return None
 
-    def forward_dynamics(
-        self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"], tau: Float[Array, "*batch n"]
-    ) -> Float[Array, "*batch n"]:
+    def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ = M⁻¹(τ − C v − G) [rad/s²]."""
         net = tau - matvec(self.coriolis_matrix(q, v), v) - self.gravity(q)
         return array_namespace(net).linalg.solve(self.mass_matrix(q), net[..., None])[..., 0]

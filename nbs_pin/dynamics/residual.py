@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import matvec
+from nbs_pin.base.arrays import Matrices, Scalars, Vectors, matvec
 from nbs_pin.base.claims import Claim, refuse
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import foreign_code, known_code
@@ -76,7 +76,7 @@ class ResidualNetwork(CholeskyNetwork):
         for weight in self.network.layers()[-1]:
             nn.init.zeros_(weight)
 
-    def terms(self, q: Float[Tensor, "*batch n"], nominal: Terms | None = None) -> Terms:
+    def terms(self, q: Vectors, nominal: Terms | None = None) -> Terms:
         """M̂, its rates and Ĝ; nominal: `nominal_terms` of the same q, where they are known already."""
         given = nominal_terms(self.nominal, q) if nominal is None else nominal
         factor = torch.linalg.cholesky(given.mass)
@@ -90,31 +90,24 @@ class ResidualNetwork(CholeskyNetwork):
         mixed = self.share * given.rates + (1.0 - self.share) * (product + product.mT)
         return Terms(self._mixed(given.mass, factor), mixed, gravity)
 
-    def mass_matrix(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M̂(q) [kg·m²]."""
         mass = self.nominal.mass_matrix(q)
         return self._mixed(mass, torch.linalg.cholesky(mass) + self._correction(self.network(self.features(q))))
 
-    def mass_rates(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "n *batch n n"]:
+    def mass_rates(self, q: Vectors) -> Float[Tensor, "n *batch n n"]:
         """∂M̂/∂q_k, stacked over k first."""
         return self.terms(q).rates.movedim(-3, 0)
 
-    def potential(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def potential(self, q: Vectors) -> Scalars:
         """V̂(q) [J]."""
         return self.nominal.potential_energy(q) + super().potential(q)
 
-    def gravity(self, q: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    def gravity(self, q: Vectors) -> Vectors:
         """Ĝ(q) [N·m]."""
         return self.terms(q).gravity
 
-    def torque(
-        self,
-        q: Float[Tensor, "*batch n"],
-        v: Float[Tensor, "*batch n"],
-        w: Float[Tensor, "*batch n"],
-        a: Float[Tensor, "*batch n"],
-        nominal: Terms | None = None,
-    ) -> Float[Tensor, "*batch n"]:
+    def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors, nominal: Terms | None = None) -> Vectors:
         """M̂ a + Ĉ(q, v) w + Ĝ [N·m]; nominal: as in `terms`, which spares a training most of the time."""
         mass, rates, gravity = self.terms(q, nominal)
         along_v, along_w = (torch.einsum("...kij,...k->...ij", rates, x) for x in (v, w))
@@ -159,7 +152,7 @@ class ResidualDynamics(LagrangianDynamics):
         return nominal
 
 
-def nominal_terms(dynamics: DynamicsProvider, q: Float[Tensor, "*batch n"]) -> Terms:
+def nominal_terms(dynamics: DynamicsProvider, q: Vectors) -> Terms:
     """M, its rates and G of any model: ∂M/∂q_k = C(q, e_k) + C(q, e_k)ᵀ, because Ṁ − 2C is skew."""
     unit = torch.eye(dynamics.nv, dtype=q.dtype, device=q.device)
     coriolis = torch.stack([dynamics.coriolis_matrix(q, e.expand(q.shape)) for e in unit], dim=-3)

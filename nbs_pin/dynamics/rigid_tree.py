@@ -6,6 +6,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.rounding import least_eigenvalues
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.kernels.layout import Packed
@@ -26,16 +27,16 @@ class RigidTree:
     """Of frame i in its parent's at q_i = 0."""
     position: Float[np.ndarray, "n 3"]
     """Of frame i's origin in its parent's frame at q_i = 0 [m]."""
-    mass: Float[np.ndarray, " n"]
+    mass: JointArray
     """[kg]."""
     centre: Float[np.ndarray, "n 3"]
     """Centre of mass in frame i [m]."""
     inertia: Float[np.ndarray, "n 3 3"]
     """About the centre of mass, in frame i [kg·m²]."""
-    armature: Float[np.ndarray, " n"]
+    armature: JointArray
     """Inertia of the rotor, on the diagonal of M [kg·m², kg]."""
-    lower: Float[np.ndarray, " n"]
-    upper: Float[np.ndarray, " n"]
+    lower: JointArray
+    upper: JointArray
     """Travel of a prismatic joint [m]; joints that turn are let turn fully."""
 
     @classmethod
@@ -99,12 +100,12 @@ class RigidTree:
         return bool((self.mass >= 0.0).all() and (least >= 0.0).all())
 
     @property
-    def least_inertia(self) -> Float[np.ndarray, " n"]:
+    def least_inertia(self) -> JointArray:
         """At most λ_min of each body's inertia about its centre of mass [kg·m²], and at least 0."""
         return np.maximum(least_eigenvalues(self.inertia) - self._rounding, 0.0)
 
     @property
-    def _rounding(self) -> Float[np.ndarray, " n"]:
+    def _rounding(self) -> JointArray:
         """An allowance for the inertias' digits: m c cᵀ was added and taken away again."""
         size = np.linalg.norm(self.inertia, axis=(1, 2)) + self.mass * (self.centre**2).sum(1)
         return 64.0 * np.finfo(float).eps * size

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
+from nbs_pin.base.arrays import Scalars
 from nbs_pin.base.known_code import known_code
 
 
@@ -47,7 +48,7 @@ class SoftplusNetwork(nn.Module):
         """Sizes of the hidden layers."""
         return tuple(len(getattr(self, f"b{i}")) for i in range(self.depth - 1))
 
-    def forward(self, x: Float[torch.Tensor, "*batch m"]) -> Float[torch.Tensor, "*batch"]:
+    def forward(self, x: Float[torch.Tensor, "*batch m"]) -> Scalars:
         """The value at x."""
         for i in range(self.depth):
             x = nn.functional.linear(x, getattr(self, f"w{i}"), getattr(self, f"b{i}"))

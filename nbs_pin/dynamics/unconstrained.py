@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
 
+from nbs_pin.base.arrays import Scalars, Vectors
 from nbs_pin.base.claims import refuse
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.features import JointFeatures
-from nbs_pin.dynamics.lagrangian_network import GeneralLagrangianNetwork, Tensor
+from nbs_pin.dynamics.lagrangian_network import GeneralLagrangianNetwork
 from nbs_pin.dynamics.scales import Scales, stored_scales
 from nbs_pin.dynamics.softplus_network import SoftplusNetwork
 from nbs_pin.dynamics.structure import ModelClaims
@@ -47,7 +47,7 @@ class UnconstrainedLagrangian(GeneralLagrangianNetwork):
         """Sizes of the hidden layers."""
         return self.network.widths
 
-    def lagrangian(self, q: Float[Tensor, "*batch n"], v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def lagrangian(self, q: Vectors, v: Vectors) -> Scalars:
         """L(q, v) [J]."""
         s = self.scales
         value = self.network(torch.cat([self.features(q), s.root * v], dim=-1))

@@ -7,9 +7,8 @@ from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
-from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array
+from nbs_pin.base.arrays import Array, Vectors
 from nbs_pin.base.checks import positive, whole
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
@@ -117,7 +116,7 @@ class _Idle(MemorylessController):
         """Number of joints."""
         return self._nv
 
-    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Float[Array, "*batch n"]:
+    def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ = 0 [N·m]."""
         return 0.0 * q
 

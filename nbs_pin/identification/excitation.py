@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.records import Reference
 from nbs_pin.controllers.gains import effective_inertia, largest_inertia, sample_configurations
 from nbs_pin.controllers.pd import PD
@@ -31,7 +32,7 @@ class Multisine:
     """[rad/s]."""
     phase: Float[np.ndarray, "tones n"]
     """[rad]."""
-    offset: Float[np.ndarray, " n"]
+    offset: JointArray
     """[rad]."""
 
     def __call__(self, t: Any) -> Reference:
@@ -80,12 +81,12 @@ def work(robot: Robot, generator: np.random.Generator) -> Sinusoid:
     return Sinusoid(usual.amplitude, usual.frequency, generator.uniform(-np.pi, np.pi, robot.nv), usual.offset)
 
 
-def configuration_box(robot: Robot) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def configuration_box(robot: Robot) -> tuple[JointArray, JointArray]:
     """(lower, upper) of the configurations to learn from [rad, m]: the joint ranges, of turning joints one turn."""
     return robot.one_turn_range
 
 
-def torque_limits(robot: Robot) -> Float[np.ndarray, " n"]:
+def torque_limits(robot: Robot) -> JointArray:
     """Largest torques of an experiment [N·m]: the arm's own, else what gravity asks at most and 20 rad/s² on top."""
     if np.isfinite(robot.effort_limit).all():
         return robot.effort_limit

@@ -119,13 +119,7 @@ def fit_residual(task: FitTask) -> Fitted:
         return ResidualNetwork(nominal, prismatic, seed=seed, **options)
 
     found = fit_network(
-        make,
-        task.data,
-        task.held_out,
-        seed=task.seed,
-        friction=task.friction,
-        progress=task.progress,
-        **settings,
+        make, task.data, task.held_out, seed=task.seed, friction=task.friction, progress=task.progress, **settings
     )
 
     def assemble(report: FitReport | None) -> DynamicsProvider:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import positive
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
@@ -48,7 +49,7 @@ class IdentificationReport:
     """Number of samples."""
     seconds: float
     """What it took [s]."""
-    noise: Float[np.ndarray, " n"]
+    noise: JointArray
     """Estimated standard deviation of the torque residual per joint [N·m]: the weights are its inverse."""
     train_nmse: float
     """Mean squared residual over torque variance, its mean over the joints whose torque varies."""
@@ -171,7 +172,7 @@ def _base_directions(
     return directions[values > _NEGLIGIBLE * values[0]].T
 
 
-def _noise(equations: np.ndarray, base: int, samples: int) -> Float[np.ndarray, " n"]:
+def _noise(equations: np.ndarray, base: int, samples: int) -> JointArray:
     """Standard deviation of the residual per joint [N·m], from the least squares that it weights in turn.
 
     Raises ArgumentError for fewer than two equations per unknown, whose residual says nothing.

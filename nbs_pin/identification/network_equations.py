@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import nn
 from torch.func import functional_call, jacrev, vmap
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
@@ -161,7 +162,7 @@ def deviation(x: Float[torch.Tensor, "m n"], given: torch.Tensor | None = None) 
     return torch.where(spread > _FLAT * largest, spread, largest)
 
 
-def deviation_of(x: Float[np.ndarray, "m n"]) -> Float[np.ndarray, " n"]:
+def deviation_of(x: Float[np.ndarray, "m n"]) -> JointArray:
     """`deviation` of an array."""
     return deviation(torch.from_numpy(x)).numpy()
 

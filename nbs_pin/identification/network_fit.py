@@ -222,12 +222,7 @@ def _adam_then_lbfgs(search: _Search, adam: Iterator[Theta]) -> Iterator[Theta]:
         yield theta
     moving = theta.clone().requires_grad_(True)
     optimiser = torch.optim.LBFGS(
-        [moving],
-        max_iter=1,
-        history_size=50,
-        line_search_fn="strong_wolfe",
-        tolerance_grad=0.0,
-        tolerance_change=1e-16,
+        [moving], max_iter=1, history_size=50, line_search_fn="strong_wolfe", tolerance_grad=0.0, tolerance_change=1e-16
     )
 
     def closure() -> torch.Tensor:

@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, PARAMETERS_OF_COORDINATES, coordinates
 from nbs_pin.identification.consistent_fit import in_factors
@@ -149,7 +150,7 @@ def expectation(
     return Expected(np.sqrt(scale) * factors, (_FRICTION_SHARE * size / np.maximum(speed, least)).ravel())
 
 
-def torque_size(triangles: Float[np.ndarray, "n rows columns"], samples: int) -> Float[np.ndarray, " n"]:
+def torque_size(triangles: Float[np.ndarray, "n rows columns"], samples: int) -> JointArray:
     """Root mean square torque per joint [N·m], those that hardly have one raised to a millionth of the largest."""
     size = np.linalg.norm(triangles[:, :, -1], axis=1) / np.sqrt(samples)
     return np.maximum(size, 1e-6 * size.max())

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.dynamics.chain import Tree
 from nbs_pin.dynamics.pseudo_inertia import BASIS, symmetric
 from nbs_pin.identification.levenberg_marquardt import Normal
@@ -32,7 +33,7 @@ class Measured:
     v: Float[np.ndarray, "rows n"]
     a: Float[np.ndarray, "rows n"]
     tau: Float[np.ndarray, "rows n"]
-    scale: Float[np.ndarray, " n"]
+    scale: JointArray
     """Torque that counts as one [N·m]."""
     kinds: Float[np.ndarray, "kinds rows n"]
     """What the torque of a joint is linear in beside the bodies (`regressor.Scalars`): v, its sign, v̇."""

@@ -7,6 +7,7 @@ rotors' armature.
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Label
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.rounding import down, largest_eigenvalue, least_eigenvalue, up
@@ -132,7 +133,7 @@ def determinant_bound(arm: Arm) -> float:
     return down(float(np.exp(max(plain, scaled))))
 
 
-def _body_traces(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _body_traces(tree: RigidTree, weights: JointArray) -> JointArray:
     """At least Σ_i w_i M_ii over all poses, by body: its mass on its greatest lever arms, its inertia, its rotor."""
     if len(tree.endless) or not tree.physical:
         return np.full(tree.nv, np.inf)
@@ -157,7 +158,7 @@ def _apart(tree: RigidTree, i: int) -> float:
     return float(np.linalg.norm(position + rotation @ tree.centre[i] - tree.centre[tree.parents[i]], axis=1).max())
 
 
-def _diagonal_below(weight: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
+def _diagonal_below(weight: Float[np.ndarray, "n n"]) -> JointArray:
     """A diagonal below W: W's own if it is diagonal, else that times λ_min of W scaled to a unit diagonal."""
     diagonal = np.diag(weight)
     if np.array_equal(weight, np.diag(diagonal)):

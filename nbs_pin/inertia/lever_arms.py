@@ -12,14 +12,15 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray, Scalars
 from nbs_pin.dynamics.rigid_tree import RigidTree
 
 CELLS, CORNERS = 48, 48
 """Cells of a table from the axis outward, and corners of the polygon around a circle."""
-Levers: TypeAlias = Callable[[Float[np.ndarray, "*batch 3"]], Float[np.ndarray, "*batch"]]
+Levers: TypeAlias = Callable[[Float[np.ndarray, "*batch 3"]], Scalars]
 
 
-def lever_arms(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> list[Levers]:
+def lever_arms(tree: RigidTree, weights: JointArray) -> list[Levers]:
     """For each body a function of points in its frame [m] that is at least V_i, all poses considered.
 
     weights: w ≥ 0 of each joint. No joint may be `endless`.
@@ -36,12 +37,12 @@ def lever_arms(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> list[Levers
     return levers
 
 
-def _at_rest(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+def _at_rest(points: Float[np.ndarray, "*batch 3"]) -> Scalars:
     """V of the base."""
     return np.zeros(points.shape[:-1])
 
 
-def _radii(tree: RigidTree) -> Float[np.ndarray, " n"]:
+def _radii(tree: RigidTree) -> JointArray:
     """How far from frame i's origin a table is read [m]: every centre of mass behind joint i, and the corners of the
     cells and polygons of the tables behind it.
     """
@@ -65,7 +66,7 @@ def _sliding(tree: RigidTree, i: int, weight: float, before: Levers) -> Levers:
     stops = np.array(tree.stops(i))
     rotation, ends = tree.rotation[i], tree.placed(i, stops)[1]
 
-    def value(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+    def value(points: Float[np.ndarray, "*batch 3"]) -> Scalars:
         return np.asarray(weight + np.max([before(points @ rotation.T + end) for end in ends], axis=0))
 
     return value
@@ -84,7 +85,7 @@ def _turning(tree: RigidTree, i: int, weight: float, before: Levers, radius: flo
     reached = before(points @ tree.rotation[i].T + tree.position[i]).max(-1)
     table = weight * outward[:, None] ** 2 + reached
 
-    def value(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+    def value(points: Float[np.ndarray, "*batch 3"]) -> Scalars:
         rho, height = np.hypot(points[..., 0], points[..., 1]) / step, points[..., 2] / step + CELLS
         a = np.clip(rho.astype(int), 0, CELLS - 1)
         b = np.clip(height.astype(int), 0, 2 * CELLS - 1)

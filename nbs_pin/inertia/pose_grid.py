@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray, Matrices
 from nbs_pin.base.rounding import largest_eigenvalues
 from nbs_pin.dynamics.rigid_tree import RigidTree, cross
 from nbs_pin.inertia.lever_arms import lever_arms
@@ -105,7 +106,7 @@ def _greatest_sample(
     return greatest
 
 
-def _greater(greatest: float, matrices: Float[np.ndarray, "*batch n n"]) -> float:
+def _greater(greatest: float, matrices: Matrices) -> float:
     """The greatest eigenvalue so far; matrices whose Frobenius norm is less need no spectrum."""
     candidates = matrices[np.linalg.norm(matrices, axis=(-2, -1)) > greatest]
     return max(greatest, float(np.max(largest_eigenvalues(candidates), initial=0.0)))
@@ -173,7 +174,7 @@ def _bodies(tree: RigidTree) -> list[Float[np.ndarray, "m m"]]:
     return energies
 
 
-def _scales(tree: RigidTree, weights: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n m"]:
+def _scales(tree: RigidTree, weights: JointArray) -> Float[np.ndarray, "n m"]:
     """Per joint, 1 ÷ how large the parent's twist and the rates can be when Σ q̇²/w ≤ 1: where a constant energy costs
     alike. Any positive numbers give a true bound.
     """

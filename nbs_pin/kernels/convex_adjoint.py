@@ -42,13 +42,7 @@ def tape_sizes(layout: np.ndarray) -> tuple[int, int]:
 
 @kernel
 def differentiate(
-    code: int,
-    parameter: float,
-    a: np.ndarray,
-    y: np.ndarray,
-    slope: np.ndarray,
-    bend: np.ndarray,
-    third: np.ndarray,
+    code: int, parameter: float, a: np.ndarray, y: np.ndarray, slope: np.ndarray, bend: np.ndarray, third: np.ndarray
 ) -> None:
     """σ(a) → y and its first three derivatives → slope, bend, third."""
     if code == SMOOTHED_RELU:

@@ -18,12 +18,7 @@ from nbs_pin.kernels.law_adjoints import adjoint_workspace, law_adjoint, pid_adj
 from nbs_pin.kernels.laws import law_row, pid
 from nbs_pin.kernels.layout import PID, Packed
 from nbs_pin.kernels.tree_laws import tree_law
-from nbs_pin.kernels.trees import (
-    tree_acceleration,
-    tree_acceleration_adjoint,
-    tree_torque_adjoint,
-    tree_workspace,
-)
+from nbs_pin.kernels.trees import tree_acceleration, tree_acceleration_adjoint, tree_torque_adjoint, tree_workspace
 
 EULER, SEMI_IMPLICIT_EULER, RK4 = 0, 1, 2
 """Integrators, by the equations of `plants/integrators.py`."""

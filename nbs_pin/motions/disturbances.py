@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
+from nbs_pin.base.arrays import Vectors
 from nbs_pin.base.checks import PerJoint, per_joint, positive
 from nbs_pin.base.exceptions import ArgumentError
 
@@ -27,9 +27,7 @@ class ConstantTorque:
     def __post_init__(self) -> None:
         per_joint(self, "torque")
 
-    def __call__(
-        self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
-    ) -> Float[np.ndarray, "*batch n"]:
+    def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """Torque at time t [s] in the state (q, v) [N·m]."""
         return _on_joints(self.torque, q)
 
@@ -45,9 +43,7 @@ class SinusoidalTorque:
     def __post_init__(self) -> None:
         per_joint(self, "amplitude", "frequency", "phase")
 
-    def __call__(
-        self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
-    ) -> Float[np.ndarray, "*batch n"]:
+    def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """Torque at time t [s] in the state (q, v) [N·m]."""
         return _on_joints(self.amplitude * np.sin(self.frequency * t + self.phase), q)
 
@@ -63,9 +59,7 @@ class SquareWave:
     def __post_init__(self) -> None:
         per_joint(self, "amplitude", "frequency", "phase")
 
-    def __call__(
-        self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
-    ) -> Float[np.ndarray, "*batch n"]:
+    def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """Torque at time t [s] in the state (q, v) [N·m]."""
         return _on_joints(self.amplitude * np.where(np.sin(self.frequency * t + self.phase) >= 0.0, 1.0, -1.0), q)
 
@@ -89,9 +83,7 @@ class TorqueNoise:
         if self.seed < 0:
             raise ArgumentError(f"seed is {self.seed}, expected an integer ≥ 0; give another seed.")
 
-    def __call__(
-        self, t: float, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]
-    ) -> Float[np.ndarray, "*batch n"]:
+    def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """Torque at time t [s] in the state (q, v) [N·m]."""
         interval = math.floor(t / self.period + 1e-9)  # t = k·period may round to just below its interval
         rng = np.random.default_rng((self.seed, interval))

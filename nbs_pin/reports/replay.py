@@ -35,12 +35,7 @@ MAX_FRAMES = 12_000
 
 
 def replay(
-    run: Run,
-    path: str | Path,
-    robot: Robot | None = None,
-    *,
-    start: int = 0,
-    package_dirs: Iterable[str | Path] = (),
+    run: Run, path: str | Path, robot: Robot | None = None, *, start: int = 0, package_dirs: Iterable[str | Path] = ()
 ) -> Path:
     """Writes a page that plays `run` in any browser without a network; returns its path.
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import weakest
 from nbs_pin.base.pages import Section, markdown_table, plain, short, write_csv
 from nbs_pin.base.progress import tracked
@@ -102,8 +103,8 @@ def on_arm(name: str, scale: Scale, seed: int = 0) -> Row:
 
 def _climbed(
     q: Float[np.ndarray, "count n"],
-    low: Float[np.ndarray, " n"],
-    high: Float[np.ndarray, " n"],
+    low: JointArray,
+    high: JointArray,
     height: Callable[[np.ndarray], np.ndarray],
     scale: Scale,
 ) -> Float[np.ndarray, "count n"]:

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array
+from nbs_pin.base.arrays import Matrices, Scalars, Vectors
 from nbs_pin.base.pages import Section, markdown_table, plain, short, write_csv
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Run
@@ -50,29 +49,23 @@ class Weightless(DynamicsProvider):
         """Number of joints."""
         return self.model.nv
 
-    def mass_matrix(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M(q) [kg·m²] of the model."""
         return self.model.mass_matrix(q)
 
-    def coriolis_matrix(self, q: Float[Array, "*batch n"], v: Float[Array, "*batch n"]) -> Float[Array, "*batch n n"]:
+    def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
         """C(q, v) [N·m·s] of the model."""
         return self.model.coriolis_matrix(q, v)
 
-    def gravity(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def gravity(self, q: Vectors) -> Vectors:
         """0 [N·m]."""
         return 0.0 * q
 
-    def potential_energy(self, q: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    def potential_energy(self, q: Vectors) -> Scalars:
         """0 [J]."""
         return 0.0 * q[..., 0]
 
-    def reference_torque(
-        self,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        v_r: Float[Array, "*batch n"],
-        a_r: Float[Array, "*batch n"],
-    ) -> Float[Array, "*batch n"]:
+    def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
         """M a_r + C v_r [N·m]: the model's torque less the one that holds it still, by its fastest route to both."""
         rest = 0.0 * q
         return self.model.reference_torque(q, v, v_r, a_r) - self.model.reference_torque(q, rest, rest, rest)

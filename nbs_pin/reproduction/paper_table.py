@@ -151,10 +151,7 @@ def package_rows(seeds: Sequence[int], epochs: int, duration: float, progress: b
     """What this package makes of rows 2 to 4 with the paper's networks, and its runs after training."""
     dynamics = AnalyticDynamics()
     makers: dict[str, tuple[str, Callable[[int], Run]]] = {
-        "NBS without training": (
-            "this package",
-            lambda seed: follow(paper_controller(dynamics, seed=seed), duration),
-        ),
+        "NBS without training": ("this package", lambda seed: follow(paper_controller(dynamics, seed=seed), duration)),
         "NBS after training": (
             "this package, exact gradient",
             lambda seed: follow(trained(paper_controller(dynamics, seed=seed), epochs), duration),

@@ -162,13 +162,7 @@ def _judged(model: Any, truth: DynamicsProvider, data: Dataset, actuated: Datase
     free = model.forward_dynamics(data.q, data.v, np.zeros_like(data.q))
     some = best_scale(actuated.tau, inverse_dynamics(model, actuated.q, actuated.v, actuated.a)).factor
     scale = best_scale(true, modelled)
-    return (
-        _relative(free, data.a),
-        _relative(modelled, true),
-        *scale,
-        some,
-        _relative(some * modelled, true),
-    )
+    return (_relative(free, data.a), _relative(modelled, true), *scale, some, _relative(some * modelled, true))
 
 
 def _relative(found: np.ndarray, true: np.ndarray) -> float:

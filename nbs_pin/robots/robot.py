@@ -12,7 +12,7 @@ import pinocchio as pin
 from array_api_compat import device
 from jaxtyping import Bool, Float, Int
 
-from nbs_pin.base.arrays import Array, array_namespace
+from nbs_pin.base.arrays import JointArray, Vectors, array_namespace
 from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.exceptions import ArgumentError, RobotError
 from nbs_pin.base.storable import storable
@@ -63,33 +63,33 @@ class Robot:
         return tuple(self.model.names[1:])
 
     @property
-    def effort_limit(self) -> Float[np.ndarray, " n"]:
+    def effort_limit(self) -> JointArray:
         """Largest |τ| [N·m, N for a prismatic joint], inf where none is stated."""
         return np.array([joint.effort for joint in self.joints])
 
     @property
-    def velocity_limit(self) -> Float[np.ndarray, " n"]:
+    def velocity_limit(self) -> JointArray:
         """Largest |v| [rad/s, m/s], inf where none is stated."""
         return np.array([joint.velocity for joint in self.joints])
 
     @property
-    def lower(self) -> Float[np.ndarray, " n"]:
+    def lower(self) -> JointArray:
         """Lower position limit [rad, m], −inf on continuous joints."""
         return np.array([joint.lower for joint in self.joints])
 
     @property
-    def upper(self) -> Float[np.ndarray, " n"]:
+    def upper(self) -> JointArray:
         """Upper position limit [rad, m], inf on continuous joints."""
         return np.array([joint.upper for joint in self.joints])
 
     @property
-    def sampling_range(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    def sampling_range(self) -> tuple[JointArray, JointArray]:
         """(lower, upper) to draw configurations from [rad, m]: the position limits, ∓π where there is none."""
         lower, upper = self.lower, self.upper
         return np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
 
     @property
-    def one_turn_range(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    def one_turn_range(self) -> tuple[JointArray, JointArray]:
         """(lower, upper) of all configurations worth telling apart [rad, m]: `sampling_range`, of a joint that turns
         one turn about its middle at most; a joint that slides keeps its limits, however long.
         """
@@ -98,12 +98,12 @@ class Robot:
         return np.where(longer, middle - np.pi, lower), np.where(longer, middle + np.pi, upper)
 
     @property
-    def damping(self) -> Float[np.ndarray, " n"]:
+    def damping(self) -> JointArray:
         """Viscous joint friction of the URDF [N·m·s/rad]."""
         return np.array([joint.damping for joint in self.joints])
 
     @property
-    def friction(self) -> Float[np.ndarray, " n"]:
+    def friction(self) -> JointArray:
         """Coulomb joint friction of the URDF [N·m]."""
         return np.array([joint.friction for joint in self.joints])
 
@@ -127,7 +127,7 @@ class Robot:
         """Fingerprint of links, joints, stated limits and gravity: equal for equal dynamics, however they are drawn."""
         return hashlib.sha256(self.urdf.without_geometry() + self.gravity_vector.tobytes()).hexdigest()
 
-    def difference(self, q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    def difference(self, q: Vectors, q_ref: Vectors) -> Vectors:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
         return configuration_difference(q, q_ref, self.continuous)
 
@@ -147,9 +147,7 @@ class Robot:
         return replace(self, urdf=urdf, model=_with_limits(self.model.copy(), urdf))
 
 
-def configuration_difference(
-    q: Float[Array, "*batch n"], q_ref: Float[Array, "*batch n"], continuous: Bool[np.ndarray, " n"] | None
-) -> Float[Array, "*batch n"]:
+def configuration_difference(q: Vectors, q_ref: Vectors, continuous: Bool[np.ndarray, " n"] | None) -> Vectors:
     """q ⊖ q_ref [rad]: plain subtraction, wrapped to (−π, π] where `continuous` is true (None: nowhere).
 
     The wrap makes every law that uses it discontinuous at |z1_i| = π (docs/theory.md §1).

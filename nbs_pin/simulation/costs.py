@@ -7,21 +7,17 @@ from typing import Literal, TypeAlias, get_args
 import torch
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import Scalars, Vectors
 from nbs_pin.base.checks import positive
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.robots.robot import Robot
 
-StageCost: TypeAlias = Callable[
-    [Float[torch.Tensor, "*batch n"], Float[torch.Tensor, "*batch n"], Float[torch.Tensor, "*batch n"]],
-    Float[torch.Tensor, "*batch"],
-]
+StageCost: TypeAlias = Callable[[Vectors, Vectors, Vectors], Scalars]
 """l(z1, v − v_d, τ) [1/s]: error [rad] and its rate [rad/s] at the end of a control period, and the torque that the
 law asked for during it [N·m], before any limit. Differentiable; anything callable will do."""
 
 
-def squared_error(
-    z1: Float[torch.Tensor, "*batch n"], dz1: Float[torch.Tensor, "*batch n"], tau: Float[torch.Tensor, "*batch n"]
-) -> Float[torch.Tensor, "*batch"]:
+def squared_error(z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
     """z1ᵀz1, the paper's: torque is free, and training buys its last tenth of a second with it (docs/theory.md §7)."""
     return (z1 * z1).sum(-1)
 
@@ -55,12 +51,7 @@ class TorqueAware:
         """With the arm's effort limits."""
         return cls(torch.as_tensor(robot.effort_limit))
 
-    def __call__(
-        self,
-        z1: Float[torch.Tensor, "*batch n"],
-        dz1: Float[torch.Tensor, "*batch n"],
-        tau: Float[torch.Tensor, "*batch n"],
-    ) -> Float[torch.Tensor, "*batch"]:
+    def __call__(self, z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
         """The cost per second."""
         share = tau / self.limit.to(tau.device)
         beyond = torch.clamp(share.abs() - 1.0, min=0.0)
@@ -84,12 +75,7 @@ class TimeOutside:
         if self.pull != 0.0:
             positive("TimeOutside's pull", self.pull, "1/rad²")
 
-    def __call__(
-        self,
-        z1: Float[torch.Tensor, "*batch n"],
-        dz1: Float[torch.Tensor, "*batch n"],
-        tau: Float[torch.Tensor, "*batch n"],
-    ) -> Float[torch.Tensor, "*batch"]:
+    def __call__(self, z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
         """The cost per second."""
         squared = (z1 * z1).sum(-1)
         return squared / (squared + self.threshold) + self.pull * squared

@@ -1,9 +1,8 @@
 """A dynamics provider integrated in time is a plant."""
 
 import numpy as np
-from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, is_torch_array
+from nbs_pin.base.arrays import Array, Vectors, is_torch_array
 from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
@@ -60,13 +59,7 @@ class DynamicsPlant(Plant):
         """The arm of the provider, or None."""
         return self.dynamics.robot
 
-    def step(
-        self,
-        q: Float[Array, "*batch n"],
-        v: Float[Array, "*batch n"],
-        tau: Float[Array, "*batch n"],
-        duration: float,
-    ) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]:
+    def step(self, q: Vectors, v: Vectors, tau: Vectors, duration: float) -> tuple[Vectors, Vectors]:
         """State (q, v) after one integration step of `duration` [s] with τ [N·m] held (zero-order hold).
 
         Numpy in, numpy out; torch in, differentiable torch out.

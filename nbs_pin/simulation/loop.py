@@ -119,12 +119,7 @@ class Loop:
             robot="" if robot is None else robot.source,
             robot_sha256="" if robot is None else robot.sha256,
             robot_options={} if robot is None else robot.options,
-            info={
-                "controller": controller,
-                "plant": repr(self.plant),
-                "plant_step": self.step,
-                "lookahead": self.lead,
-            },
+            info={"controller": controller, "plant": repr(self.plant), "plant_step": self.step, "lookahead": self.lead},
         )
         run.q[0], run.v[0] = q0, v0
         return run

@@ -10,11 +10,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import Scalars, Vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.robots.robot import configuration_difference
 
-Numbers: TypeAlias = Float[np.ndarray, "*batch"] | np.float64
+Numbers: TypeAlias = Scalars | np.float64
 """One number per start: an array for a batch, a number for a single start."""
 PAPER_THRESHOLD = 0.01
 """‖z1‖² below which the paper calls an arm converged [rad²]."""
@@ -58,7 +59,7 @@ def convergence_time(run: Run, threshold: float = PAPER_THRESHOLD, shift: int = 
     return np.append(run.t[:rows], np.inf)[last_outside + 1]
 
 
-def rms_error(run: Run, after: float = 0.0) -> Float[np.ndarray, "*batch n"]:
+def rms_error(run: Run, after: float = 0.0) -> Vectors:
     """Root mean square of z1 per joint from the time `after` [s] on [rad]."""
     return np.sqrt(np.mean(error(run)[_from(run, after)] ** 2, axis=0))
 
@@ -68,7 +69,7 @@ def peak_torque(run: Run) -> Numbers:
     return np.max(joint_peak_torque(run), axis=-1)
 
 
-def joint_peak_torque(run: Run) -> Float[np.ndarray, "*batch n"]:
+def joint_peak_torque(run: Run) -> Vectors:
     """Largest |τ_i| applied, over time, per joint [N·m]."""
     return np.max(np.abs(run.tau[:-1]), axis=0)
 

@@ -6,8 +6,8 @@ from typing import Any, Literal, TypeAlias
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
+from nbs_pin.base.arrays import Matrices, Vectors
 from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
@@ -48,10 +48,7 @@ class MujocoPlant(Plant):
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        integrator: MujocoIntegrator | None = None,
-        joint_friction: JointFrictionChoice = "drop",
+        self, robot: Robot, integrator: MujocoIntegrator | None = None, joint_friction: JointFrictionChoice = "drop"
     ) -> None:
         integrator = integrator or ("rk4" if joint_friction == "drop" else "implicitfast")
         if integrator not in _INTEGRATORS:
@@ -99,13 +96,7 @@ class MujocoPlant(Plant):
         """The arm."""
         return self._robot
 
-    def step(
-        self,
-        q: Float[np.ndarray, "*batch n"],
-        v: Float[np.ndarray, "*batch n"],
-        tau: Float[np.ndarray, "*batch n"],
-        duration: float,
-    ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"]]:
+    def step(self, q: Vectors, v: Vectors, tau: Vectors, duration: float) -> tuple[Vectors, Vectors]:
         """State (q, v) after one MuJoCo step of `duration` [s] with τ [N·m] held.
 
         Raises SimulationDiverged when an input or the result is not finite or MuJoCo counts a warning.
@@ -116,20 +107,15 @@ class MujocoPlant(Plant):
         result = _stack(lambda *row: np.array(self._step_row(*row)), q, v, tau)
         return result[..., 0, :], result[..., 1, :]
 
-    def acceleration(
-        self,
-        q: Float[np.ndarray, "*batch n"],
-        v: Float[np.ndarray, "*batch n"],
-        tau: Float[np.ndarray, "*batch n"],
-    ) -> Float[np.ndarray, "*batch n"]:
+    def acceleration(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ [rad/s²] that MuJoCo's forward dynamics gives the torque τ [N·m]."""
         return _stack(lambda *row: self._forward(*row).qacc[self._at_v].copy(), q, v, tau)
 
-    def bias(self, q: Float[np.ndarray, "*batch n"], v: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n"]:
+    def bias(self, q: Vectors, v: Vectors) -> Vectors:
         """C(q, v) v + G(q) [N·m], without joint friction."""
         return _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v].copy(), q, v, np.zeros_like(v))
 
-    def mass_matrix(self, q: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n n"]:
+    def mass_matrix(self, q: Vectors) -> Matrices:
         """M(q) [kg·m²]."""
         return _stack(self._mass_matrix_row, q, np.zeros_like(q), np.zeros_like(q))
 

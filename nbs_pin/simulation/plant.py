@@ -2,9 +2,7 @@
 
 from abc import ABC, abstractmethod
 
-import numpy as np
-from jaxtyping import Float
-
+from nbs_pin.base.arrays import Vectors
 from nbs_pin.robots.robot import Robot
 
 
@@ -22,13 +20,7 @@ class Plant(ABC):
         """The arm this plant simulates, or None for one without a URDF."""
 
     @abstractmethod
-    def step(
-        self,
-        q: Float[np.ndarray, "*batch n"],
-        v: Float[np.ndarray, "*batch n"],
-        tau: Float[np.ndarray, "*batch n"],
-        duration: float,
-    ) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"]]:
+    def step(self, q: Vectors, v: Vectors, tau: Vectors, duration: float) -> tuple[Vectors, Vectors]:
         """State (q, v) after one integration step of `duration` [s] with the torque τ [N·m] held constant.
 
         Raises SimulationDiverged when the result is not finite or the engine reports a warning.
