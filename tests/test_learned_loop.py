@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.pages import Section, page
 from nbs_pin.cli import main
 from nbs_pin.controllers.neural_backstepping import paper_controller
 from nbs_pin.dynamics.cholesky import CholeskyNetwork
@@ -18,6 +17,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.fit import fit
 from nbs_pin.motions.references import paper_reference
+from nbs_pin.reports.markdown import Section, page
 from nbs_pin.reproduction import figure5, learned_loop, passive_data
 from nbs_pin.reproduction.figure5 import Weightless
 from nbs_pin.robots.robot import load_robot

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from nbs_pin.accuracy.compare import compare
-from nbs_pin.base.pages import Section
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.identification.collect import collect
+from nbs_pin.reports.markdown import Section
 from nbs_pin.reproduction import model_study
 from nbs_pin.reproduction.inverse_mlp import fit_mlp
 from nbs_pin.reproduction.model_noise import Noisy, _ranking, _ratios, friction_of, noise_section

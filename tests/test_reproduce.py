@@ -11,11 +11,12 @@ import pytest
 import torch
 
 from nbs_pin.base.arrays import matvec
-from nbs_pin.base.pages import Section, page, plain, short
+from nbs_pin.base.plain import plain
 from nbs_pin.cli import main
 from nbs_pin.commands import reproduce
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.motions.references import paper_reference
+from nbs_pin.reports.markdown import Section, page, short
 from nbs_pin.reproduction import paper
 from nbs_pin.reproduction.authors import PERIOD, AuthorsLaw, follow_authors, train_authors
 from nbs_pin.reproduction.paper_alpha import LARGEST_INERTIA, corrected_bound, regulariser, swept_controller

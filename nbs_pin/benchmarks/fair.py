@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nbs_pin.base.pages import Section, markdown_table, plain, write_csv
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import DesiredMotion, Sinusoid
+from nbs_pin.reports.markdown import Section, markdown_table
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.simulation.costs import TimeOutside
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
-from nbs_pin.base.pages import plain
+from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design

@@ -11,8 +11,9 @@ from nbs_pin.accuracy.compare import ModelErrors, compare
 from nbs_pin.accuracy.error_maps import ErrorMap, error_map, telling_joints
 from nbs_pin.accuracy.relative_errors import check_joints
 from nbs_pin.base.checks import PerJoint
+from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
-from nbs_pin.base.pages import plain, write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
 from nbs_pin.cli.compare import Compare

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.pages import plain
+from nbs_pin.base.plain import plain
 from nbs_pin.cli.learn import Learn
 from nbs_pin.commands.results import SUMMARY, Results, sha256_of, table
 from nbs_pin.dynamics.friction import JointFriction

@@ -8,10 +8,10 @@ from typing import Any
 from rich.console import Console
 
 from nbs_pin.base.files import write_whole
-from nbs_pin.base.pages import page
 from nbs_pin.benchmarks.fair import fair_part
 from nbs_pin.cli.reproduce import Reproduce
 from nbs_pin.commands.results import SUMMARY, Results
+from nbs_pin.reports.markdown import page
 from nbs_pin.reproduction.certificate_study import reproduce_certificates
 from nbs_pin.reproduction.learned_loop import reproduce_learned
 from nbs_pin.reproduction.model_study import reproduce_models

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.text import Text
 
-from nbs_pin.base.pages import plain
+from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import plain_numbers

@@ -1,6 +1,5 @@
 """The columns of a log, from CSV or NPZ, in the order of an arm's joints."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -8,11 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from nbs_pin.base.csv_files import QUANTITIES, joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import FileFormatError
-from nbs_pin.base.npz import LARGEST
 
-QUANTITIES = ("tau", "q", "v", "a")
-"""What a log has per joint; v and a may be left out."""
 _NEEDED = "log t, q and tau (and v and a if known)"
 
 
@@ -33,16 +30,11 @@ def columns_of_csv(path: Path, joint_names: Sequence[str] | None) -> Columns:
 
     joint_names: in the order wanted; None takes the file's. Raises FileFormatError naming column or row, and remedy.
     """
-    header, table = _table(path)
-    columns: dict[str, dict[str, int]] = {kind: {} for kind in QUANTITIES}
-    for k, name in enumerate(header):
-        kind = next((kind for kind in QUANTITIES if _joint(name, kind)), None)
-        if kind is not None:
-            columns[kind][_joint(name, kind)] = k
+    header, table = read_csv(path)
+    columns = {kind: joint_columns(header, kind) for kind in QUANTITIES}
     joints = list(columns["q"]) or ["1"]
     needed = [kind for kind in QUANTITIES if columns[kind] or kind in ("q", "tau")]
     absent = [f"{kind}_{joint}" for kind in needed for joint in joints if joint not in columns[kind]]
-    absent += [] if "t" in header else ["t"]
     if absent:
         raise FileFormatError(f"{path}: no column '{absent[0]}' among {', '.join(header)}; {_NEEDED}, for each joint.")
     arrays = {kind: table[:, [columns[kind][joint] for joint in joints]] for kind in needed}
@@ -75,7 +67,7 @@ def columns_of_arrays(path: Path, stored: dict[str, np.ndarray], joint_names: Se
 
 def _columns(path: Path, arrays: dict[str, np.ndarray], found: list[str], joint_names: Sequence[str] | None) -> Columns:
     """The columns with their joints in order and trajectories numbered."""
-    order = _order(path, found, joint_names)
+    order = joint_order(path, found, joint_names)
     numbers = arrays.get("trajectory", np.zeros(len(arrays["t"])))
     if not np.array_equal(numbers, np.round(numbers)):
         raise FileFormatError(f"{path}: 'trajectory' must hold a whole number in every row; number them 0, 1, 2, ….")
@@ -88,47 +80,3 @@ def _columns(path: Path, arrays: dict[str, np.ndarray], found: list[str], joint_
         a=given.get("a"),
         trajectory=numbers.astype(np.int64),
     )
-
-
-def _order(path: Path, found: list[str], joint_names: Sequence[str] | None) -> list[int]:
-    """Which column holds each joint; numbers 1 … n stand for the arm's own order."""
-    numbers = [str(i + 1) for i in range(len(found))]
-    wanted = found if joint_names is None else list(joint_names)
-    if sorted(found) == sorted(numbers) and len(wanted) == len(found):
-        wanted = numbers
-    if sorted(found) != sorted(wanted):
-        raise FileFormatError(
-            f"{path}: joints {', '.join(found)}, expected {', '.join(wanted)}; rename the columns, or number them."
-        )
-    return [found.index(name) for name in wanted]
-
-
-def _joint(name: str, kind: str) -> str:
-    """The joint that a column `KIND_NAME` or `KIND1` is of, empty for another column."""
-    rest = name.removeprefix(kind)
-    return "" if rest == name else rest[1:] if rest.startswith("_") else rest if rest.isdecimal() else ""
-
-
-def _table(path: Path) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
-    """Header and numbers of a CSV file."""
-    if path.stat().st_size > LARGEST // 8:
-        raise FileFormatError(f"{path}: more than {LARGEST // 8} bytes, too large for a CSV; store it as npz.")
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [line for line in csv.reader(file, strict=True) if line]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(f"{path}: not a UTF-8 CSV file ({error}); export it again.") from error
-    header = [name.strip() for name in lines[0]] if lines else []
-    if len(lines) < 2 or len(set(header)) != len(header):
-        raise FileFormatError(f"{path}: expected a header with each name once and rows of numbers; export it so.")
-    table = np.empty((len(lines) - 1, len(header)))
-    for row, cells in enumerate(lines[1:]):
-        if len(cells) != len(header):
-            raise FileFormatError(
-                f"{path}: row {row + 1} has {len(cells)} values, expected {len(header)}; complete it."
-            )
-        try:
-            table[row] = [float(cell) for cell in cells]
-        except ValueError as error:
-            raise FileFormatError(f"{path}: row {row + 1}: {error}; correct it.") from error
-    return header, table

@@ -1,6 +1,5 @@
 """Desired motions from samples and from files: a C² spline with its exact derivatives, held at both ends."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,8 +10,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from nbs_pin.base.checks import floats
+from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
-from nbs_pin.base.npz import LARGEST, read_npz, require
+from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
 
 FEWEST_SAMPLES = 4
@@ -66,7 +66,8 @@ class Sampled:
 def load_reference(path: str | Path, joint_names: Sequence[str]) -> Sampled:
     """The motion in a CSV or NPZ file for the joints named, in their order.
 
-    CSV: a header `t` and the joint names in any order (or q1 … qn in the arm's order), then numbers in [s] and [rad].
+    CSV: a header `t` and the joint names in any order (or q1 … qn in the arm's order), then numbers in [s] and [rad];
+    or the header of a log, `q_NAME` and whatever else it holds (`load_log`).
     NPZ: arrays `t` (rows,) and `q` (rows, n), with `joint_names` (n,) if their order is to be checked; a recorded
     run is such a file. A velocity `v` (rows, n) beside them is only compared with dq/dt.
     A motion whose velocity jumps is refused: between samples, or at the ends, beyond which it is held.
@@ -77,7 +78,7 @@ def load_reference(path: str | Path, joint_names: Sequence[str]) -> Sampled:
     if read is None:
         raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv or .npz; convert it.")
     t, q, v, columns = read(path)
-    order, names = _order(path, columns, list(joint_names)), list(joint_names)
+    order, names = joint_order(path, columns, joint_names), list(joint_names)
     q = q[:, order]
     fault = _fault(t, q, names)
     if fault:
@@ -142,23 +143,6 @@ def _numbered(n: int) -> list[str]:
     return [f"q{i + 1}" for i in range(n)]
 
 
-def _order(path: Path, columns: list[str], joint_names: list[str]) -> list[int]:
-    """Which column holds each joint."""
-    if len(columns) != len(joint_names):
-        raise FileFormatError(
-            f"{path}: {len(columns)} joints ({', '.join(columns)}), expected {len(joint_names)} "
-            f"({', '.join(joint_names)}); give one column per joint."
-        )
-    if columns == _numbered(len(columns)):
-        return list(range(len(columns)))
-    if sorted(columns) != sorted(joint_names):
-        unknown = [name for name in columns if name not in joint_names] or columns
-        raise FileFormatError(
-            f"{path}: no joint is named {', '.join(unknown)}, expected {', '.join(joint_names)}; rename the columns."
-        )
-    return [columns.index(name) for name in joint_names]
-
-
 _Columns: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str]]
 """t (rows,), q (rows, n), v (rows, n) if it is stated, and the names of the joints."""
 
@@ -171,7 +155,7 @@ def _read_npz(path: Path) -> _Columns:
     if "v" in data and data["v"].shape != data["q"].shape:
         raise FileFormatError(f"{path}: 'v' has shape {data['v'].shape}, q {data['q'].shape}; match them.")
     if "joint_names" not in data:
-        return data["t"], data["q"], data.get("v"), _numbered(data["q"].shape[1])
+        return data["t"], data["q"], data.get("v"), [str(i + 1) for i in range(data["q"].shape[1])]
     require(data, path, {"joint_names": "U"})
     names = [str(name) for name in data["joint_names"].ravel()]
     if len(names) != data["q"].shape[1]:
@@ -180,31 +164,11 @@ def _read_npz(path: Path) -> _Columns:
 
 
 def _read_csv(path: Path) -> _Columns:
-    if path.stat().st_size > LARGEST // 8:
-        raise FileFormatError(f"{path}: more than {LARGEST // 8} bytes, too large for a CSV; store it as npz.")
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [line for line in csv.reader(file, strict=True) if line]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(f"{path}: not a UTF-8 CSV file ({error}); export it again.") from error
-    header = [name.strip() for name in lines[0]] if lines else []
-    if header[:1] != ["t"] or len(set(header)) != len(header):
-        raise FileFormatError(
-            f"{path}: the header is '{', '.join(header)}', expected 't' and then each joint's name once; add it."
-        )
-    rows = [_numbers(path, row, line, header) for row, line in enumerate(lines[1:], start=1)]
-    table = np.array(rows, dtype=float).reshape(len(rows), len(header))
-    return table[:, 0], table[:, 1:], None, header[1:]
-
-
-def _numbers(path: Path, row: int, cells: list[str], header: list[str]) -> list[float]:
-    if len(cells) != len(header):
-        raise FileFormatError(f"{path}: row {row} has {len(cells)} values, expected {len(header)}; complete it.")
-    numbers = []
-    for name, cell in zip(header, cells, strict=True):
-        try:
-            # float() also reads '1_0' and digits of other scripts, which no instrument writes.
-            numbers.append(float(cell if cell.isascii() and "_" not in cell else ""))
-        except ValueError as error:
-            raise FileFormatError(f"{path}: row {row}, column {name}: '{cell}' is not a number; correct it.") from error
-    return numbers
+    header, table = read_csv(path)
+    if header[:1] != ["t"]:
+        raise FileFormatError(f"{path}: the first column is '{header[0]}', expected 't'; put time first.")
+    q, v = (joint_columns(header, kind) for kind in "qv")
+    if not q:  # no log's header, so every other column is the joint that it names
+        return table[:, 0], table[:, 1:], None, header[1:]
+    stated = table[:, [v[joint] for joint in q]] if q.keys() <= v.keys() else None
+    return table[:, 0], table[:, list(q.values())], stated, list(q)

@@ -10,10 +10,12 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import weakest
-from nbs_pin.base.pages import Section, markdown_table, plain, short, write_csv
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.inertia.bounds import largest_inertia_bound, least_inertia_bound
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import load_robot
 

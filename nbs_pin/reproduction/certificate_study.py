@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from nbs_pin.base.pages import Section, markdown_table, plain, short, write_csv
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.attack import attack, random_disturbances, worst_of
@@ -20,6 +21,7 @@ from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.controllers.potential import Potential
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import Hold
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, picture
 from nbs_pin.reproduction import certificate_poses
 from nbs_pin.robots.robot import Robot, load_robot

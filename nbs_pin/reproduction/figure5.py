@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from nbs_pin.base.arrays import Matrices, Scalars, Vectors
-from nbs_pin.base.pages import Section, markdown_table, plain, short, write_csv
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Run
 from nbs_pin.controllers.controller import Controller
@@ -17,6 +18,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.motions.references import paper_reference
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, TORQUE, picture, thin
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.simulation import metrics

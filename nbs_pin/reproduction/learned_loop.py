@@ -9,7 +9,8 @@ from typing import NamedTuple
 import joblib
 import numpy as np
 
-from nbs_pin.base.pages import Section, markdown_table, plain, short, write_csv
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
 from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import Controller
@@ -24,6 +25,7 @@ from nbs_pin.identification.measurement import Noise
 from nbs_pin.kernels.threads import cores
 from nbs_pin.motions.disturbances import Disturbance, TorqueNoise
 from nbs_pin.motions.references import Sinusoid
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reports.plotting import ACTUAL, ERROR, picture
 from nbs_pin.reproduction import figure5, passive_data
 from nbs_pin.robots.robot import Robot, load_robot

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nbs_pin.base.pages import Section, markdown_table, short
 from nbs_pin.base.progress import tracked
 from nbs_pin.identification.collect import collect
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reproduction.model_trials import SPEED, Judge, Trial, attempt, chosen, column, write_trials
 from nbs_pin.robots.robot import load_robot
 

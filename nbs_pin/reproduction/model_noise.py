@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nbs_pin.base.pages import Section, markdown_table, short
 from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.excitation import torque_limits
 from nbs_pin.identification.measurement import Noise
 from nbs_pin.reports.error_charts import plot_sample_sizes
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reproduction.model_trials import MLP, Judge, Trial, attempt, chosen, column, write_trials
 from nbs_pin.robots.robot import Robot, load_robot
 

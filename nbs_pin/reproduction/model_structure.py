@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from nbs_pin.base.pages import Section, markdown_table, short
 from nbs_pin.base.progress import tracked
 from nbs_pin.identification.collect import collect
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, TORQUE, picture
 from nbs_pin.reproduction.model_trials import FAST, SPEED, Judge, Trial, attempt, chosen, column, write_trials
 from nbs_pin.robots.robot import load_robot

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from nbs_pin.base.pages import Section
+from nbs_pin.reports.markdown import Section
 from nbs_pin.reproduction.model_clean import clean_section, clean_trials
 from nbs_pin.reproduction.model_noise import noise_section, noise_trials
 from nbs_pin.reproduction.model_structure import STRUCTURES, structure_section, structure_trials

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from nbs_pin.accuracy.relative_errors import Box
-from nbs_pin.base.pages import plain, write_csv
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from nbs_pin.base.pages import Section, markdown_table, plain, short, write_csv
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.controllers.neural_backstepping import paper_controller
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.reports.charts import plot_bounds, plot_motions
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reproduction.paper_alpha import WAVES, AsPrinted, Sweep, as_printed, sweep
 from nbs_pin.reproduction.paper_table import COLUMNS, PRINTED, Row, authors_rows, follow, package_rows, pid_rows
 

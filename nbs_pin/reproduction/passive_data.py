@@ -9,8 +9,9 @@ import joblib
 import numpy as np
 
 from nbs_pin.accuracy.compare import best_scale
+from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.pages import Section, markdown_table, plain, short, write_csv
+from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
@@ -20,6 +21,7 @@ from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit import fit
 from nbs_pin.kernels.threads import cores
+from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 

@@ -4,7 +4,6 @@ Every function gives one number per start (shape (*batch,)), or one per start an
 Torque statistics leave out the last row, whose torque was computed but never applied.
 """
 
-import math
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import Scalars, Vectors
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.robots.robot import configuration_difference
 
@@ -121,7 +121,7 @@ def summary(run: Run, after: float = 1.0) -> dict[str, Any]:
     return {
         **times,
         "joints": list(run.joint_names),
-        **{name: _plain(np.asarray(value).tolist()) for name, value in figures.items()},
+        **plain({name: np.asarray(value) for name, value in figures.items()}),
     }
 
 
@@ -130,9 +130,3 @@ def _from(run: Run, after: float) -> np.ndarray:
     if not 0.0 <= after < run.t[-1]:
         raise ArgumentError(f"after is {after} s, expected a time in [0, {run.t[-1]:g}) s, inside the run.")
     return run.t >= after - 1e-9 * run.period
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_plain(x) for x in value]
-    return value if math.isfinite(value) else None
