@@ -28,6 +28,7 @@ from .controllers.neural_backstepping import (
 from .controllers.pd import PD as PD
 from .controllers.pid import PID as PID
 from .controllers.potential import Potential as Potential
+from .controllers.sliding_mode import SlidingMode as SlidingMode
 from .controllers.slotine_li import SlotineLi as SlotineLi
 from .dynamics.analytic import AnalyticDynamics as AnalyticDynamics
 from .dynamics.equations import (

@@ -26,11 +26,9 @@ from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
 from nbs_pin.benchmarks.serial_chains import serial_chain
 from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
-from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.convex import FICNN
 from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.neural_backstepping import DAMPINGS, NeuralBackstepping, paper_controller
-from nbs_pin.controllers.pd import PD
 from nbs_pin.controllers.pid import PID
 from nbs_pin.controllers.potential import POTENTIALS, Potential
 from nbs_pin.controllers.slotine_li import SlotineLi
@@ -39,6 +37,7 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.storage.checkpoints import FORMAT, TrainingState, about, read_checkpoint, write_checkpoint
+from tests.laws import EVERY
 from tests.test_networks import randomise
 
 TWO_LINK, PANDA, KINOVA = (load_robot(name) for name in ("two_link", "panda", "kinova"))
@@ -74,11 +73,8 @@ LAWS = {
     },
     "by_hand": by_hand,
     "paper": lambda robot: paper_controller(PinocchioDynamics(robot), m=0.3),
-    "slotine_li": lambda robot: SlotineLi.for_robot(robot, friction=JointFriction.of(robot)),
-    "computed_torque": ComputedTorque.for_robot,
-    "pd_plus": PD.for_robot,
-    "pd_gravity": lambda robot: PD.for_robot(robot, feedforward="gravity"),
-    "pid": PID.for_robot,
+    "friction": lambda robot: SlotineLi.for_robot(robot, friction=JointFriction.of(robot)),
+    **EVERY,
 }
 
 

@@ -36,16 +36,11 @@ from nbs_pin.kernels.jit import compile_for
 from nbs_pin.kernels.laws import difference
 from nbs_pin.kernels.layout import workspace
 from nbs_pin.robots.robot import load_robot
+from tests.laws import COMPILED
 from tests.test_networks import randomise
 
-LAWS = {
-    "nbs": NeuralBackstepping.for_robot,
-    "nbs_paper": lambda robot, **kw: NeuralBackstepping.for_robot(robot, potential="paper", damping="paper", **kw),
-    "slotine_li": SlotineLi.for_robot,
-    "computed_torque": ComputedTorque.for_robot,
-    "pd_plus": PD.for_robot,
-    "pd_gravity": lambda robot, **kw: PD.for_robot(robot, feedforward="gravity", **kw),
-}
+LAWS = {name: make for name, make in COMPILED.items() if name != "pid"}
+"""Laws without memory."""
 ARMS = ["two_link", "panda", "kinova", "z1"]
 
 

@@ -26,16 +26,9 @@ from nbs_pin.motions.references import Hold, Sinusoid
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
+from tests.laws import EVERY as LAWS
 from tests.test_networks import randomise
 
-LAWS = {
-    "nbs": NeuralBackstepping.for_robot,
-    "slotine_li": SlotineLi.for_robot,
-    "computed_torque": ComputedTorque.for_robot,
-    "pd_plus": PD.for_robot,
-    "pd_gravity": lambda robot, **kw: PD.for_robot(robot, feedforward="gravity", **kw),
-    "pid": lambda robot, **kw: PID.for_robot(robot, **kw),
-}
 ARMS = ["two_link", "panda", "kinova", str(Path(__file__).parent / "data" / "gantry.urdf")]
 
 
@@ -81,7 +74,7 @@ def test_defaults_follow_a_moving_reference(law, robot):
     reference = Sinusoid.for_robot(robot, amplitude=0.2)
     run = simulate(DynamicsPlant(PinocchioDynamics(robot)), law(robot), reference, 0.5, 0.001)
     error = np.abs(robot.difference(run.q, run.q_ref)).max()
-    modelled = law not in (LAWS["pid"], LAWS["pd_gravity"])
+    modelled = law not in (LAWS["pid"], LAWS["pd-gravity"])
     assert error < (1e-3 if modelled else 0.15)
 
 
@@ -92,7 +85,7 @@ def test_laws_with_a_model_give_the_inverse_dynamics_on_the_reference(law, robot
     controller = law(robot)
     q, v, _, _, a = arguments(robot.nv)
     dynamics = PinocchioDynamics(robot)
-    expected = dynamics.gravity(q) if law is LAWS["pd_gravity"] else dynamics.reference_torque(q, v, v, a)
+    expected = dynamics.gravity(q) if law is LAWS["pd-gravity"] else dynamics.reference_torque(q, v, v, a)
     np.testing.assert_allclose(call(controller, q, v, q, v, a), expected, rtol=1e-10, atol=1e-9)
 
 

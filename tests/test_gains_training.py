@@ -24,20 +24,14 @@ from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.kernels import layout
 from nbs_pin.robots.robot import load_robot
+from tests.laws import COMPILED
 from tests.test_controllers import arguments, call
 from tests.test_networks import randomise
 
-LAWS = {
-    "nbs": NeuralBackstepping.for_robot,
-    "nbs_paper": lambda robot: NeuralBackstepping.for_robot(robot, potential="paper", damping="paper"),
+LAWS = COMPILED | {
     "nbs_friction": lambda robot: NeuralBackstepping.for_robot(
         robot, friction=JointFriction(np.full(robot.nv, 0.3), np.linspace(1.0, 2.0, robot.nv))
-    ),
-    "slotine_li": SlotineLi.for_robot,
-    "computed_torque": ComputedTorque.for_robot,
-    "pd_plus": PD.for_robot,
-    "pd_gravity": lambda robot: PD.for_robot(robot, feedforward="gravity"),
-    "pid": PID.for_robot,
+    )
 }
 STEP = 1e-6
 
@@ -168,7 +162,7 @@ def test_every_gain_is_a_parameter(law, robot):
         SlotineLi: {"gains.rate", "gains.gain"},
         NeuralBackstepping: {"rate", "potential.stiffness", "damping.floor"},
     }[type(controller)]
-    assert gains == expected - ({"damping.floor"} if law is LAWS["nbs_paper"] else set())
+    assert gains == expected - ({"damping.floor"} if law is LAWS["nbs-paper"] else set())
     assert all(p.dtype == torch.float64 and p.requires_grad for p in controller.parameters())
 
 

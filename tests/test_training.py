@@ -15,8 +15,8 @@ from nbs_pin.simulation.costs import TimeOutside, TorqueAware, squared_error
 from nbs_pin.simulation.loop import Loop
 from nbs_pin.simulation.rollout import Batch, engine_for, motions, recorded, running_cost
 from nbs_pin.storage.checkpoints import about, read_checkpoint
+from tests.laws import COMPILED
 
-LAWS = ("nbs", "nbs-paper", "slotine-li", "computed-torque", "pd-plus", "pd-gravity", "pid")
 PERIOD = 0.01
 
 
@@ -59,7 +59,7 @@ def assert_engines_agree(controller, batch, cost):
     assert float(torch.linalg.norm(fast[1] - slow[1])) <= 1e-9 * float(torch.linalg.norm(slow[1]))
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", COMPILED)
 def test_both_engines_are_one_loop_for_every_law(name):
     robot = arm("two_link", 30.0)
     assert_engines_agree(law_for(robot, name), problem(robot), TorqueAware.for_robot(robot))
@@ -139,7 +139,7 @@ def test_gradients_of_many_starts_are_the_sum_of_those_of_few(monkeypatch):
     torch.testing.assert_close(parts[1], whole[1], rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", COMPILED)
 def test_a_motion_is_the_run_that_simulate_gives(name):
     robot = arm("two_link", 20.0)
     controller, batch = law_for(robot, name), problem(robot, steps=30, starts=1, lookahead=0.004)
@@ -197,7 +197,7 @@ def quick(controller, robot, **settings):
     return nbs.train(controller, plant, [nbs.Sinusoid.for_robot(robot)], **given)
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", COMPILED)
 @pytest.mark.parametrize("optimiser", ["cautious", "adam", "lbfgs"])
 def test_training_lowers_the_held_out_cost_and_leaves_the_given_law_alone(name, optimiser):
     robot = arm("two_link")

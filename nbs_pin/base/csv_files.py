@@ -58,7 +58,7 @@ def joint_columns(header: Sequence[str], kind: str) -> dict[str, int]:
 
 
 def joint_order(path: Path, found: Sequence[str], joint_names: Sequence[str] | None) -> list[int]:
-    """Which of the joints found is each joint named; numbers 1 … n stand for the arm's own order, None for the file's.
+    """Which of the joints found is each joint named; numbers 1 … n stand for the arm's order, None for the file's.
 
     Raises:
         FileFormatError: When they are not the same joints.

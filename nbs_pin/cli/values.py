@@ -3,7 +3,7 @@
 import difflib
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -63,9 +63,8 @@ def positive_list(flag: str, most: float, unit: str) -> PrimitiveConstructorSpec
     return _spec("W1,W2,…", parse, str)
 
 
-def choice(flag: str, names: Iterable[str], ending: str = "") -> PrimitiveConstructorSpec[str]:
+def choice(flag: str, known: Collection[str], ending: str = "") -> PrimitiveConstructorSpec[str]:
     """One of the names, or with an ending a path that ends so, for tyro; raises OptionError for any other text."""
-    known = tuple(names)
     file = f" or a {ending} file" if ending else ""
 
     def parse(words: list[str]) -> str:

@@ -13,6 +13,7 @@ LAWS: dict[str, Entry] = {
     "nbs": Entry(f"{_LAWS}.neural_backstepping:NeuralBackstepping.for_robot"),
     "nbs-paper": Entry(f"{_LAWS}.neural_backstepping:paper_controller_for"),
     "slotine-li": Entry(f"{_LAWS}.slotine_li:SlotineLi.for_robot"),
+    "sliding-mode": Entry(f"{_LAWS}.sliding_mode:SlidingMode.for_robot"),
     "computed-torque": Entry(f"{_LAWS}.computed_torque:ComputedTorque.for_robot"),
     "pd-plus": Entry(f"{_LAWS}.pd:PD.for_robot", {"feedforward": "reference"}),
     "pd-gravity": Entry(f"{_LAWS}.pd:PD.for_robot", {"feedforward": "gravity"}),
