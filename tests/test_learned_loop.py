@@ -10,6 +10,7 @@ import pytest
 
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.cli import main
+from nbs_pin.commands import reproduce
 from nbs_pin.controllers.neural_backstepping import paper_controller
 from nbs_pin.dynamics.cholesky import CholeskyNetwork
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
@@ -229,6 +230,6 @@ def replace_ratio(row):
 
 
 def test_the_command_has_the_part(tmp_path, monkeypatch):
-    monkeypatch.setattr(learned_loop, "reproduce_learned", lambda *_: [Section("Learned", "Text.", {"x": 1})])
+    monkeypatch.setitem(reproduce.PARTS, "lnn", lambda *_: [Section("Learned", "Text.", {"x": 1})])
     assert main(["reproduce", "--part", "lnn", "--out", str(tmp_path / "out")]) == 0
     assert "## Learned\n\nText." in (tmp_path / "out" / "report.md").read_text()

@@ -22,7 +22,7 @@ def states(seed, count=20, size=0.5):
 
 
 def test_the_registry_has_laws_with_and_without_a_storage_function():
-    assert {"nbs", "nbs-paper", "slotine-li"} == set(CERTIFIED)
+    assert {"nbs", "nbs-paper", "slotine-li", "sliding-mode"} == set(CERTIFIED)
 
 
 @pytest.mark.parametrize("name", CERTIFIED)

@@ -35,7 +35,7 @@ def test_a_model_gives_its_torques_and_inertias(name):
     np.testing.assert_allclose(model.mass_matrix(q), EXPECTED[f"mass {name}"], rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("load, prefix", [(nbs.load_dataset, "data"), (nbs.Run.load, "run")])
+@pytest.mark.parametrize(("load", "prefix"), [(nbs.load_dataset, "data"), (nbs.Run.load, "run")])
 def test_data_and_runs_hold_their_numbers(load, prefix):
     record = load(OLD / f"{prefix}.npz")
     for key in (key for key in EXPECTED if key.startswith(f"{prefix} ") and key != "run error"):

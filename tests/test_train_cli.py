@@ -308,7 +308,7 @@ def test_one_motion_that_diverges_leaves_the_others_their_figures(monkeypatch, w
     batch = training.fresh_batch(loop, [nbs.Sinusoid.for_robot(robot, 1.0)], 0.1, seed=0, starts=5)
     batch.v0[2] = 1e3
     if without_kernels:
-        moved = training.motions
+        moved = evaluation.motions
         monkeypatch.setattr(evaluation, "motions", lambda law, batch: moved(law, batch, "torch"))
     figures = training.fresh_figures(training.compared(law, batch))
     assert np.isfinite(figures["convergence_time_median_s"])

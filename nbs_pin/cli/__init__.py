@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if argv is None else list(argv)
     with _stops() as stops, _warnings_to(notes):
         try:
-            return _run(arguments, notes)
+            return _run(arguments, notes, stops)
         except BaseException as error:
             # A signal that meets the import of an extension comes out as its ImportError: ask the signal first.
             if stops or isinstance(error, KeyboardInterrupt):
@@ -95,7 +95,7 @@ def _failed(error: BaseException, notes: Console) -> int:
     return BAD_INPUT
 
 
-def _run(arguments: list[str], notes: Console) -> int:
+def _run(arguments: list[str], notes: Console, stops: list[int]) -> int:
     console = Output()
     if arguments == ["--version"]:
         console.print(f"nbs-pin {__version__}", highlight=False)
@@ -104,6 +104,8 @@ def _run(arguments: list[str], notes: Console) -> int:
     if command is not None:
         with notes.status("loading"):
             body = import_module(f"nbs_pin.commands.{arguments[0]}")
+        if stops:  # a library that is being imported may swallow the interrupt
+            raise KeyboardInterrupt
         body.run(command, console, notes)
     return 0
 
