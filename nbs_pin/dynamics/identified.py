@@ -7,18 +7,15 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors
+from nbs_pin.base.arrays import Array
 from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.pinocchio_tree import pack_model
-from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
 from nbs_pin.dynamics.structure import ModelClaims, rigid_tree_claims
-from nbs_pin.kernels.layout import Packed
 from nbs_pin.robots.robot import Robot
 
 _ROUNDING = 1e-9
@@ -27,7 +24,7 @@ _ROUNDING = 1e-9
 
 @known_code
 @storable(("parameters", "rotor_inertia", "report"), parts=("robot", "friction"))
-class IdentifiedDynamics(DynamicsProvider):
+class IdentifiedDynamics(PinocchioDynamics):
     """M, C, G of an arm with the joints of `robot` and the inertial parameters given here instead of its own.
 
     robot: gives geometry, gravity, limits and drawings; its own inertias play no part. parameters: (n, 10), per body
@@ -46,54 +43,20 @@ class IdentifiedDynamics(DynamicsProvider):
         rotor_inertia: Float[Array, " n"] | None = None,
         report: Any = None,
     ) -> None:
-        self._robot, self.report = robot, report
         self.parameters = _consistent(floats("parameters", parameters).copy(), robot)
-        self.friction = friction_of_size(friction, robot.nv)
+        self.friction, self.report = friction_of_size(friction, robot.nv), report
         self.rotor_inertia = _rotors(rotor_inertia, robot)
         model = robot.model.copy()
         for i, body in enumerate(self.parameters):
             model.inertias[i + 1] = pin.Inertia.FromDynamicParameters(body)
         model.armature = self.rotor_inertia
-        self._model = model
-        self._rigid = PinocchioDynamics(replace(robot, model=model))
-
-    @property
-    def nv(self) -> int:
-        """Number of joints."""
-        return self._robot.nv
+        super().__init__(replace(robot, model=model))
+        self._described = robot
 
     @property
     def robot(self) -> Robot:
         """The arm as its file describes it."""
-        return self._robot
-
-    def mass_matrix(self, q: Vectors) -> Matrices:
-        """M(q) [kg·m²]."""
-        return self._rigid.mass_matrix(q)
-
-    def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
-        """C(q, v) [N·m·s], the Christoffel one."""
-        return self._rigid.coriolis_matrix(q, v)
-
-    def gravity(self, q: Vectors) -> Vectors:
-        """G(q) [N·m]."""
-        return self._rigid.gravity(q)
-
-    def potential_energy(self, q: Vectors) -> Scalars:
-        """V(q) [J], up to a constant."""
-        return self._rigid.potential_energy(q)
-
-    def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
-        """M a_r + C(q, v) v_r + G [N·m] by two RNEA."""
-        return self._rigid.reference_torque(q, v, v_r, a_r)
-
-    def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
-        """v̇ [rad/s²] by the articulated body algorithm."""
-        return self._rigid.forward_dynamics(q, v, tau)
-
-    def packed_tree(self) -> Packed | None:
-        """The arm's joints and identified bodies; None for a subclass, which may have changed an equation."""
-        return pack_model(self._model) if type(self) is IdentifiedDynamics else None
+        return self._described
 
     def structure_claims(self) -> ModelClaims | None:
         """Those of a rigid tree."""

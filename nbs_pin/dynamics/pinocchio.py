@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, is_torch_array, over_rows
 from nbs_pin.base.claims import refuse
-from nbs_pin.base.known_code import known_code
+from nbs_pin.base.known_code import is_known, known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -88,7 +88,7 @@ class PinocchioDynamics(DynamicsProvider):
 
     def packed_tree(self) -> Packed | None:
         """The arm's joints and bodies; None for a subclass, which may have changed an equation."""
-        return pack_model(self._model) if type(self) is PinocchioDynamics else None
+        return pack_model(self._model) if is_known(self) else None
 
     def structure_claims(self) -> ModelClaims | None:
         """Those of a rigid tree; raises CertificateRefused when the model is no longer that of `robot`."""
