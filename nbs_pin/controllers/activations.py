@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import Array, array_namespace
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.kernels.layout import SMOOTHED_RELU, SQUAREPLUS
+from nbs_pin.kernels.layout import ActivationCode
 
 
 class Activation(ABC):
@@ -51,7 +51,7 @@ class SmoothedReLU(Activation):
     @property
     def kernel(self) -> tuple[int, float]:
         """Code and parameter of the compiled form."""
-        return SMOOTHED_RELU, self.d
+        return ActivationCode.SMOOTHED_RELU, self.d
 
 
 @dataclass(frozen=True)
@@ -77,4 +77,4 @@ class Squareplus(Activation):
     @property
     def kernel(self) -> tuple[int, float]:
         """Code and parameter of the compiled form."""
-        return SQUAREPLUS, self.b
+        return ActivationCode.SQUAREPLUS, self.b

@@ -14,7 +14,7 @@ from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.potential import Potential
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.kernels.layout import BACKSTEPPING, Packed
+from nbs_pin.kernels.layout import LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
 DAMPINGS = ("inertial", "bounded", "paper")
@@ -160,7 +160,7 @@ class NeuralBackstepping(ModelLaw):
     def _packed(self, numpy: bool) -> Packed:
         rate = self.rate.value(numpy=numpy)
         return self._pack(
-            BACKSTEPPING,
+            LawCode.BACKSTEPPING,
             (rate, 0.0 * rate),
             inertial_rate=self.inertial_rate,
             potential=self.potential.packed(numpy=numpy),

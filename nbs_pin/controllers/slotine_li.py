@@ -9,7 +9,7 @@ from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.kernels.layout import SLOTINE_LI, Packed
+from nbs_pin.kernels.layout import LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
 
@@ -74,4 +74,4 @@ class SlotineLi(ModelLaw):
 
     def _packed(self, numpy: bool) -> Packed:
         rate, gain = self.gains.value(numpy=numpy)
-        return self._pack(SLOTINE_LI, (rate, gain))
+        return self._pack(LawCode.SLOTINE_LI, (rate, gain))

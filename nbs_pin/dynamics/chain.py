@@ -13,7 +13,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.lagrangian_network import CompiledTorque, LagrangianNetwork, Tensor
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import tree_workspace
-from nbs_pin.kernels.tree_rows import tree_torques
+from nbs_pin.kernels.trees import tree_torques
 
 
 class Chain(LagrangianNetwork):

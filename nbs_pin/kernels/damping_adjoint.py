@@ -4,86 +4,48 @@ With x = Rz and y = Rf̄:  s = f̄ᵀD₀z + (Ty)ᵀ(Tx), so T̄ = (Ty)xᵀ + (T
 ȳ = Tᵀ(Tx) for T held still; T̄ then goes back through the two tanh networks.
 """
 
-import numpy as np
-
 from nbs_pin.kernels.convex_adjoint import add_transposed
-from nbs_pin.kernels.damping import tanh
+from nbs_pin.kernels.damping import diagonal_of, tanh_network
 from nbs_pin.kernels.jit import kernel
-from nbs_pin.kernels.layout import PART_HEADER
-
-_VECTORS = 5
-
-
-@kernel
-def room_for_damping(layout: np.ndarray) -> int:
-    """How many numbers of scratch space `damping_adjoint` needs for the damping of that layout."""
-    n, tapes = layout[0], 0
-    for layer in range(2 * layout[2]):
-        tapes += layout[PART_HEADER + 3 * layer + 1]
-    return _VECTORS * n + tapes + 3 * layout[3] + n * (n + 1) // 2
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.records import Vec
+from nbs_pin.kernels.views import damping_of, layer, row, take, take4
 
 
 @kernel
-def tanh_forward(
-    first: int, depth: int, layout: np.ndarray, weights: np.ndarray, x: np.ndarray, tape: np.ndarray, out: np.ndarray
-) -> int:
-    """`damping.tanh_network` → out with the inputs [h, 1, 0] of all layers on the tape; returns how many numbers."""
-    size, at = len(x), 0
-    h = tape
-    for layer in range(first, first + depth):
-        width, length, offset = layout[PART_HEADER + 3 * layer : PART_HEADER + 3 * layer + 3]
-        h = tape[at : at + length]
-        if layer == first:
-            h[:size] = x
-        else:
-            tanh(out[:size], h[:size])
-        h[size], h[size + 1 :] = 1.0, 0.0
-        for i in range(width):
-            row = weights[offset + i * length : offset + (i + 1) * length]
-            a = 0.0
-            for j in range(length):
-                a += row[j] * h[j]
-            out[i] = a
-        size, at = width, at + length
-    return at
+def room_for_damping(part: Packed) -> int:
+    """How many numbers of scratch space `damping_adjoint` needs for the damping."""
+    d, tapes = damping_of(part), 0
+    for k in range(2 * d.depth):
+        tapes += layer(part, k)[1]
+    return 5 * d.n + tapes + 3 * d.widest + d.n * (d.n + 1) // 2
 
 
 @kernel
-def tanh_reverse(
-    first: int,
-    depth: int,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    tape: np.ndarray,
-    out_bar: np.ndarray,
-    h_bar: np.ndarray,
-    weights_bar: np.ndarray,
-) -> int:
-    """What is gained per x → h_bar[:n] and, added to weights_bar, per weight; returns where its tape began.
+def tanh_reverse(first: int, part: Packed, tape: Vec, out_bar: Vec, h_bar: Vec, part_bar: Packed) -> int:
+    """What is gained per x → h_bar[:n] and, added to part_bar, per weight; returns where its tape began.
 
-    tape: up to the last number that `tanh_forward` wrote. out_bar, as wide as a layer, is used up.
+    tape: up to the last number that `damping.tanh_network` wrote. out_bar, as wide as a layer, is used up.
     """
     at = len(tape)
-    for layer in range(first + depth - 1, first - 1, -1):
-        size, length, offset = layout[PART_HEADER + 3 * layer : PART_HEADER + 3 * layer + 3]
+    for k in range(first + damping_of(part).depth - 1, first - 1, -1):
+        size, length, matrix = layer(part, k)
         at -= length
-        h, total = tape[at : at + length], h_bar[:length]
+        h, total, matrix_bar = tape[at : at + length], h_bar[:length], layer(part_bar, k)[2]
         total[:] = 0.0
-        add_transposed(weights[offset : offset + size * length], out_bar[:size], total)
+        add_transposed(matrix, out_bar[:size], total)
         for i in range(size):
-            row_bar, delta = weights_bar[offset + i * length : offset + (i + 1) * length], out_bar[i]
+            row_bar, delta = row(matrix_bar, i, length), out_bar[i]
             for j in range(length):
                 row_bar[j] += delta * h[j]
-        if layer > first:
-            for j in range(layout[PART_HEADER + 3 * layer - 3]):
+        if k > first:
+            for j in range(layer(part, k - 1)[0]):
                 out_bar[j] = total[j] * (1.0 - h[j] * h[j])
     return at
 
 
 @kernel
-def factor_adjoint(
-    x: np.ndarray, y: np.ndarray, diagonal: np.ndarray, lower: np.ndarray, x_bar: np.ndarray, y_bar: np.ndarray
-) -> None:
+def factor_adjoint(x: Vec, y: Vec, diagonal: Vec, lower: Vec, x_bar: Vec, y_bar: Vec) -> None:
     """Tᵀ(Ty) → x_bar, Tᵀ(Tx) → y_bar, and T̄ in place of T: its diagonal, and its rows below it end to end."""
     n, at = len(x), 0
     x_bar[:], y_bar[:] = 0.0, 0.0
@@ -103,42 +65,35 @@ def factor_adjoint(
 
 
 @kernel
-def damping_adjoint(
-    z: np.ndarray,
-    force_bar: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    z_bar: np.ndarray,
-    weights_bar: np.ndarray,
-) -> None:
-    """Add the gradient of force_barᵀD(z)z by z and the weights of the damping: (n,) and as weights; m gets none."""
-    n, paper, depth, widest = layout[0], layout[1], layout[2], layout[3]
-    m, scale, below = weights[0], weights[1 : 1 + n], n * (n - 1) // 2
-    x, y, x_bar, y_bar = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n]
-    diagonal = work[4 * n : 5 * n]
-    room = work[_VECTORS * n :]
-    h_bar, out = room[:widest], room[widest : 3 * widest + n + below]
-    second, tapes, used = widest + n, room[3 * widest + n + below :], 0
-    upper, lower = out[:second], out[second:]
+def damping_adjoint(z: Vec, force_bar: Vec, part: Packed, work: Vec, z_bar: Vec, weights_bar: Vec) -> None:
+    """Add the gradient of force_barᵀD(z)z by z and by the weights of the damping; m gets none."""
+    part_bar = Packed(part.layout, weights_bar)
+    d, d_bar = damping_of(part), damping_of(part_bar)
+    n = d.n
+    x, y, x_bar, y_bar, work = take4(work, n)
+    diagonal, work = take(work, n)
+    h_bar, work = take(work, d.widest)
+    upper, work = take(work, d.widest + n)  # outputs of a network's layers, the last of which may be the widest
+    lower, tapes = take(work, d.widest + n * (n - 1) // 2)
     for i in range(n):
-        x[i], y[i] = scale[i] * z[i], scale[i] * force_bar[i]
-    for k in range(2):
-        used += tanh_forward(k * depth, depth, layout, weights, x, tapes[used:], out[k * second :])
+        x[i], y[i] = d.scale[i] * z[i], d.scale[i] * force_bar[i]
+    used = tanh_network(0, part, x, True, tapes, upper)
+    used += tanh_network(d.depth, part, x, True, tapes[used:], lower)
     for i in range(n):
-        diagonal[i] = upper[i] if not paper else (m if upper[i] < 0.0 else upper[i] + m)
+        diagonal[i], upper[i] = diagonal_of(d.code, d.m[0], upper[i])
     factor_adjoint(x, y, diagonal, lower, x_bar, y_bar)
     for i in range(n):
-        upper[i] = diagonal[i] if not paper or upper[i] > 0.0 else 0.0
-    for k in range(1, -1, -1):
-        used = tanh_reverse(k * depth, depth, layout, weights, tapes[:used], out[k * second :], h_bar, weights_bar)
-        for i in range(n):
-            x_bar[i] += h_bar[i]
+        upper[i] *= diagonal[i]
+    used = tanh_reverse(d.depth, part, tapes[:used], lower, h_bar, part_bar)
     for i in range(n):
-        z_bar[i] += scale[i] * x_bar[i]
-        weights_bar[1 + i] += z[i] * x_bar[i] + force_bar[i] * y_bar[i]
-    floor, floor_bar = weights[1 + n :], weights_bar[1 + n :]
+        x_bar[i] += h_bar[i]
+    tanh_reverse(0, part, tapes[:used], upper, h_bar, part_bar)
     for i in range(n):
+        x_bar[i] += h_bar[i]
+        z_bar[i] += d.scale[i] * x_bar[i]
+        d_bar.scale[i] += z[i] * x_bar[i] + force_bar[i] * y_bar[i]
+    for i in range(n):
+        floor, floor_bar = row(d.floor, i, n), row(d_bar.floor, i, n)
         for j in range(n):
-            z_bar[j] += floor[i * n + j] * force_bar[i]
-            floor_bar[i * n + j] += force_bar[i] * z[j]
+            z_bar[j] += floor[j] * force_bar[i]
+            floor_bar[j] += force_bar[i] * z[j]
