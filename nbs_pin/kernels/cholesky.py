@@ -5,7 +5,6 @@ layout     n, depth, joints that turn, largest layer, then per layer: size, row 
 weights    R (n), ε, scale of V̂, layers [W | b | 0] padded as in `layout.py`
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -88,7 +87,7 @@ def _features(q: Vec, v: Vec, w: Vec, joints: Vec, turning: int, u: Vec, du: Mat
     for k in range(len(joints)):
         i = joints[k]
         if k < turning:
-            s, c = math.sin(q[i]), math.cos(q[i])
+            s, c = np.sin(q[i]), np.cos(q[i])
             u[k], du[0, k], du[1, k] = s, c * v[i], c * w[i]
             u[turning + k], du[0, turning + k], du[1, turning + k] = c, -s * v[i], -s * w[i]
         else:

@@ -4,8 +4,6 @@ Row i of a sample is ∂τ_i/∂(−gravity (3), then per joint: turn δ of R₀
 armature), τ of `trees.tree_torque` at w = v: μᵀτ with μ the unit vector of joint i, as in `tree_torque_adjoint`.
 """
 
-import math
-
 import numpy as np
 
 from nbs_pin.kernels import tree_bodies as bodies
@@ -56,7 +54,7 @@ def _joint_row(motion: Motion, mu: Vec, tree: Packed, work: Vec, bars: Vec) -> N
         x, y, z = bodies.turn_bar(joint, v, v, a, mu[i])
         put(bar, SHIFT, bodies.shift_bar(joint, bodies.hand_bars(joint)))
         if joint.slide == 0.0:  # δ turns R₀, before Rz(q)
-            c, s = math.cos(q), math.sin(q)
+            c, s = np.cos(q), np.sin(q)
             put(bar, TURN, (c * x - s * y, s * x + c * y, z))
         else:  # the body travels q along R₀ z, which turns with R₀
             dx, dy, _ = transposed_times(joint.row, R, get(bar, SHIFT))

@@ -7,7 +7,7 @@ adjoint is one more pass outwards and inwards (`tree_bodies.py`).
 `work` holds a row for the base, which is at rest but for a = −gravity, and one per joint, then two vectors (n,).
 """
 
-import math
+import numpy as np
 
 from nbs_pin.kernels import tree_bodies as bodies
 from nbs_pin.kernels.jit import kernel
@@ -27,7 +27,7 @@ def place(q: Vec, tree: Packed, work: Vec) -> None:
         body, row = joint.body, joint.row
         c, s, travel = 1.0, 0.0, joint.slide * q[i]
         if joint.slide == 0.0:
-            c, s, travel = math.cos(q[i]), math.sin(q[i]), 0.0
+            c, s, travel = np.cos(q[i]), np.sin(q[i]), 0.0
         for k in range(3):
             x, y, z = get(body, 3 * k)
             put(row, 3 * k, (c * x + s * y, c * y - s * x, z))
@@ -137,7 +137,7 @@ def _factorise(matrix: Mat) -> None:
             share /= other[j]
             row[j] = share
             rest -= share * share
-        row[i] = math.sqrt(rest)
+        row[i] = np.sqrt(rest)
 
 
 @kernel
