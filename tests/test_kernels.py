@@ -28,13 +28,14 @@ from nbs_pin.kernels.layout import (
     JointCode,
     LawCode,
     Packed,
+    known,
     pack_damping,
     pack_law,
     pack_potential,
     workspace,
 )
 from nbs_pin.kernels.records import Dual, Motion, Signals, State, Target
-from nbs_pin.kernels.rollouts import Course, Rollout, integrator_code, rollout, rollout_adjoint, rollout_workspace
+from nbs_pin.kernels.rollouts import Course, Rollout, rollout, rollout_adjoint, rollout_workspace
 from nbs_pin.kernels.tree_layout import PER_JOINT, TREE_JOINTS, Link, pack_tree, tree_workspace
 from nbs_pin.kernels.trees import tree_acceleration, tree_torque
 from nbs_pin.simulation.costs import squared_error
@@ -148,10 +149,10 @@ def test_unknown_codes_are_not_packed():
     layers = [(None, np.ones((1, 2)), None)]
     networks = tuple([[(np.ones((k, 2)), np.ones(k))] for k in (2, 1)])
     for pack, what in (
-        (lambda: pack_law(UNKNOWN, (one, one), None, None), "the law 99; give one of BACKSTEPPING = 0"),
-        (lambda: pack_potential(layers, (UNKNOWN, 0.1), one, np.eye(2)), "the activation 99"),
-        (lambda: pack_damping(networks, UNKNOWN, 0.1, one, np.eye(2)), "the form of the damping 99"),
-        (lambda: integrator_code("leapfrog"), "the integrator 'leapfrog'; give one of euler"),
+        (lambda: pack_law(UNKNOWN, (one, one), None, None), "the law '99'; give one of backstepping = 0"),
+        (lambda: pack_potential(layers, (UNKNOWN, 0.1), one, np.eye(2)), "the activation '99'"),
+        (lambda: pack_damping(networks, UNKNOWN, 0.1, one, np.eye(2)), "the form of a damping '99'"),
+        (lambda: known("leapfrog", IntegratorCode, "integrator"), "the integrator 'leapfrog'; give one of euler = 0"),
         (lambda: pack_law(LawCode.PID, (one, one), None, None), "PID to pack_pid"),
         (lambda: pack_law(LawCode.BACKSTEPPING, (one, one), None, None), "with 0 networks"),
     ):

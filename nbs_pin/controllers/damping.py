@@ -12,7 +12,7 @@ from torch import nn
 from nbs_pin.base.arrays import Array, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.gain import Gain, positive_definite, positive_scale
-from nbs_pin.kernels.layout import DampingCode, Packed, pack_damping
+from nbs_pin.kernels.layout import Packed, pack_damping
 
 DAMPINGS = ("bounded", "paper")
 
@@ -107,7 +107,7 @@ class Damping(nn.Module):
         """
         networks = self.diagonal.layers(numpy=numpy), self.lower.layers(numpy=numpy)
         d0, r = self._constants(numpy=numpy)
-        return pack_damping(networks, DampingCode[self.form.upper()], self.m, r, d0)
+        return pack_damping(networks, self.form, self.m, r, d0)
 
     def _constants(self, *, numpy: bool) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         r = self.scale.numpy(force=True) if numpy else self.scale

@@ -5,7 +5,7 @@ import math
 from nbs_pin.kernels.jit import exact_kernel, inlined, kernel
 from nbs_pin.kernels.layout import PADDING, DampingCode, Packed
 from nbs_pin.kernels.records import Vec
-from nbs_pin.kernels.views import damping_of, layer, row, take, take3
+from nbs_pin.kernels.views import damping_of, layer, row, take, take2
 
 _I3, _I5, _I6, _I7, _I8, _I9 = 1 / 3, 1 / 5, 1 / 6, 1 / 7, 1 / 8, 1 / 9
 _I10, _I11, _I12, _I13, _I14, _I15 = 1 / 10, 1 / 11, 1 / 12, 1 / 13, 1 / 14, 1 / 15
@@ -74,7 +74,7 @@ def damping_force(z: Vec, part: Packed, work: Vec, force: Vec) -> None:
     """D(z) z = D₀z + R TᵀT Rz [N·m] → force."""
     d = damping_of(part)
     n = d.n
-    x, tx, diagonal, work = take3(work, n)
+    x, diagonal, work = take2(work, n)
     h, out = take(work, d.widest + PADDING)
     for i in range(n):
         x[i] = d.scale[i] * z[i]
@@ -82,18 +82,14 @@ def damping_force(z: Vec, part: Packed, work: Vec, force: Vec) -> None:
     for i in range(n):
         diagonal[i], _ = diagonal_of(d.code, d.m[0], out[i])
     tanh_network(d.depth, part, x, False, h, out)
-    at = 0
-    for i in range(n):  # T x, with row i of T below the diagonal in out[at : at + i]
-        tx[i] = diagonal[i] * x[i]
+    force[:], at = 0.0, 0
+    for i in range(n):  # Tᵀ(T x), with row i of T below the diagonal in out[at : at + i]
+        tx = diagonal[i] * x[i]
         for j in range(i):
-            tx[i] += out[at + j] * x[j]
-        at += i
-    for i in range(n):
-        force[i] = diagonal[i] * tx[i]
-    at = 0
-    for i in range(n):
+            tx += out[at + j] * x[j]
+        force[i] += diagonal[i] * tx
         for j in range(i):
-            force[j] += out[at + j] * tx[i]
+            force[j] += out[at + j] * tx
         at += i
     for i in range(n):
         total, floor = 0.0, row(d.floor, i, n)

@@ -12,7 +12,7 @@ from nbs_pin.kernels import layout as at
 from nbs_pin.kernels.convex import potential
 from nbs_pin.kernels.damping import damping_force
 from nbs_pin.kernels.jit import compile_for, exact_kernel, inlined, kernel
-from nbs_pin.kernels.layout import LawCode, Packed, checked_code
+from nbs_pin.kernels.layout import LawCode, Packed, known
 from nbs_pin.kernels.records import PID, Dual, Mat, Memory, Motion, Signals, State, Target, Tracking, Vec
 from nbs_pin.kernels.tree_layout import tree_workspace
 from nbs_pin.kernels.trees import tree_torque
@@ -43,7 +43,7 @@ def law_workspace(law: Packed, tree: Packed | None = None) -> int:
     Raises:
         ArgumentError: for a law that no kernel knows, and for a PID, which has no model.
     """
-    if checked_code(int(law.layout[at.LAW]), LawCode, "law") is LawCode.PID:
+    if known(int(law.layout[at.LAW]), LawCode, "law") is LawCode.PID:
         raise ArgumentError("a PID was given as a law with a model of the arm; compile the PID itself.")
     signals = int(law.layout[at.SCRATCH])
     return signals if tree is None else 3 * int(law.layout[at.JOINTS]) + max(signals, tree_workspace(tree))

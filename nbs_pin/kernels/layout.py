@@ -96,22 +96,22 @@ class Packed(NamedTuple):
     """float64: a numpy array, or a torch tensor of the same numbers, differentiable in what was packed."""
 
 
-def checked_code(code: int, codes: type[Code], what: str) -> Code:
-    """The code as one that the kernels know.
+def known(code: int | str, codes: type[Code], what: str) -> Code:
+    """One of the codes that the kernels know.
 
     Args:
-        code: what is to be packed.
+        code: the code, or its name in small letters.
         codes: the list it must be in.
-        what: what it stands for, as the message names it.
+        what: what it stands for, as the message says it.
 
     Raises:
-        ArgumentError: for a code that no kernel knows.
+        ArgumentError: for what no kernel knows.
     """
-    try:
-        return codes(code)
-    except ValueError:
-        known = ", ".join(f"{c.name} = {c.value}" for c in codes)
-        raise ArgumentError(f"no kernel knows the {what} {code}; give one of {known}.") from None
+    for one in codes:
+        if code in (one, one.name.lower()):
+            return one
+    names = ", ".join(f"{one.name.lower()} = {one}" for one in codes)
+    raise ArgumentError(f"no kernel knows the {what} '{code}'; give one of {names}.")
 
 
 def pack_potential(
@@ -133,7 +133,7 @@ def pack_potential(
     Raises:
         ArgumentError: for an activation that no kernel knows.
     """
-    code, parameter = checked_code(activation[0], ActivationCode, "activation"), activation[1]
+    code, parameter = known(activation[0], ActivationCode, "activation"), activation[1]
     matrices = [_padded(wx, bias, wy) for wy, wx, bias in layers]
     value, gradient = (0.0 * scale[0], 0.0 * scale) if tangent is None else tangent
     head = [_vector(scale, parameter), value[None], scale, gradient, 2.0 * stiffness.ravel()]
@@ -142,7 +142,7 @@ def pack_potential(
 
 def pack_damping(
     networks: tuple[Sequence[tuple[Array, Array]], Sequence[tuple[Array, Array]]],
-    form: int,
+    form: int | str,
     m: float,
     scale: Array,
     floor: Array,
@@ -151,7 +151,7 @@ def pack_damping(
 
     Args:
         networks: layers (W, b) of T's diagonal and of its rows below the diagonal, input to output; as many in both.
-        form: code of the damping's form.
+        form: code or name of the damping's form.
         m: smallest diagonal entry of T in the paper's form.
         scale: the diagonal R, (n,).
         floor: D₀, (n, n) [N·m·s/rad].
@@ -159,7 +159,7 @@ def pack_damping(
     Raises:
         ArgumentError: for a form that no kernel knows.
     """
-    code = checked_code(form, DampingCode, "form of the damping")
+    code = known(form, DampingCode, "form of a damping")
     matrices = [_padded(weight, bias) for network in networks for weight, bias in network]
     head = [_vector(scale, m), scale, floor.ravel()]
     return _assembled([len(scale), len(networks[0]), code], head, matrices)
@@ -188,7 +188,7 @@ def pack_law(
     Raises:
         ArgumentError: for a law that no kernel knows, PID, or backstepping without its networks.
     """
-    code, n = checked_code(law, LawCode, "law"), len(gains[0])
+    code, n = known(law, LawCode, "law"), len(gains[0])
     parts = [p for p in (potential, damping) if p is not None]
     if code is LawCode.PID or len(parts) != (2 if code is LawCode.BACKSTEPPING else 0):
         raise ArgumentError(

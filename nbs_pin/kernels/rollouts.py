@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.kernels.jit import inlined, kernel
 from nbs_pin.kernels.law_adjoints import adjoint_workspace, law_adjoint, pid_adjoint
 from nbs_pin.kernels.laws import law_workspace, pid_step, signals_of, torque_of
@@ -78,21 +77,6 @@ Stages = namedtuple("Stages", "q v a net factors")
 factors of M, (4, n, n)."""
 
 
-def integrator_code(name: str) -> int:
-    """The code of an integrator.
-
-    Args:
-        name: as `simulation.integrators.INTEGRATORS` has it.
-
-    Raises:
-        ArgumentError: for an integrator that has no kernel.
-    """
-    known = {code.name.lower(): int(code) for code in IntegratorCode}
-    if name not in known:
-        raise ArgumentError(f"no kernel knows the integrator '{name}'; give one of {', '.join(known)}.")
-    return known[name]
-
-
 def rollout_workspace(law: Packed, scene: Scene) -> int:
     """How many numbers of scratch space `rollout` and `rollout_adjoint` need.
 
@@ -108,7 +92,7 @@ def rollout_workspace(law: Packed, scene: Scene) -> int:
 
 
 @kernel
-def rollout(course: Course, scene: Scene, law: Packed, work: Vec, motion: Rollout) -> None:
+def rollout(course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout) -> None:
     """A motion from its start.
 
     Args:
@@ -116,16 +100,16 @@ def rollout(course: Course, scene: Scene, law: Packed, work: Vec, motion: Rollou
         scene: what all motions share.
         law: the law.
         work: scratch space (`rollout_workspace`).
-        motion: written, but for the state in its first row, the start.
+        run: written, but for the state in its first row, the start.
     """
     tau, work = take(work, len(scene.limit))
-    motion.memory[0] = 0.0
+    run.memory[0] = 0.0
     for k in range(len(course.leads)):
-        _ask(k, course, scene, law, work, motion)
-        _clip(motion.command[k], course.tau_d[k], scene, tau)
-        motion.q[k + 1], motion.v[k + 1] = motion.q[k], motion.v[k]
+        _ask(k, course, scene, law, work, run)
+        _clip(run.command[k], course.tau_d[k], scene, tau)
+        run.q[k + 1], run.v[k + 1] = run.q[k], run.v[k]
         for _ in range(scene.substeps):
-            _step(State(motion.q[k + 1], motion.v[k + 1]), tau, scene, work)
+            _step(State(run.q[k + 1], run.v[k + 1]), tau, scene, work)
 
 
 @kernel
@@ -134,7 +118,7 @@ def rollout_adjoint(
     scene: Scene,
     law: Packed,
     work: Vec,
-    motion: Rollout,
+    run: Rollout,
     bars: Rollout,
     tau_d_bar: Mat,
     law_bar: Packed,
@@ -146,7 +130,7 @@ def rollout_adjoint(
         scene: what all motions share.
         law: the law.
         work: scratch space (`rollout_workspace`).
-        motion: as `rollout` left it.
+        run: as `rollout` left it.
         bars: cotangents of states and torques, and zeros for those of the memory; what is gained per start is left in
             the first row of q and v, the rest is used up.
         tau_d_bar: written, (T, n).
@@ -155,35 +139,23 @@ def rollout_adjoint(
     n = len(scene.limit)
     tau, work = take(work, n)
     path, work = take(work, 2 * scene.substeps * n)
+    states = path.reshape(scene.substeps, 2, n)
     for k in range(len(course.leads) - 1, -1, -1):
         after_bar, tau_bar = State(bars.q[k + 1], bars.v[k + 1]), tau_d_bar[k]
         tau_bar[:] = 0.0
-        _clip(motion.command[k], course.tau_d[k], scene, tau)
-        for s in range(scene.substeps):
-            start = State(motion.q[k], motion.v[k]) if s == 0 else _on(path, s - 1, n)
-            _copy(start, _on(path, s, n))
-            if s > 0:
-                _step(_on(path, s, n), tau, scene, work)
+        _clip(run.command[k], course.tau_d[k], scene, tau)
+        states[0, 0], states[0, 1] = run.q[k], run.v[k]
+        for s in range(1, scene.substeps):
+            states[s] = states[s - 1]
+            _step(State(states[s, 0], states[s, 1]), tau, scene, work)
         for s in range(scene.substeps - 1, -1, -1):
-            _step_adjoint(_on(path, s, n), tau, scene, work, after_bar, tau_bar)
+            _step_adjoint(State(states[s, 0], states[s, 1]), tau, scene, work, after_bar, tau_bar)
         for i in range(n):
             bars.q[k, i] += after_bar.q[i]
             bars.v[k, i] += after_bar.v[i]
-            if abs(motion.command[k, i]) <= scene.limit[i]:
+            if abs(run.command[k, i]) <= scene.limit[i]:
                 bars.command[k, i] += tau_bar[i]
-        _ask_adjoint(k, course, scene, law, work, motion, bars, law_bar)
-
-
-@inlined
-def _on(path: Vec, s: int, n: int) -> State:
-    """State s of a path."""
-    return State(row(path, 2 * s, n), row(path, 2 * s + 1, n))
-
-
-@inlined
-def _copy(state: State, to: State) -> None:
-    for i in range(len(to.q)):
-        to.q[i], to.v[i] = state.q[i], state.v[i]
+        _ask_adjoint(k, course, scene, law, work, run, bars, law_bar)
 
 
 @inlined
@@ -194,29 +166,29 @@ def _clip(command: Vec, tau_d: Vec, scene: Scene, tau: Vec) -> None:
 
 
 @inlined
-def _ahead(k: int, course: Course, motion: Rollout, seen: State) -> Target:
+def _ahead(k: int, course: Course, run: Rollout, seen: State) -> Target:
     """The state that the law sees at instant k → seen; where it is to go."""
     aim, lead = course.aims[k], course.leads[k]
     for i in range(len(seen.q)):
         dv = lead * aim[0, i]
-        seen.q[i], seen.v[i] = motion.q[k, i] + lead * (motion.v[k, i] + 0.5 * dv), motion.v[k, i] + dv
+        seen.q[i], seen.v[i] = run.q[k, i] + lead * (run.v[k, i] + 0.5 * dv), run.v[k, i] + dv
     return Target(aim[1], aim[2], aim[3])
 
 
 @inlined
-def _remembered(k: int, motion: Rollout) -> Memory:
+def _remembered(k: int, run: Rollout) -> Memory:
     """What a PID remembers at instant k."""
-    return Memory(motion.memory[k, 0], motion.memory[k, 1])
+    return Memory(run.memory[k, 0], run.memory[k, 1])
 
 
 @kernel
-def _ask(k: int, course: Course, scene: Scene, law: Packed, work: Vec, motion: Rollout) -> None:
+def _ask(k: int, course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout) -> None:
     """The torque that the law asks for at instant k, and what it remembers afterwards."""
     q, v, work = take2(work, len(scene.limit))
-    seen, tau = State(q, v), motion.command[k]
-    target = _ahead(k, course, motion, seen)
+    seen, tau = State(q, v), run.command[k]
+    target = _ahead(k, course, run, seen)
     if law.layout[LAW] == LawCode.PID:
-        memory, after, aim = _remembered(k, motion), _remembered(k + 1, motion), State(target.q, target.v)
+        memory, after, aim = _remembered(k, run), _remembered(k + 1, run), State(target.q, target.v)
         pid_step(memory, seen, aim, scene.period, pid_of(law.weights), tau, after)
     else:
         torque_of(seen, target, law, scene.belief, work, tau)
@@ -224,16 +196,16 @@ def _ask(k: int, course: Course, scene: Scene, law: Packed, work: Vec, motion: R
 
 @kernel
 def _ask_adjoint(
-    k: int, course: Course, scene: Scene, law: Packed, work: Vec, motion: Rollout, bars: Rollout, law_bar: Packed
+    k: int, course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout, bars: Rollout, law_bar: Packed
 ) -> None:
     """Adds to the cotangents of the state at instant k, of what a PID remembers there, and of the law's weights."""
     n, lead, tau_bar = len(scene.limit), course.leads[k], bars.command[k]
     q, v, q_bar, v_bar, work = take4(work, n)
     seen, seen_bar = State(q, v), State(q_bar, v_bar)
-    target = _ahead(k, course, motion, seen)
+    target = _ahead(k, course, run, seen)
     q_bar[:], v_bar[:] = 0.0, 0.0
     if law.layout[LAW] == LawCode.PID:
-        memory, aim = _remembered(k, motion), State(target.q, target.v)
+        memory, aim = _remembered(k, run), State(target.q, target.v)
         memory_bar, after_bar = _remembered(k, bars), _remembered(k + 1, bars)
         pid_adjoint(
             memory, seen, aim, scene.period, law.weights, tau_bar, after_bar, memory_bar, seen_bar, law_bar.weights
@@ -310,7 +282,7 @@ def _tableau(integrator: int, s: int) -> tuple[int, float, float, float]:
 def _run_stages(state: State, tau: Vec, scene: Scene, stages: Stages, work: Vec) -> None:
     """The states and accelerations of the integrator's stages."""
     n, h = len(tau), scene.step
-    _copy(state, State(row(stages.q, 0, n), row(stages.v, 0, n)))
+    stages.q[:n], stages.v[:n] = state.q, state.v
     _accelerate(0, stages, tau, scene, work)
     for s in range(1, _tableau(scene.integrator, 0)[0]):
         c = _tableau(scene.integrator, s)[2]

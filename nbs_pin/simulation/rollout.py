@@ -15,12 +15,11 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.model_law import ModelLaw
-from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.layout import IntegratorCode, Packed, known
 from nbs_pin.kernels.rollouts import (
     Course,
     Rollout,
     Scene,
-    integrator_code,
     rollout,
     rollout_adjoint,
     rollout_workspace,
@@ -192,7 +191,7 @@ def _scene(controller: Controller, loop: Loop) -> Scene | None:
         period=float(loop.period),
         step=float(loop.step),
         substeps=int(loop.substeps),
-        integrator=integrator_code(plant.integrator),
+        integrator=int(known(plant.integrator, IntegratorCode, "integrator")),
         limit=loop.limit,
         viscous=viscous,
         coulomb=coulomb,
