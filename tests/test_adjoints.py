@@ -11,7 +11,7 @@ from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.potential import Potential
 from nbs_pin.kernels.convex import subtract_tangent
 from nbs_pin.kernels.convex_adjoint import pull_back, room_for_potential, taped
-from nbs_pin.kernels.damping_adjoint import damping_adjoint, room_for_damping
+from nbs_pin.kernels.damping import damping_adjoint, room_for_damping
 from nbs_pin.kernels.law_adjoints import adjoint_workspace, law_adjoint, pid_adjoint
 from nbs_pin.kernels.laws import law_signals, law_workspace, pid
 from nbs_pin.kernels.layout import (

@@ -15,8 +15,7 @@ from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.damping import DAMPINGS, Damping
 from nbs_pin.kernels.convex import activation, potential
-from nbs_pin.kernels.damping import damping_force
-from nbs_pin.kernels.damping_adjoint import damping_adjoint, room_for_damping
+from nbs_pin.kernels.damping import damping_adjoint, damping_force, room_for_damping
 from nbs_pin.kernels.law_adjoints import law_adjoint
 from nbs_pin.kernels.laws import law_signals
 from nbs_pin.kernels.layout import (

@@ -1,7 +1,7 @@
 """M̂ a + Ĉ w + Ĝ of a network with M̂ = R LLᵀ R + εI: one pass forward with two tangents, one pass back.
 
-layout     n, depth, joints that turn, largest layer, then per layer: size, row length, offset, then the joints in the
-           order of the features
+layout     n, depth, joints that turn, widest row or column, then per layer: size, row length, offset, then the joints
+           in the order of the features
 weights    R (n), ε, scale of V̂, layers [W | b | 0] padded as in `layout.py`
 """
 
@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nbs_pin.kernels.convex_adjoint import add_transposed
 from nbs_pin.kernels.damping import tanh
 from nbs_pin.kernels.jit import kernel
-from nbs_pin.kernels.layout import CODE, DEPTH, LAYERS, PADDING, PER_LAYER, SIZE, WIDEST, Packed
+from nbs_pin.kernels.layout import CODE, DEPTH, LAYERS, PADDING, PER_LAYER, SIZE, WIDEST, Packed, assembled, padded
+from nbs_pin.kernels.matrices import add_transposed
 from nbs_pin.kernels.records import Mat, Vec
 from nbs_pin.kernels.threads import over_cores
 from nbs_pin.kernels.views import layer, row, take
@@ -54,12 +54,9 @@ def pack_cholesky(
         epsilon: ε [kg·m²].
         energy: scale of V̂ [J].
     """
-    matrices = [np.column_stack([w, b, np.zeros((len(b), -(w.shape[1] + 1) % PADDING))]) for w, b in layers]
-    offsets = len(root) + 2 + np.cumsum([0, *(m.size for m in matrices)])
-    table = [(*m.shape, offset) for m, offset in zip(matrices, offsets[:-1], strict=True)]
-    first = [len(root), len(layers), turning, max(max(m.shape) for m in matrices)]
-    weights = np.concatenate([root, [epsilon, energy], *(m.ravel() for m in matrices)])
-    return Packed(np.concatenate([first, np.ravel(table), joints]).astype(np.int64), weights.astype(float))
+    matrices, scales = [padded(w, b) for w, b in layers], np.array([epsilon, energy])
+    layout, weights = assembled([len(root), len(layers), turning], [root, scales], matrices)
+    return Packed(np.concatenate([layout, joints]).astype(np.int64), weights)
 
 
 def cholesky_workspace(part: Packed) -> int:

@@ -6,6 +6,7 @@ import numpy as np
 
 from nbs_pin.kernels.jit import inlined, kernel
 from nbs_pin.kernels.layout import PADDING, ActivationCode, Packed, workspace
+from nbs_pin.kernels.matrices import times_dual
 from nbs_pin.kernels.records import Dual, Vec
 from nbs_pin.kernels.views import layer, potential_of, row, take2, take4
 
@@ -26,19 +27,6 @@ def activation(code: int, parameter: float, a: float) -> tuple[float, float, flo
 
 
 @kernel
-def times(matrix: Vec, u: Vec, du: Vec, a: Vec, da: Vec) -> None:
-    """W u → a and W u̇ → ȧ, the rows of W end to end in `matrix`."""
-    length = len(u)
-    for i in range(len(a)):
-        w = row(matrix, i, length)
-        x, dx = 0.0, 0.0
-        for j in range(length):
-            x += w[j] * u[j]
-            dx += w[j] * du[j]
-        a[i], da[i] = x, dx
-
-
-@kernel
 def convex_forward(part: Packed, u: Vec, du: Vec, slope: Vec, bend: Vec) -> float:
     """f(x) of a convex network, and in the tapes σ'(a) and σ''(a)ȧ of every layer, for x in u[:n] and ẋ in du[:n]."""
     phi = potential_of(part)
@@ -48,7 +36,7 @@ def convex_forward(part: Packed, u: Vec, du: Vec, slope: Vec, bend: Vec) -> floa
     for k in range(phi.depth):
         size, length, matrix = layer(part, k)
         s, b, y, dy = slope[at : at + size], bend[at : at + size], u[n + 1 :], du[n + 1 :]
-        times(matrix, u[:length], du[:length], s, b)
+        times_dual(matrix, u[:length], du[:length], s, b)
         for i in range(size):
             y[i], first, second, _ = activation(code, parameter, s[i])
             s[i], dy[i], b[i] = first, first * b[i], second * b[i]
@@ -94,7 +82,7 @@ def potential(error: Dual, part: Packed, work: Vec, out: Dual) -> float:
         u[i], du[i] = phi.scale[i] * z[i], phi.scale[i] * dz[i]
     value = convex_forward(part, u, du, slope, bend) - phi.value[0]
     convex_reverse(part, slope, bend, g, dg)
-    times(phi.stiffness, z, dz, out.value, out.rate)
+    times_dual(phi.stiffness, z, dz, out.value, out.rate)
     for i in range(phi.n):
         value += z[i] * (0.5 * out.value[i] - phi.scale[i] * phi.tangent[i])
         out.value[i] += phi.scale[i] * (g[i] - phi.tangent[i])

@@ -27,11 +27,12 @@ The tape holds u, u₁, u₂, u₁₂ of every layer, and eight numbers per unit
 
 from collections import namedtuple
 
-from nbs_pin.kernels.convex import activation, times
+from nbs_pin.kernels.convex import activation
 from nbs_pin.kernels.jit import inlined, kernel
 from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.matrices import add_transposed, times_adjoint, times_dual
 from nbs_pin.kernels.records import Dual, Vec
-from nbs_pin.kernels.views import layer, potential_of, row, take, take2, take4
+from nbs_pin.kernels.views import layer, potential_of, row, take, take2
 
 U, U_1, U_2, U_12, CHANNELS = range(5)
 """Where the inputs of a layer lie on the tape, and how many they are."""
@@ -74,22 +75,6 @@ def tape_in(part: Packed, work: Vec) -> Tape:
 
 
 @kernel
-def add_transposed(matrix: Vec, d: Vec, g: Vec) -> None:
-    """Add Wᵀδ to g, four rows of W at a time so that g is fetched and stored less often."""
-    size, length = len(d), len(g)
-    whole = size - size % 4
-    for i in range(0, whole, 4):
-        r0, r1, r2, r3, _ = take4(matrix[i * length :], length)
-        d0, d1, d2, d3 = d[i], d[i + 1], d[i + 2], d[i + 3]
-        for j in range(length):
-            g[j] += d0 * r0[j] + d1 * r1[j] + d2 * r2[j] + d3 * r3[j]
-    for i in range(whole, size):
-        w, di = row(matrix, i, length), d[i]
-        for j in range(length):
-            g[j] += di * w[j]
-
-
-@kernel
 def forward(part: Packed, tape: Tape) -> None:
     """u, u₁ of every layer from those of the first, and per unit σ', σ'', σ''' and a₁."""
     phi, here, at = potential_of(part), 0, 0
@@ -97,10 +82,11 @@ def forward(part: Packed, tape: Tape) -> None:
     for k in range(phi.depth):
         size, length, matrix = layer(part, k)
         end, there = at + size, here + length
+        tape.inputs[U, here + phi.n] = 1.0
         y, y1 = tape.inputs[U, there + phi.n + 1 :], tape.inputs[U_1, there + phi.n + 1 :]
         slope, bend, third = tape.units[SLOPE, at:end], tape.units[BEND, at:end], tape.units[THIRD, at:end]
         a, a1 = tape.units[DELTA_12, at:end], tape.units[ALONG, at:end]
-        times(matrix, tape.inputs[U, here:there], tape.inputs[U_1, here:there], a, a1)
+        times_dual(matrix, tape.inputs[U, here:there], tape.inputs[U_1, here:there], a, a1)
         for i in range(size):
             y[i], slope[i], bend[i], third[i] = activation(code, parameter, a[i])
             y1[i] = slope[i] * a1[i]
@@ -141,7 +127,7 @@ def forward_again(part: Packed, tape: Tape) -> None:
         y2, y12 = tape.inputs[U_2, there + phi.n + 1 :], tape.inputs[U_12, there + phi.n + 1 :]
         slope, bend_a1 = tape.units[SLOPE, at:end], tape.units[ALONG, at:end]
         a2, a12 = tape.units[DELTA_1, at:end], tape.units[DELTA, at:end]
-        times(matrix, tape.inputs[U_2, here:there], tape.inputs[U_12, here:there], a2, a12)
+        times_dual(matrix, tape.inputs[U_2, here:there], tape.inputs[U_12, here:there], a2, a12)
         for i in range(size):
             y2[i], y12[i] = slope[i] * a2[i], slope[i] * a12[i] + bend_a1[i] * a2[i]
         here, at = there, end
@@ -184,12 +170,13 @@ def add_outer(tape: Tape, at: int, here: int, size: int, length: int, matrix_bar
 
 
 @kernel
-def spread(part: Packed, tape: Tape, channel: int, z: Vec) -> None:
-    """Rz, the part of u that all layers share, into one channel of their inputs."""
+def spread(part: Packed, tape: Tape, channel: int, z: Vec, dz: Vec) -> None:
+    """Rz and Rż, the part of u that all layers share, into two channels of their inputs."""
     phi, here = potential_of(part), 0
     for k in range(phi.depth):
         for i in range(phi.n):
             tape.inputs[channel, here + i] = phi.scale[i] * z[i]
+            tape.inputs[channel + 1, here + i] = phi.scale[i] * dz[i]
         here += layer(part, k)[1]
 
 
@@ -198,15 +185,10 @@ def taped(error: Dual, part: Packed, work: Vec, out: Dual) -> None:
     """∇Φ(z) and ∇²Φ(z) ż → out as `convex.potential`; work keeps what `pull_back` needs."""
     phi, tape = potential_of(part), tape_in(part, work)
     tape.inputs[:] = 0.0
-    here = phi.n
-    for k in range(phi.depth):
-        tape.inputs[U, here] = 1.0
-        here += layer(part, k)[1]
-    spread(part, tape, U, error.value)
-    spread(part, tape, U_1, error.rate)
+    spread(part, tape, U, error.value, error.rate)
     forward(part, tape)
     reverse(part, tape)
-    times(phi.stiffness, error.value, error.rate, out.value, out.rate)
+    times_dual(phi.stiffness, error.value, error.rate, out.value, out.rate)
     for i in range(phi.n):
         tape.psi.value[i], tape.psi.rate[i] = tape.lam.value[i] - phi.tangent[i], tape.lam.rate[i]
         out.value[i] += phi.scale[i] * tape.psi.value[i]
@@ -223,8 +205,7 @@ def pull_back(error: Dual, out_bar: Dual, part: Packed, work: Vec, error_bar: Du
     part_bar = Packed(part.layout, weights_bar)
     phi, phi_bar, tape = potential_of(part), potential_of(part_bar), tape_in(part, work)
     n, psi, force_bar, rate_bar = phi.n, tape.psi, out_bar.value, out_bar.rate
-    spread(part, tape, U_2, rate_bar)
-    spread(part, tape, U_12, force_bar)
+    spread(part, tape, U_2, rate_bar, force_bar)
     forward_again(part, tape)
     reverse_again(part, tape, part_bar)
     x_bar, dx_bar = tape.lam.value, tape.lam.rate
@@ -234,9 +215,5 @@ def pull_back(error: Dual, out_bar: Dual, part: Packed, work: Vec, error_bar: Du
         phi_bar.tangent[i] -= phi.scale[i] * force_bar[i]
         phi_bar.scale[i] += error.value[i] * x_bar[i] + error.rate[i] * dx_bar[i]
         phi_bar.scale[i] += rate_bar[i] * psi.rate[i] + force_bar[i] * psi.value[i]
-    for i in range(n):
-        stiffness, stiffness_bar = row(phi.stiffness, i, n), row(phi_bar.stiffness, i, n)
-        for j in range(n):
-            error_bar.value[j] += stiffness[j] * force_bar[i]
-            error_bar.rate[j] += stiffness[j] * rate_bar[i]
-            stiffness_bar[j] += force_bar[i] * error.value[j] + rate_bar[i] * error.rate[j]
+    times_adjoint(phi.stiffness, error.value, force_bar, error_bar.value, phi_bar.stiffness)
+    times_adjoint(phi.stiffness, error.rate, rate_bar, error_bar.rate, phi_bar.stiffness)

@@ -4,7 +4,7 @@ import math
 
 from nbs_pin.kernels import layout as at
 from nbs_pin.kernels.convex_adjoint import pull_back, room_for_potential, taped
-from nbs_pin.kernels.damping_adjoint import damping_adjoint, room_for_damping
+from nbs_pin.kernels.damping import damping_adjoint, room_for_damping
 from nbs_pin.kernels.jit import exact_kernel, kernel
 from nbs_pin.kernels.laws import errors, pid_terms
 from nbs_pin.kernels.layout import LawCode, Packed

@@ -23,7 +23,7 @@ _VEC, _MAT, _PACKED = float64[::1], float64[:, ::1], (int64[::1], float64[::1])
 
 
 def compile_laws() -> None:
-    """Compile `law_signals`, `tree_law` and `pid` for float64, so that no first call waits for the compiler."""
+    """Compile `law_signals` and `pid` for float64, so that no first call waits for the compiler."""
     compile_for(law_signals, boolean(*[_VEC] * 5, *_PACKED, _VEC, _MAT))
     compile_for(pid, boolean(*[_VEC] * 6, float64, _VEC, _MAT))
 
@@ -106,18 +106,18 @@ def linear_law(now: Tracking, law: Packed, out: Signals) -> None:
     """Slotine–Li, computed torque and PD: the same signals without networks; of any other law NaN."""
     code, first, second = law.layout[at.LAW], vector(law, at.FIRST), vector(law, at.SECOND)
     for i in range(len(now.v)):
+        v_r, a_r, feedback = math.nan, math.nan, math.nan
         pd = -first[i] * now.z1[i] - second[i] * now.dz1[i]
         if code == LawCode.SLOTINE_LI:
-            out.v_r[i], out.a_r[i] = now.v_ref[i] - first[i] * now.z1[i], now.a_ref[i] - first[i] * now.dz1[i]
-            out.feedback[i] = -second[i] * (now.v[i] - out.v_r[i])
+            v_r, a_r = now.v_ref[i] - first[i] * now.z1[i], now.a_ref[i] - first[i] * now.dz1[i]
+            feedback = -second[i] * (now.v[i] - v_r)
         elif code == LawCode.COMPUTED_TORQUE:
-            out.v_r[i], out.a_r[i], out.feedback[i] = now.v[i], now.a_ref[i] + pd, 0.0
+            v_r, a_r, feedback = now.v[i], now.a_ref[i] + pd, 0.0
         elif code == LawCode.PD_REFERENCE:
-            out.v_r[i], out.a_r[i], out.feedback[i] = now.v_ref[i], now.a_ref[i], pd
+            v_r, a_r, feedback = now.v_ref[i], now.a_ref[i], pd
         elif code == LawCode.PD_GRAVITY:
-            out.v_r[i], out.a_r[i], out.feedback[i] = 0.0, 0.0, pd
-        else:
-            out.v_r[i], out.a_r[i], out.feedback[i] = math.nan, math.nan, math.nan
+            v_r, a_r, feedback = 0.0, 0.0, pd
+        out.v_r[i], out.a_r[i], out.feedback[i] = v_r, a_r, feedback
 
 
 @inlined

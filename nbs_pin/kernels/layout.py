@@ -7,10 +7,10 @@ a multiple of 8 numbers:
     input-convex layer   a = [Wx | b | Wy | 0] · [x, 1, y, 0]
     tanh layer           a = [W | b | 0] · [h, 1, 0]
 
-    potential layout     n, depth, activation, widest row, then per layer: size, row length, offset
+    potential layout     n, depth, activation, widest row or column, then per layer: size, row length, offset
     potential weights    activation parameter, f(0), R (n), ∇f(0) (n), 2S (n, n), layers
-    damping layout       n, depth, form, widest row, then per layer of the diagonal network and then of the lower one:
-                         size, row length, offset
+    damping layout       n, depth, form, widest row or column, then per layer of the diagonal network and then of the
+                         lower one: size, row length, offset
     damping weights      m, R (n), D₀ (n, n), layers
     law layout           law, n, 1 with friction, start of the potential in the layout and in the weights, the same of
                          the damping, numbers of scratch space
@@ -82,7 +82,7 @@ WRAPS, FIRST, SECOND, VISCOUS, COULOMB, VECTORS = range(6)
 TRANSITION, OMEGA = range(2)
 """Vectors (n,) that a law's weights begin with, and numbers that follow them."""
 SIZE, DEPTH, CODE, WIDEST, LAYERS = range(5)
-"""Where n, depth, code and widest row of a network's layout lie, and where its layers begin."""
+"""Where n, depth, code and widest row or column of a network's layout lie, and where its layers begin."""
 PER_LAYER = 3
 """Numbers in the layout for each layer."""
 
@@ -134,10 +134,10 @@ def pack_potential(
         ArgumentError: for an activation that no kernel knows.
     """
     code, parameter = known(activation[0], ActivationCode, "activation"), activation[1]
-    matrices = [_padded(wx, bias, wy) for wy, wx, bias in layers]
+    matrices = [padded(wx, bias, wy) for wy, wx, bias in layers]
     value, gradient = (0.0 * scale[0], 0.0 * scale) if tangent is None else tangent
     head = [_vector(scale, parameter), value[None], scale, gradient, 2.0 * stiffness.ravel()]
-    return _assembled([len(scale), len(layers), code], head, matrices)
+    return assembled([len(scale), len(layers), code], head, matrices)
 
 
 def pack_damping(
@@ -160,9 +160,9 @@ def pack_damping(
         ArgumentError: for a form that no kernel knows.
     """
     code = known(form, DampingCode, "form of a damping")
-    matrices = [_padded(weight, bias) for network in networks for weight, bias in network]
+    matrices = [padded(weight, bias) for network in networks for weight, bias in network]
     head = [_vector(scale, m), scale, floor.ravel()]
-    return _assembled([len(scale), len(networks[0]), code], head, matrices)
+    return assembled([len(scale), len(networks[0]), code], head, matrices)
 
 
 def pack_law(
@@ -239,7 +239,7 @@ def _joined(vectors: list[Array]) -> Array:
     return xp.astype(xp.concat(vectors), xp.float64, copy=False)
 
 
-def _padded(inputs: Array, bias: Array | None, others: Array | None = None) -> Array:
+def padded(inputs: Array, bias: Array | None, others: Array | None = None) -> Array:
     """[Wx | b | Wy | 0], row after row; a network without biases has zeros for them."""
     xp = array_namespace(inputs)
     size, width = inputs.shape[0], inputs.shape[1] + 1 + (0 if others is None else others.shape[1])
@@ -248,10 +248,11 @@ def _padded(inputs: Array, bias: Array | None, others: Array | None = None) -> A
     return xp.concat([x for x in (inputs, column, others, padding) if x is not None], axis=1)
 
 
-def _assembled(head: list[int], constants: list[Array], matrices: list[Array]) -> Packed:
+def assembled(head: list[int], constants: list[Array], matrices: list[Array]) -> Packed:
+    """A network of those layers, with n, depth and code in head."""
     start = sum(len(c) for c in constants)
     offsets = start + np.cumsum([0, *(m.shape[0] * m.shape[1] for m in matrices)])
     table = [(*m.shape, offset) for m, offset in zip(matrices, offsets[:-1], strict=True)]
-    widest = max(m.shape[1] for m in matrices)
+    widest = max(max(m.shape) for m in matrices)
     layout = np.concatenate([[*head, widest], np.ravel(table)]).astype(np.int64)
     return Packed(layout, _joined([*constants, *(m.ravel() for m in matrices)]))

@@ -114,14 +114,7 @@ def rollout(course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout) 
 
 @kernel
 def rollout_adjoint(
-    course: Course,
-    scene: Scene,
-    law: Packed,
-    work: Vec,
-    run: Rollout,
-    bars: Rollout,
-    tau_d_bar: Mat,
-    law_bar: Packed,
+    course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout, bars: Rollout, tau_d_bar: Mat, law_bar: Packed
 ) -> None:
     """What a number that depends on a motion gains per start, disturbance and weight of the law.
 
@@ -223,15 +216,6 @@ def _ask_adjoint(
         bars.v[k, i] += v_bar[i] + lead * q_bar[i]
 
 
-@inlined
-def _stages_in(work: Vec, n: int) -> tuple[Stages, Vec]:
-    """Stages in scratch space, and the rest of it."""
-    q, v, a, work = take3(work, STAGES * n)
-    net, work = take(work, n)
-    factors, work = take(work, STAGES * n * n)
-    return Stages(q, v, a, net, factors.reshape(STAGES, n, n)), work
-
-
 @kernel
 def _accelerate(s: int, stages: Stages, tau: Vec, scene: Scene, work: Vec) -> None:
     """v̇ of the plant with its friction, at the state of stage s."""
@@ -278,27 +262,29 @@ def _tableau(integrator: int, s: int) -> tuple[int, float, float, float]:
     return 1, math.nan, math.nan, math.nan
 
 
-@kernel
-def _run_stages(state: State, tau: Vec, scene: Scene, stages: Stages, work: Vec) -> None:
-    """The states and accelerations of the integrator's stages."""
+@inlined
+def _run_stages(state: State, tau: Vec, scene: Scene, work: Vec) -> tuple[Stages, Vec]:
+    """The states and accelerations of the integrator's stages in scratch space, and the rest of that."""
     n, h = len(tau), scene.step
-    stages.q[:n], stages.v[:n] = state.q, state.v
+    q, v, a, work = take3(work, STAGES * n)
+    net, work = take(work, n)
+    factors, work = take(work, STAGES * n * n)
+    stages = Stages(q, v, a, net, factors.reshape(STAGES, n, n))
+    q[:n], v[:n] = state.q, state.v
     _accelerate(0, stages, tau, scene, work)
     for s in range(1, _tableau(scene.integrator, 0)[0]):
-        c = _tableau(scene.integrator, s)[2]
-        q, v = row(stages.q, s, n), row(stages.v, s, n)
-        v_before, a_before = row(stages.v, s - 1, n), row(stages.a, s - 1, n)
+        c, before, now = _tableau(scene.integrator, s)[2], (s - 1) * n, s * n
         for i in range(n):
-            q[i], v[i] = state.q[i] + c * h * v_before[i], state.v[i] + c * h * a_before[i]
+            q[now + i], v[now + i] = state.q[i] + c * h * v[before + i], state.v[i] + c * h * a[before + i]
         _accelerate(s, stages, tau, scene, work)
+    return stages, work
 
 
 @kernel
 def _step(state: State, tau: Vec, scene: Scene, work: Vec) -> None:
     """One plant step in place."""
     n, h = len(tau), scene.step
-    stages, work = _stages_in(work, n)
-    _run_stages(state, tau, scene, stages, work)
+    stages, work = _run_stages(state, tau, scene, work)
     count, _, _, ahead = _tableau(scene.integrator, 0)
     for s in range(count):
         b, v, a = _tableau(scene.integrator, s)[1], row(stages.v, s, n), row(stages.a, s, n)
@@ -314,8 +300,7 @@ def _step_adjoint(state: State, tau: Vec, scene: Scene, work: Vec, state_bar: St
     The cotangent of k_s is b_s h x̄⁺ + c_{s+1} h x̄_{s+1} (`_tableau`), and that of x is x̄⁺ + Σ x̄_s.
     """
     n, h = len(tau), scene.step
-    stages, work = _stages_in(work, n)
-    _run_stages(state, tau, scene, stages, work)
+    stages, work = _run_stages(state, tau, scene, work)
     count, _, _, ahead = _tableau(scene.integrator, 0)
     a_bar, q_sum, v_sum, work = take3(work, n)
     q_s, v_s, work = take2(work, n)

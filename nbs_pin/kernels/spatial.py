@@ -30,21 +30,14 @@ def add(x: Vec, at: int, y: Three) -> None:
 @inlined
 def times(x: Vec, at: int, y: Three) -> Three:
     """The matrix that begins there, times y."""
-    return (
-        x[at] * y[0] + x[at + 1] * y[1] + x[at + 2] * y[2],
-        x[at + 3] * y[0] + x[at + 4] * y[1] + x[at + 5] * y[2],
-        x[at + 6] * y[0] + x[at + 7] * y[1] + x[at + 8] * y[2],
-    )
+    return dot(get(x, at), y), dot(get(x, at + 3), y), dot(get(x, at + 6), y)
 
 
 @inlined
 def transposed_times(x: Vec, at: int, y: Three) -> Three:
     """The transpose of the matrix that begins there, times y."""
-    return (
-        x[at] * y[0] + x[at + 3] * y[1] + x[at + 6] * y[2],
-        x[at + 1] * y[0] + x[at + 4] * y[1] + x[at + 7] * y[2],
-        x[at + 2] * y[0] + x[at + 5] * y[1] + x[at + 8] * y[2],
-    )
+    a, b, c = get(x, at), get(x, at + 3), get(x, at + 6)
+    return dot((a[0], b[0], c[0]), y), dot((a[1], b[1], c[1]), y), dot((a[2], b[2], c[2]), y)
 
 
 @inlined
@@ -57,3 +50,15 @@ def plus(x: Three, y: Three) -> Three:
 def cross(x: Three, y: Three) -> Three:
     """The vector product."""
     return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
+
+
+@inlined
+def dot(x: Three, y: Three) -> float:
+    """The scalar product."""
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+@inlined
+def scaled(a: float, x: Three) -> Three:
+    """The multiple."""
+    return a * x[0], a * x[1], a * x[2]

@@ -29,7 +29,7 @@ from collections import namedtuple
 from nbs_pin.kernels.jit import inlined
 from nbs_pin.kernels.layout import JointCode, Packed
 from nbs_pin.kernels.records import Vec
-from nbs_pin.kernels.spatial import Three, add, cross, get, plus, put, times, transposed_times
+from nbs_pin.kernels.spatial import Three, add, cross, dot, get, plus, put, scaled, times, transposed_times
 from nbs_pin.kernels.tree_layout import BASE, BODY, FIRST, MASS, PER_JOINT, ROW, SECOND, TREE_JOINTS
 
 R, P, V, W, ALPHA, A, B, F, N = 0, 9, 12, 15, 18, 21, 24, 33, 36
@@ -91,17 +91,21 @@ def move(joint: Joint, v: float, w: float, a: float) -> None:
 
 
 @inlined
+def second_moments(body: Vec) -> tuple[Three, Three, Three]:
+    """The rows of E."""
+    (xx, xy, xz), (yy, yz, zz) = get(body, SECOND), get(body, SECOND + 3)
+    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+
+
+@inlined
 def load(joint: Joint) -> None:
     """F = m a + Bh and N = h × a + Σ m x × Bx of a body alone."""
     body, row = joint.body, joint.row
-    m, h, (ax, ay, az) = body[MASS], get(body, FIRST), get(row, A)
-    (exx, exy, exz), (eyy, eyz, ezz) = get(body, SECOND), get(body, SECOND + 3)
-    (bxx, bxy, bxz), (byx, byy, byz), (bzx, bzy, bzz) = get(row, B), get(row, B + 3), get(row, B + 6)
-    put(row, F, plus((m * ax, m * ay, m * az), times(row, B, h)))
-    x, y, z = cross(h, (ax, ay, az))
-    row[N] = x + bzx * exy + bzy * eyy + bzz * eyz - byx * exz - byy * eyz - byz * ezz
-    row[N + 1] = y + bxx * exz + bxy * eyz + bxz * ezz - bzx * exx - bzy * exy - bzz * exz
-    row[N + 2] = z + byx * exx + byy * exy + byz * exz - bxx * exy - bxy * eyy - bxz * eyz
+    h, a, (ex, ey, ez) = get(body, FIRST), get(row, A), second_moments(body)
+    bx, by, bz = get(row, B), get(row, B + 3), get(row, B + 6)
+    put(row, F, plus(scaled(body[MASS], a), times(row, B, h)))
+    axial = dot(bz, ey) - dot(by, ez), dot(bx, ez) - dot(bz, ex), dot(by, ex) - dot(bx, ey)
+    put(row, N, plus(cross(h, a), axial))
 
 
 @inlined
@@ -121,26 +125,18 @@ def couple(joint: Joint) -> None:
     by ω̄ = Kω' and ω̄' = Kω with K = ½(B̄ + B̄ᵀ) − tr(B̄)1.
     """
     body, row = joint.body, joint.row
-    m, (hx, hy, hz) = body[MASS], get(body, FIRST)
-    (exx, exy, exz), (eyy, eyz, ezz) = get(body, SECOND), get(body, SECOND + 3)
-    (ux, uy, uz), (x, y, z) = get(row, U), get(row, SPIN)
-    add(row, A_BAR, plus((m * ux, m * uy, m * uz), cross((x, y, z), (hx, hy, hz))))
-    bxx = row[B_BAR] + ux * hx + y * exz - z * exy
-    bxy = row[B_BAR + 1] + ux * hy + y * eyz - z * eyy
-    bxz = row[B_BAR + 2] + ux * hz + y * ezz - z * eyz
-    byx = row[B_BAR + 3] + uy * hx + z * exx - x * exz
-    byy = row[B_BAR + 4] + uy * hy + z * exy - x * eyz
-    byz = row[B_BAR + 5] + uy * hz + z * exz - x * ezz
-    bzx = row[B_BAR + 6] + uz * hx + x * exy - y * exx
-    bzy = row[B_BAR + 7] + uz * hy + x * eyy - y * exy
-    bzz = row[B_BAR + 8] + uz * hz + x * eyz - y * exz
-    add(row, ALPHA_BAR, (bzy - byz, bxz - bzx, byx - bxy))
-    kxx, kyy, kzz = -byy - bzz, -bxx - bzz, -bxx - byy
-    kxy, kxz, kyz = 0.5 * (bxy + byx), 0.5 * (bxz + bzx), 0.5 * (byz + bzy)
-    x, y, z = get(row, W)
-    add(row, V_BAR, (kxx * x + kxy * y + kxz * z, kxy * x + kyy * y + kyz * z, kxz * x + kyz * y + kzz * z))
-    x, y, z = get(row, V)
-    add(row, W_BAR, (kxx * x + kxy * y + kxz * z, kxy * x + kyy * y + kyz * z, kxz * x + kyz * y + kzz * z))
+    h, u, o, (ex, ey, ez) = get(body, FIRST), get(row, U), get(row, SPIN), second_moments(body)
+    add(row, A_BAR, plus(scaled(body[MASS], u), cross(o, h)))
+    add(row, B_BAR, plus(scaled(u[0], h), plus(scaled(o[1], ez), scaled(-o[2], ey))))
+    add(row, B_BAR + 3, plus(scaled(u[1], h), plus(scaled(o[2], ex), scaled(-o[0], ez))))
+    add(row, B_BAR + 6, plus(scaled(u[2], h), plus(scaled(o[0], ey), scaled(-o[1], ex))))
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = get(row, B_BAR), get(row, B_BAR + 3), get(row, B_BAR + 6)
+    add(row, ALPHA_BAR, (zy - yz, xz - zx, yx - xy))
+    kxy, kxz, kyz = 0.5 * (xy + yx), 0.5 * (xz + zx), 0.5 * (yz + zy)
+    kx, ky, kz = (-yy - zz, kxy, kxz), (kxy, -xx - zz, kyz), (kxz, kyz, -xx - yy)
+    v, w = get(row, V), get(row, W)
+    add(row, V_BAR, (dot(kx, w), dot(ky, w), dot(kz, w)))
+    add(row, W_BAR, (dot(kx, v), dot(ky, v), dot(kz, v)))
 
 
 @inlined
@@ -149,12 +145,11 @@ def hand_bars(joint: Joint) -> Three:
     row, up = joint.row, joint.up
     for at in (V_BAR, W_BAR, ALPHA_BAR):
         add(up, at, times(row, R, get(row, at)))
-    (x, y, z), (px, py, pz) = times(row, R, get(row, A_BAR)), get(row, P)
-    add(up, A_BAR, (x, y, z))
-    add(up, B_BAR, (x * px, x * py, x * pz))
-    add(up, B_BAR + 3, (y * px, y * py, y * pz))
-    add(up, B_BAR + 6, (z * px, z * py, z * pz))
-    return x, y, z
+    a_bar, p = times(row, R, get(row, A_BAR)), get(row, P)
+    add(up, A_BAR, a_bar)
+    for k in range(3):
+        add(up, B_BAR + 3 * k, scaled(a_bar[k], p))
+    return a_bar
 
 
 @inlined
@@ -203,18 +198,17 @@ def shift_bar(joint: Joint, a_bar: Three) -> Three:
 @inlined
 def join(joint: Joint) -> None:
     """Add m, h and E of a body and all behind it to its parent's: E → RERᵀ + (Rh)pᵀ + p(Rh)ᵀ + m ppᵀ."""
-    row, up, at = joint.row, joint.up, COMPOSITE + 4
-    m, (hx, hy, hz) = row[COMPOSITE], times(row, R, get(row, COMPOSITE + 1))
-    sx, sy, sz = times(row, R, (row[at], row[at + 1], row[at + 2]))
-    tx, ty, tz = times(row, R, (row[at + 1], row[at + 3], row[at + 4]))
-    ux, uy, uz = times(row, R, (row[at + 2], row[at + 4], row[at + 5]))
-    px, py, pz = get(row, P)
-    gx, gy, gz = hx + m * px, hy + m * py, hz + m * pz
+    row, up, at, p = joint.row, joint.up, COMPOSITE + 4, get(joint.row, P)
+    m, h = row[COMPOSITE], times(row, R, get(row, COMPOSITE + 1))
+    moved = plus(h, scaled(m, p))
     up[COMPOSITE] += m
-    add(up, COMPOSITE + 1, (gx, gy, gz))
-    up[at] += sx * row[0] + tx * row[1] + ux * row[2] + (hx + gx) * px
-    up[at + 1] += sx * row[3] + tx * row[4] + ux * row[5] + gx * py + px * hy
-    up[at + 2] += sx * row[6] + tx * row[7] + ux * row[8] + gx * pz + px * hz
-    up[at + 3] += sy * row[3] + ty * row[4] + uy * row[5] + (hy + gy) * py
-    up[at + 4] += sy * row[6] + ty * row[7] + uy * row[8] + gy * pz + py * hz
-    up[at + 5] += sz * row[6] + tz * row[7] + uz * row[8] + (hz + gz) * pz
+    add(up, COMPOSITE + 1, moved)
+    (xx, xy, xz), (yy, yz, zz) = get(row, at), get(row, at + 3)
+    ex, ey, ez = times(row, R, (xx, xy, xz)), times(row, R, (xy, yy, yz)), times(row, R, (xz, yz, zz))
+    k = at
+    for i in range(3):
+        for j in range(i, 3):  # (R E Rᵀ)_ij from the rows of E Rᵀ
+            up[k] += (
+                ex[i] * row[3 * j] + ey[i] * row[3 * j + 1] + ez[i] * row[3 * j + 2] + moved[i] * p[j] + p[i] * h[j]
+            )
+            k += 1

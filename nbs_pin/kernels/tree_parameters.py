@@ -10,7 +10,7 @@ from nbs_pin.kernels import tree_bodies as bodies
 from nbs_pin.kernels.jit import kernel
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.records import Mat, Motion, Vec
-from nbs_pin.kernels.spatial import get, put, transposed_times
+from nbs_pin.kernels.spatial import cross, dot, get, plus, put, transposed_times
 from nbs_pin.kernels.tree_bodies import A_BAR, SPIN, V_BAR, A, B, Joint, R, U, joint_of
 from nbs_pin.kernels.tree_layout import BASE, ROW, TREE_SIZE
 from nbs_pin.kernels.trees import gather, place, spread, sweep
@@ -24,19 +24,16 @@ COLUMNS, TURN, SHIFT, INERTIA, ROTOR = 17, 0, 3, 6, 16
 def _inertia_bars(joint: Joint, a: float, mu: float, bar: Vec) -> None:
     """u·F + o·N of one body, F = m a + Bh and N = h × a + Σ m x × Bx, is linear in m, h, E and the armature."""
     row = joint.row
-    (ux, uy, uz), (x, y, z), (ax, ay, az) = get(row, U), get(row, SPIN), get(row, A)
+    u, a_, (x, y, z) = get(row, U), get(row, A), get(row, SPIN)
     (bxx, bxy, bxz), (byx, byy, byz), (bzx, bzy, bzz) = get(row, B), get(row, B + 3), get(row, B + 6)
-    bar[INERTIA] = ux * ax + uy * ay + uz * az
-    bar[INERTIA + 1] = bxx * ux + byx * uy + bzx * uz + ay * z - az * y
-    bar[INERTIA + 2] = bxy * ux + byy * uy + bzy * uz + az * x - ax * z
-    bar[INERTIA + 3] = bxz * ux + byz * uy + bzz * uz + ax * y - ay * x
+    bar[INERTIA], bar[ROTOR] = dot(u, a_), a * mu
+    put(bar, INERTIA + 1, plus(transposed_times(row, B, u), cross(a_, (x, y, z))))
     bar[INERTIA + 4] = byx * z - bzx * y
     bar[INERTIA + 5] = bzx * x - bxx * z + byy * z - bzy * y
     bar[INERTIA + 6] = bxx * y - byx * x + byz * z - bzz * y
     bar[INERTIA + 7] = bzy * x - bxy * z
     bar[INERTIA + 8] = bxy * y - byy * x + bzz * x - bxz * z
     bar[INERTIA + 9] = bxz * y - byz * x
-    bar[ROTOR] = a * mu
 
 
 @kernel

@@ -172,14 +172,7 @@ def tree_acceleration(state: State, tau: Vec, tree: Packed, work: Vec, factor: M
 
 @kernel
 def tree_acceleration_adjoint(
-    state: State,
-    a: Vec,
-    a_bar: Vec,
-    tree: Packed,
-    work: Vec,
-    factor: Mat,
-    state_bar: State,
-    tau_bar: Vec,
+    state: State, a: Vec, a_bar: Vec, tree: Packed, work: Vec, factor: Mat, state_bar: State, tau_bar: Vec
 ) -> None:
     """Add the derivatives of āᵀa, a of `tree_acceleration`, with respect to q, v and τ to state_bar and tau_bar.
 
