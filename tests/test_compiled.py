@@ -458,6 +458,8 @@ def test_pid_refuses_what_does_not_fit():
 
 # Machine code on disk.
 
+machine_code = pytest.mark.skipif(jit.INTERPRETED, reason="NUMBA_DISABLE_JIT is set")
+
 PROCESS = """
 import numpy as np
 from nbs_pin.controllers.slotine_li import SlotineLi
@@ -483,12 +485,14 @@ def misses(folder: Path, package: Path) -> list[int]:
     return [int(x) for x in out.stdout.split()]
 
 
+@machine_code
 def test_a_second_process_does_not_compile(tmp_path):
     """`compile_laws` ran in this process or an earlier one; a new process loads what it left."""
     NeuralBackstepping.for_robot(load_robot("two_link")).compile()
     assert misses(tmp_path, Path(__file__).parent.parent) == [0, 0]
 
 
+@machine_code
 def test_machine_code_is_stamped_with_the_whole_folder():
     """numba looks at one file only; a change in a callee or a constant must renew its callers too."""
     stamps = {laws.law_signals._cache._cache_file._source_stamp, potential._cache._cache_file._source_stamp}
@@ -496,6 +500,7 @@ def test_machine_code_is_stamped_with_the_whole_folder():
     assert len(jit._SOURCES) == 64
 
 
+@machine_code
 def test_a_kernel_that_another_compiled_refuses_other_arguments_too():
     """Whatever was compiled before it in the process, the fast path meets a TypeError and converts."""
     inner = numba.njit(lambda x: x[0])
@@ -505,3 +510,16 @@ def test_a_kernel_that_another_compiled_refuses_other_arguments_too():
     assert inner(np.ones(1)) == 1.0
     with pytest.raises(TypeError):
         inner(np.ones((1, 1)))
+
+
+def test_an_interpreted_kernel_refuses_them_as_well(monkeypatch):
+    monkeypatch.setattr(jit, "INTERPRETED", True)
+    first = jit.kernel(lambda x: x[0])
+    assert first([2.0]) == 2.0  # any kernel takes anything before it is compiled for a signature
+    compile_for(first, numba.float64(numba.float64[::1]))
+    assert first(np.ones(1)) == 1.0
+    frozen = np.ones(1)
+    frozen.flags.writeable = False
+    for other in (np.ones((1, 1)), [1.0], np.ones(4)[::2], np.ones(1, dtype=np.float32), torch.ones(1), frozen, None):
+        with pytest.raises(TypeError, match="takes"):
+            first(other)

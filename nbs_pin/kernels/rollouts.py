@@ -247,19 +247,19 @@ def _accelerate_adjoint(
 
 
 @inlined
-def _tableau(integrator: int, s: int) -> tuple[int, float, float, float]:
-    """How many stages an integrator has, b_s, c_s, and the share of h²a in q⁺; NaN of one that is unknown.
+def _tableau(integrator: int, s: int) -> tuple[int, float, float, bool]:
+    """How many stages an integrator has, b_s, c_s, and whether v⁺ moves q; b_s of an unknown one is NaN.
 
-    With x_s the state of stage s and k_s = (v_s, a_s): x_s = x + c_s h k_{s−1} and x⁺ = x + h Σ b_s k_s, and with the
-    semi-implicit Euler method, which moves q with v⁺, another h²a in q⁺.
+    With x_s the state of stage s and k_s = (v_s, a_s): x_s = x + c_s h k_{s−1} and x⁺ = x + h Σ b_s k_s. Where v⁺ moves
+    q, h²a is added to q⁺.
     """
     if integrator == IntegratorCode.RK4:
-        return STAGES, 1.0 / 6.0 if s == 0 or s == 3 else 1.0 / 3.0, 0.0 if s == 0 else (1.0 if s == 3 else 0.5), 0.0
+        return STAGES, 1.0 / 6.0 if s in (0, 3) else 1.0 / 3.0, 0.0 if s == 0 else (1.0 if s == 3 else 0.5), False
     if integrator == IntegratorCode.SEMI_IMPLICIT_EULER:
-        return 1, 1.0, 0.0, 1.0
+        return 1, 1.0, 0.0, True
     if integrator == IntegratorCode.EULER:
-        return 1, 1.0, 0.0, 0.0
-    return 1, math.nan, math.nan, math.nan
+        return 1, 1.0, 0.0, False
+    return 1, math.nan, 0.0, False
 
 
 @inlined
@@ -289,8 +289,10 @@ def _step(state: State, tau: Vec, scene: Scene, work: Vec) -> None:
     for s in range(count):
         b, v, a = _tableau(scene.integrator, s)[1], row(stages.v, s, n), row(stages.a, s, n)
         for i in range(n):
-            state.q[i] += h * (b * v[i] + ahead * h * a[i])
+            state.q[i] += h * b * v[i]
             state.v[i] += h * b * a[i]
+            if ahead:
+                state.q[i] += h * h * a[i]
 
 
 @kernel
@@ -308,7 +310,9 @@ def _step_adjoint(state: State, tau: Vec, scene: Scene, work: Vec, state_bar: St
     for s in range(count - 1, -1, -1):
         b, c = h * _tableau(scene.integrator, s)[1], 0.0 if s + 1 == count else h * _tableau(scene.integrator, s + 1)[2]
         for i in range(n):
-            a_bar[i] = b * state_bar.v[i] + c * v_s[i] + ahead * h * h * state_bar.q[i]
+            a_bar[i] = b * state_bar.v[i] + c * v_s[i]
+            if ahead:
+                a_bar[i] += h * h * state_bar.q[i]
             v_s[i] = b * state_bar.q[i] + c * q_s[i]
             q_s[i] = 0.0
         _accelerate_adjoint(s, stages, a_bar, scene, work, State(q_s, v_s), tau_bar)
