@@ -5,15 +5,26 @@ layout     n, depth, joints that turn, widest row or column, then per layer: siz
 weights    R (n), ε, scale of V̂, layers [W | b | 0] padded as in `layout.py`
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from nbs_pin.kernels.damping import tanh
 from nbs_pin.kernels.jit import kernel
-from nbs_pin.kernels.layout import CODE, DEPTH, LAYERS, PADDING, PER_LAYER, SIZE, WIDEST, Packed, assembled, padded
-from nbs_pin.kernels.matrices import add_transposed
+from nbs_pin.kernels.layout import (
+    CODE,
+    DEPTH,
+    LAYERS,
+    PADDING,
+    PER_LAYER,
+    SIZE,
+    WIDEST,
+    Layers,
+    Packed,
+    assembled,
+    padded,
+)
+from nbs_pin.kernels.matrices import add_transposed, times, times_dual
 from nbs_pin.kernels.records import Mat, Vec
 from nbs_pin.kernels.threads import over_cores
 from nbs_pin.kernels.views import layer, row, take
@@ -37,12 +48,7 @@ class CholeskyTorque:
 
 
 def pack_cholesky(
-    layers: Sequence[tuple[np.ndarray, np.ndarray]],
-    joints: np.ndarray,
-    turning: int,
-    root: np.ndarray,
-    epsilon: float,
-    energy: float,
+    layers: Layers, joints: np.ndarray, turning: int, root: np.ndarray, epsilon: float, energy: float
 ) -> Packed:
     """A Cholesky network.
 
@@ -63,19 +69,6 @@ def cholesky_workspace(part: Packed) -> int:
     """How many numbers of scratch space the kernels need."""
     n, depth, widest = (int(x) for x in part.layout[[SIZE, DEPTH, WIDEST]])
     return (6 + depth) * (widest + PADDING) + 8 * n
-
-
-@kernel
-def _layer(matrix: Vec, u: Vec, du: Mat, out: Mat, size: int, length: int) -> None:
-    """The matrix times u, du[0] and du[1] → the rows of out; padding and bias are set in the inputs."""
-    for i in range(size):
-        x = row(matrix, i, length)
-        a, da, db = 0.0, 0.0, 0.0
-        for j in range(length):
-            a += x[j] * u[j]
-            da += x[j] * du[0, j]
-            db += x[j] * du[1, j]
-        out[0, i], out[1, i], out[2, i] = a, da, db
 
 
 @kernel
@@ -138,7 +131,8 @@ def cholesky_torque(q: Vec, v: Vec, w: Vec, a: Vec, part: Packed, work: Vec, tau
     for k in range(depth):
         u[size], u[size + 1 :], du[:, size:] = 1.0, 0.0, 0.0
         size, length, matrix = layer(part, k)
-        _layer(matrix, u, du, out, size, length)
+        times(matrix, u[:length], out[0, :size])
+        times_dual(matrix, du[0, :length], du[1, :length], out[1, :size], out[2, :size])
         if k < depth - 1:
             tanh(out[0, :size], u[:size])
             slope = row(slopes, k, width)

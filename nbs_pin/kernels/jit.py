@@ -21,17 +21,16 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile at first use; sums may be reordered so that they fill vector registers, NaN and inf keep their meaning.
 
-    Arguments: contiguous float64 vectors, and the records of `layout.py` and `views.py`; results go into the vectors
-    named last, and `work` is scratch space (`layout.workspace`). Kernels allocate nothing and hold no state, so any
-    number of threads may run them, each with its own scratch space. The machine code is kept beside the source, or in
-    the user's cache directory where that is read-only (NUMBA_CACHE_DIR names another), or nowhere where neither can be
-    written.
+    Arguments: contiguous float64 vectors and the groups of `records.py`; results go into the vectors named last, and
+    `work` is scratch space. Kernels allocate nothing and hold no state, so any number of threads may run them, each
+    with its own scratch space. The machine code is kept beside the source, or in the user's cache directory where that
+    is read-only (NUMBA_CACHE_DIR names another), or nowhere where neither can be written.
     """
     return _compiled(function, {"reassoc", "contract"})
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Like `kernel`, as a part of every kernel that calls it: arrays that it returns are then not counted as owned."""
+    """Like `kernel`, as a part of every kernel that calls it, so that arrays it returns need no counting of owners."""
     return _compiled(function, {"reassoc", "contract"}, forceinline=True)
 
 
@@ -41,12 +40,7 @@ def exact_kernel(function: Callable[..., Any]) -> Any:
 
 
 def compile_for(dispatcher: Any, signature: Any) -> None:
-    """Make a kernel ready for one signature, and let it refuse all others with a TypeError.
-
-    Args:
-        dispatcher: the kernel, which is compiled or loaded from disk; interpreted, it checks its arguments from now on.
-        signature: its return type and the types of its arguments, as numba writes them.
-    """
+    """Compile the kernel, or load it from disk, for this signature, and let it refuse all others with a TypeError."""
     if INTERPRETED:
         dispatcher.accepts = signature.args
         return

@@ -24,55 +24,27 @@ Kernels read them through `views.py`.
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
 from nbs_pin.base.arrays import Array, array_namespace, constant_like
 from nbs_pin.base.exceptions import ArgumentError
 
-
-class LawCode(IntEnum):
-    """Every law that has a kernel and an adjoint (`laws.py`, `law_adjoints.py`)."""
-
-    BACKSTEPPING = 0
-    SLOTINE_LI = 1
-    COMPUTED_TORQUE = 2
-    PD_REFERENCE = 3
-    PD_GRAVITY = 4
-    PID = 5
-
-
-class ActivationCode(IntEnum):
-    """Every activation of a potential that has kernels (`convex.activation`)."""
-
-    SMOOTHED_RELU = 0
-    SQUAREPLUS = 1
-
-
-class DampingCode(IntEnum):
-    """Every form of the damping that has kernels (`damping.diagonal_of`)."""
-
-    BOUNDED = 0
-    PAPER = 1
-
-
-class IntegratorCode(IntEnum):
-    """Every integrator that rollouts have, by the equations of `simulation/integrators.py`."""
-
-    EULER = 0
-    SEMI_IMPLICIT_EULER = 1
-    RK4 = 2
-
-
-class JointCode(IntEnum):
-    """Every joint that a rigid tree may have."""
-
-    REVOLUTE = 0
-    PRISMATIC = 1
-
+LawCode = IntEnum("LawCode", "BACKSTEPPING SLOTINE_LI COMPUTED_TORQUE PD_REFERENCE PD_GRAVITY PID", start=0)
+"""Every law that has a kernel and an adjoint (`laws.py`, `law_adjoints.py`)."""
+ActivationCode = IntEnum("ActivationCode", "SMOOTHED_RELU SQUAREPLUS", start=0)
+"""Every activation of a potential that has a kernel (`convex.activation`)."""
+DampingCode = IntEnum("DampingCode", "BOUNDED PAPER", start=0)
+"""Every form of a damping that has a kernel (`damping.diagonal_of`)."""
+IntegratorCode = IntEnum("IntegratorCode", "EULER SEMI_IMPLICIT_EULER RK4", start=0)
+"""Every integrator that rollouts have, by the equations of `simulation/integrators.py`."""
+JointCode = IntEnum("JointCode", "REVOLUTE PRISMATIC", start=0)
+"""Every joint that a rigid tree may have."""
 
 Code = TypeVar("Code", bound=IntEnum)
+Layers: TypeAlias = Sequence[tuple[Array, Array]]
+"""(W, b), input to output."""
 
 PADDING = 8
 """Row lengths are multiples of this many float64: one cache line, and whole vector registers."""
@@ -140,13 +112,7 @@ def pack_potential(
     return assembled([len(scale), len(layers), code], head, matrices)
 
 
-def pack_damping(
-    networks: tuple[Sequence[tuple[Array, Array]], Sequence[tuple[Array, Array]]],
-    form: int | str,
-    m: float,
-    scale: Array,
-    floor: Array,
-) -> Packed:
+def pack_damping(networks: tuple[Layers, Layers], form: int | str, m: float, scale: Array, floor: Array) -> Packed:
     """D(z) = D₀ + R TᵀT R, all in the kind of R.
 
     Args:
