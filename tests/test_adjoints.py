@@ -10,28 +10,33 @@ from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
 from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.potential import Potential
 from nbs_pin.kernels.convex import subtract_tangent
-from nbs_pin.kernels.convex_adjoint import potential_adjoint, room_for_potential
-from nbs_pin.kernels.damping_adjoint import damping_adjoint, room_for_damping
+from nbs_pin.kernels.convex_adjoint import pull_back, room_for_potential, taped
+from nbs_pin.kernels.damping import damping_adjoint, room_for_damping
 from nbs_pin.kernels.law_adjoints import adjoint_workspace, law_adjoint, pid_adjoint
-from nbs_pin.kernels.laws import law_row, pid
+from nbs_pin.kernels.laws import law_signals, law_workspace, pid
 from nbs_pin.kernels.layout import (
-    BACKSTEPPING,
-    COMPUTED_TORQUE,
-    PART_HEADER,
-    PD_GRAVITY,
-    PD_REFERENCE,
-    SLOTINE_LI,
-    SMOOTHED_RELU,
-    SQUAREPLUS,
+    DAMPING_LAYOUT,
+    DAMPING_WEIGHTS,
+    FRICTION,
+    JOINTS,
+    LAW,
+    LAYERS,
+    PER_LAYER,
+    POTENTIAL_LAYOUT,
+    POTENTIAL_WEIGHTS,
+    ActivationCode,
+    DampingCode,
+    LawCode,
     Packed,
     pack_damping,
     pack_law,
     pack_potential,
 )
+from nbs_pin.kernels.records import Dual, Memory, Signals, State, Target
 
 SIZES = [(1, ()), (1, (5,)), (2, (4, 3)), (7, (32, 32, 32)), (7, (11,))]
-ACTIVATIONS = {"smooth": (SQUAREPLUS, 0.7), "paper": (SMOOTHED_RELU, 0.5)}
-LINEAR = [SLOTINE_LI, COMPUTED_TORQUE, PD_REFERENCE, PD_GRAVITY]
+ACTIVATIONS = {"smooth": (ActivationCode.SQUAREPLUS, 0.7), "paper": (ActivationCode.SMOOTHED_RELU, 0.5)}
+LAWS = [code for code in LawCode if code is not LawCode.PID]
 
 
 # Random parts, and the same parts written out in torch on the same flat weights.
@@ -55,13 +60,14 @@ def random_damping(n: int, widths: tuple[int, ...], form: str, seed: int = 0) ->
         [(rng.normal(size=(b, a)) / np.sqrt(a), rng.normal(size=b)) for a, b in pairwise((n, *widths, outputs))]
         for outputs in (n, n * (n - 1) // 2)
     ]
-    return pack_damping(tuple(networks), form == "paper", 0.3, rng.uniform(0.5, 2.0, n), rng.normal(size=(n, n)))
+    code = DampingCode.PAPER if form == "paper" else DampingCode.BOUNDED
+    return pack_damping(tuple(networks), code, 0.3, rng.uniform(0.5, 2.0, n), rng.normal(size=(n, n)))
 
 
 def random_law(law: int, n: int, form: str, *, friction: bool, seed: int = 0) -> Packed:
     rng = np.random.default_rng(seed)
     parts = {}
-    if law == BACKSTEPPING:
+    if law == LawCode.BACKSTEPPING:
         parts = {"potential": random_potential(n, (6, 5), form, seed), "damping": random_damping(n, (5,), form, seed)}
         parts["inertial_rate"] = 1.5
     gains = tuple(rng.uniform(0.5, 2.0, (2, n)))
@@ -71,12 +77,12 @@ def random_law(law: int, n: int, form: str, *, friction: bool, seed: int = 0) ->
 
 
 def layers_of(layout: np.ndarray, weights: torch.Tensor, first: int, depth: int) -> list[torch.Tensor]:
-    table = layout[PART_HEADER + 3 * first : PART_HEADER + 3 * (first + depth)].reshape(depth, 3).tolist()
+    table = layout[LAYERS + PER_LAYER * first :][: PER_LAYER * depth].reshape(depth, PER_LAYER).tolist()
     return [weights[offset : offset + size * length].reshape(size, length) for size, length, offset in table]
 
 
 def sigma(code: int, parameter: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
-    if code == SQUAREPLUS:
+    if code == ActivationCode.SQUAREPLUS:
         return 0.5 * (a + (a * a + parameter).sqrt())
     s = (a / parameter).clip(0.0, 1.0)
     return s * (a - 0.5 * parameter * s)
@@ -98,7 +104,7 @@ def torch_potential(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor, 
 
 def torch_damping(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
     """D(z) z."""
-    n, paper, depth = layout[:3].tolist()
+    n, depth, form = layout[:3].tolist()
     scale, floor = weights[1 : 1 + n], weights[1 + n :][: n * n].reshape(n, n)
     outputs = []
     for first in (0, depth):
@@ -106,11 +112,23 @@ def torch_damping(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor) ->
         for k, matrix in enumerate(layers_of(layout, weights, first, depth)):
             h = (torch.tanh(h) if k else h) @ matrix[:, : len(h)].T + matrix[:, len(h)]
         outputs.append(h)
-    diagonal = outputs[0].clip(0.0) + weights[0] if paper else outputs[0]
+    diagonal = outputs[0].clip(0.0) + weights[0] if form == DampingCode.PAPER else outputs[0]
     below = torch.zeros(n, n, dtype=z.dtype)
     below[*np.tril_indices(n, -1)] = outputs[1]
     t = torch.diag(diagonal) + below
     return floor @ z + scale * (t.T @ (t @ (scale * z)))
+
+
+def part(law: Packed, weights: torch.Tensor, in_layout: int, in_weights: int) -> tuple[np.ndarray, torch.Tensor]:
+    """The potential or the damping of a law."""
+    return law.layout[law.layout[in_layout] :], weights[law.layout[in_weights] :]
+
+
+def without_adjoint(law: Packed) -> list[int]:
+    """Weights that get no cotangent: which joints wrap, σ's parameter, f(0), m."""
+    potential, damping = law.layout[POTENTIAL_WEIGHTS], law.layout[DAMPING_WEIGHTS]
+    own = list(range(law.layout[JOINTS]))
+    return [*own, potential, potential + 1, damping] if law.layout[LAW] == LawCode.BACKSTEPPING else own
 
 
 def torch_law(law: Packed, weights: torch.Tensor, q, v, q_ref, v_ref, a_ref):
@@ -119,22 +137,22 @@ def torch_law(law: Packed, weights: torch.Tensor, q, v, q_ref, v_ref, a_ref):
     wraps, first, second, viscous, coulomb = weights[: 5 * n].reshape(5, n)
     turns = torch.ceil((q - q_ref - np.pi) / (2.0 * np.pi))
     z1, dz1 = q - q_ref - 2.0 * np.pi * wraps * turns, v - v_ref
-    if code == BACKSTEPPING:
-        gradient, product = torch_potential(law.layout[law.layout[3] :], weights[law.layout[4] :], z1, dz1)
+    if code == LawCode.BACKSTEPPING:
+        gradient, product = torch_potential(*part(law, weights, POTENTIAL_LAYOUT, POTENTIAL_WEIGHTS), z1, dz1)
         v_r = v_ref - first * gradient
         a_r = a_ref - first * product - weights[5 * n + 1] * (v - v_r)
-        damped = torch_damping(law.layout[law.layout[5] :], weights[law.layout[6] :], v - v_r)
+        damped = torch_damping(*part(law, weights, DAMPING_LAYOUT, DAMPING_WEIGHTS), v - v_r)
         feedback = -gradient - damped
-    elif code == SLOTINE_LI:
+    elif code == LawCode.SLOTINE_LI:
         v_r, a_r = v_ref - first * z1, a_ref - first * dz1
         feedback = -second * (v - v_r)
-    elif code == COMPUTED_TORQUE:
+    elif code == LawCode.COMPUTED_TORQUE:
         v_r, a_r, feedback = v + 0.0, a_ref - second * dz1 - first * z1, 0.0 * q
     else:
         feedback = -first * z1 - second * dz1
-        v_r, a_r = (0.0 * v_ref, 0.0 * a_ref) if code == PD_GRAVITY else (v_ref, a_ref)
-    if law.layout[2]:
-        speed = v_r if code in (BACKSTEPPING, SLOTINE_LI) else v_ref
+        v_r, a_r = (0.0 * v_ref, 0.0 * a_ref) if code == LawCode.PD_GRAVITY else (v_ref, a_ref)
+    if law.layout[FRICTION]:
+        speed = v_r if code in (LawCode.BACKSTEPPING, LawCode.SLOTINE_LI) else v_ref
         feedback = feedback + viscous * speed + coulomb * torch.tanh(speed / weights[5 * n])
     return v_r, a_r, feedback
 
@@ -145,6 +163,13 @@ def torch_law(law: Packed, weights: torch.Tensor, q, v, q_ref, v_ref, a_ref):
 def guarded(size: int) -> np.ndarray:
     """Scratch space full of NaN, so that a kernel that reads before it writes is seen."""
     return np.full(int(size), np.nan)
+
+
+def potential_adjoint(given: np.ndarray, part: Packed, error_bar: Dual, weights_bar: np.ndarray) -> None:
+    """Both halves of the adjoint; given: z, ż and the cotangents of ∇Φ and ∇²Φ ż."""
+    error, out_bar, room = Dual(*given[:2]), Dual(*given[2:]), guarded(room_for_potential(part))
+    taped(error, part, room, Dual(*np.empty_like(given[:2])))
+    pull_back(error, out_bar, part, room, error_bar, weights_bar)
 
 
 def leaves(*arrays: np.ndarray) -> list[torch.Tensor]:
@@ -168,7 +193,7 @@ def test_potential_adjoint_is_the_gradient(n, widths, form, seed):
     part = random_potential(n, widths, form, seed)
     z, dz, gradient_bar, product_bar = given = np.random.default_rng(seed).normal(size=(4, n))
     z_bar, dz_bar, weights_bar = np.zeros(n), np.zeros(n), np.zeros_like(part.weights)
-    potential_adjoint(*given, *part, guarded(room_for_potential(part.layout)), z_bar, dz_bar, weights_bar)
+    potential_adjoint(given, part, Dual(z_bar, dz_bar), weights_bar)
 
     inputs = leaves(z, dz, part.weights)
     gradient, product = torch_potential(part.layout, inputs[2], *inputs[:2])
@@ -186,7 +211,7 @@ def test_damping_adjoint_is_the_gradient(n, widths, form, seed):
     part = random_damping(n, widths, form, seed)
     z, force_bar = np.random.default_rng(seed).normal(size=(2, n))
     z_bar, weights_bar = np.zeros(n), np.zeros_like(part.weights)
-    damping_adjoint(z, force_bar, *part, guarded(room_for_damping(part.layout)), z_bar, weights_bar)
+    damping_adjoint(z, force_bar, part, guarded(room_for_damping(part)), z_bar, weights_bar)
 
     inputs = leaves(z, part.weights)
     expected = gradients(torch_damping(part.layout, inputs[1], inputs[0]) @ torch.tensor(force_bar), inputs)
@@ -198,10 +223,12 @@ def test_damping_adjoint_is_the_gradient(n, widths, form, seed):
 @pytest.mark.parametrize(("n", "widths"), [*SIZES, (12, (3,)), (2, (41, 2)), (9, (2, 50))])
 def test_adjoints_stay_within_their_scratch_space(n, widths):
     one, parts = np.ones(n), (random_potential(n, widths, "smooth"), random_damping(n, widths, "paper"))
-    law = pack_law(BACKSTEPPING, (one, one), None, (one, one, 0.1), 1.0, *parts)
+    law = pack_law(LawCode.BACKSTEPPING, (one, one), None, (one, one, 0.1), 1.0, *parts)
     size = adjoint_workspace(law)
     room, found = guarded(size + 100), np.zeros((2, n))
-    law_adjoint(*states(n, seed=0), *law, room[:size], one, one, one, *found, np.zeros_like(law.weights))
+    q, v, *target = states(n, seed=0)
+    law_bar = Packed(law.layout, np.zeros_like(law.weights))
+    law_adjoint(State(q, v), Target(*target), law, room[:size], Signals(one, one, one), State(*found), law_bar)
     assert np.isfinite(found).all()
     assert np.isnan(room[size:]).all()
 
@@ -219,10 +246,8 @@ def test_networks_as_they_are_read(n, form, activation):
 
     z_bar, dz_bar = np.zeros((2, n))
     given, phi_part, d_part = tensor.numpy(), phi.packed(), d.packed()
-    potential_adjoint(
-        *given, *phi_part, guarded(room_for_potential(phi_part.layout)), z_bar, dz_bar, 0.0 * phi_part.weights
-    )
-    damping_adjoint(given[1], given[2], *d_part, guarded(room_for_damping(d_part.layout)), dz_bar, 0.0 * d_part.weights)
+    potential_adjoint(given, phi_part, Dual(z_bar, dz_bar), 0.0 * phi_part.weights)
+    damping_adjoint(given[1], given[2], d_part, guarded(room_for_damping(d_part)), dz_bar, 0.0 * d_part.weights)
     assert_close(z_bar, expected[0])
     assert_close(dz_bar, expected[1])
 
@@ -235,13 +260,15 @@ def states(n: int, seed: int) -> list[np.ndarray]:
 def adjoint_of(law: Packed, given: list[np.ndarray], bars: np.ndarray, start: float = 0.0) -> list[np.ndarray]:
     """By q, v and the weights, added to `start`."""
     found = [np.full_like(x, start) for x in (given[0], given[1], law.weights)]
-    law_adjoint(*given, *law, guarded(adjoint_workspace(law)), *bars, *found)
+    (q, v, *target), law_bar = given, Packed(law.layout, found[2])
+    room = guarded(adjoint_workspace(law))
+    law_adjoint(State(q, v), Target(*target), law, room, Signals(*bars), State(*found[:2]), law_bar)
     return found
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])
 @pytest.mark.parametrize("form", ACTIVATIONS)
-@pytest.mark.parametrize("law_code", [BACKSTEPPING, *LINEAR])
+@pytest.mark.parametrize("law_code", LAWS)
 @pytest.mark.parametrize("friction", [False, True])
 def test_law_adjoint_is_the_gradient(n, form, law_code, friction):
     law = random_law(law_code, n, form, friction=friction, seed=n)
@@ -249,32 +276,28 @@ def test_law_adjoint_is_the_gradient(n, form, law_code, friction):
     inputs = leaves(given[0], given[1], law.weights)
     signals = torch_law(law, inputs[2], *inputs[:2], *(torch.tensor(x) for x in given[2:]))
     kernel = np.empty((3, n))
-    assert law_row(*given, *law, guarded(law.layout[7]), *kernel)
+    assert law_signals(*given, *law, guarded(law_workspace(law)), kernel)
     for x, y in zip(signals, kernel, strict=True):
         assert_close(x.detach().numpy(), y, 1e-12)
 
     expected = gradients(sum(x @ torch.tensor(bar) for x, bar in zip(signals, bars, strict=True)), inputs)
-    expected[2][:n] = 0.0  # which joints wrap
-    if law_code == BACKSTEPPING:
-        expected[2][law.layout[4] : law.layout[4] + 2] = expected[2][law.layout[6]] = 0.0  # σ's parameter, f(0), m
+    expected[2][without_adjoint(law)] = 0.0
     for found, wanted in zip(adjoint_of(law, given, bars), expected, strict=True):
         assert_close(found, wanted)
 
 
-@pytest.mark.parametrize("law_code", [BACKSTEPPING, *LINEAR])
+@pytest.mark.parametrize("law_code", LAWS)
 def test_law_adjoint_against_differences_of_the_law(law_code):
     n, rng = 3, np.random.default_rng(law_code)
     law = random_law(law_code, n, "smooth", friction=True)
     given, bars = states(n, seed=5), rng.normal(size=(3, n))
     directions = [rng.normal(size=x.shape) for x in (given[0], given[1], law.weights)]
-    directions[2][:n] = 0.0
-    if law_code == BACKSTEPPING:
-        directions[2][law.layout[4] : law.layout[4] + 2] = directions[2][law.layout[6]] = 0.0
+    directions[2][without_adjoint(law)] = 0.0
 
     def value(step: float) -> float:
         out = np.empty((3, n))
         q, v, weights = (x + step * d for x, d in zip((*given[:2], law.weights), directions, strict=True))
-        law_row(q, v, *given[2:], law.layout, weights, guarded(law.layout[7]), *out)
+        law_signals(q, v, *given[2:], law.layout, weights, guarded(law_workspace(law)), out)
         return float((out * bars).sum())
 
     slope = (value(1e-5) - value(-1e-5)) / 2e-5
@@ -282,7 +305,7 @@ def test_law_adjoint_against_differences_of_the_law(law_code):
     assert found == pytest.approx(slope, rel=1e-7)
 
 
-@pytest.mark.parametrize("law_code", [BACKSTEPPING, *LINEAR])
+@pytest.mark.parametrize("law_code", LAWS)
 def test_law_adjoint_adds(law_code):
     law = random_law(law_code, 2, "paper", friction=True)
     given, bars = states(2, seed=1), np.random.default_rng(1).normal(size=(3, 2))
@@ -290,7 +313,7 @@ def test_law_adjoint_adds(law_code):
         np.testing.assert_allclose(added, 0.5 + alone, rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("law_code", [BACKSTEPPING, *LINEAR])
+@pytest.mark.parametrize("law_code", LAWS)
 def test_bars_that_are_given_are_only_read(law_code):
     law = random_law(law_code, 2, "smooth", friction=True)
     given, bars = states(2, seed=2), np.random.default_rng(2).normal(size=(3, 2))
@@ -301,11 +324,20 @@ def test_bars_that_are_given_are_only_read(law_code):
 
 
 def test_law_adjoint_follows_the_error_past_half_a_turn():
-    law = random_law(BACKSTEPPING, 2, "smooth", friction=False)
+    law = random_law(LawCode.BACKSTEPPING, 2, "smooth", friction=False)
     given, bars = states(2, seed=3), np.ones((3, 2))
     turned = [given[0] + [0.0, 2.0 * np.pi], *given[1:]]  # joint 1 wraps
     for x, y in zip(adjoint_of(law, given, bars), adjoint_of(law, turned, bars), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+
+
+def pid_bars(given: list[np.ndarray], period: float, gains: np.ndarray, bars: np.ndarray, found: list) -> None:
+    """Adds to integral, derivative, q, v and gains in found; given: the first four and the reference."""
+    integral, derivative, q, v, q_ref, v_ref = given
+    pid_adjoint(
+        Memory(integral, derivative), State(q, v), State(q_ref, v_ref), period, gains.ravel(),
+        bars[0], Memory(bars[1], bars[2]), Memory(*found[:2]), State(*found[2:4]), found[4].reshape(-1),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -318,7 +350,7 @@ def test_pid_adjoint_against_differences(seed, filter_time, rows):
     q *= 4.0
     bars = rng.normal(size=(3, n * rows))
     found = [np.full_like(x, 0.25) for x in (integral, derivative, q, v, gains)]
-    pid_adjoint(*given, period, gains, bars, *found)
+    pid_bars(given, period, gains, bars, found)
 
     directions = [rng.normal(size=x.shape) for x in found]
     directions[4][[3, 5]] = 0.0
@@ -327,7 +359,7 @@ def test_pid_adjoint_against_differences(seed, filter_time, rows):
     def value(step: float) -> float:
         out = np.empty((3, n * rows))
         moved = [x + step * d for x, d in zip((*given[:4], gains), directions, strict=True)]
-        assert pid(*moved[:4], q_ref, v_ref, period, moved[4], out)
+        assert pid(*moved[:4], q_ref, v_ref, period, moved[4].ravel(), out)
         return float((out * bars).sum())
 
     slope = (value(1e-6) - value(-1e-6)) / 2e-6
@@ -338,7 +370,7 @@ def test_pid_adjoint_against_differences(seed, filter_time, rows):
 def test_pid_adjoint_rests_where_the_integral_rests():
     one, gains = np.ones(1), np.array([[2.0], [3.0], [1.0], [0.5], [0.0], [0.0]])
     zero = np.zeros(1)
-    found = [np.zeros(1) for _ in range(4)]
-    gains_bar, bars = np.zeros((6, 1)), np.array([[0.0], [1.0], [0.0]])
-    pid_adjoint(zero, zero, one, zero, zero, zero, 0.01, gains, bars, *found, gains_bar)  # τ = −2, limit 0.5
-    np.testing.assert_array_equal([*np.ravel(found), *np.ravel(gains_bar)], [1.0, *[0.0] * 9])
+    found = [*np.zeros((4, 1)), np.zeros((6, 1))]
+    bars = np.array([[0.0], [1.0], [0.0]])
+    pid_bars([zero, zero, one, zero, zero, zero], 0.01, gains, bars, found)  # τ = −2, limit 0.5
+    np.testing.assert_array_equal(np.concatenate([x.ravel() for x in found]), [1.0, *[0.0] * 9])

@@ -22,7 +22,7 @@ from nbs_pin.controllers.potential import Potential
 from nbs_pin.controllers.slotine_li import SlotineLi
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.kernels import layout
+from nbs_pin.kernels.layout import LawCode
 from nbs_pin.robots.robot import load_robot
 from tests.laws import COMPILED
 from tests.test_controllers import arguments, call
@@ -284,7 +284,7 @@ def test_a_packed_pid_is_its_rows():
     robot = load_robot("kinova")
     pid = PID.for_robot(robot, period=0.002)
     law = pid.packed_law()
-    assert list(law.layout) == [layout.PID, robot.nv]
+    assert list(law.layout) == [LawCode.PID, robot.nv]
     rows = law.weights.reshape(6, -1)
     expected = [pid.kp, pid.ki, pid.kd, robot.effort_limit, np.full(robot.nv, 0.004), robot.continuous]
     np.testing.assert_array_equal(rows, np.array(expected, dtype=float))

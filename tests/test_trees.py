@@ -11,14 +11,9 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.kernels.layout import Packed
-from nbs_pin.kernels.tree_layout import Link, pack_tree
-from nbs_pin.kernels.trees import (
-    tree_acceleration,
-    tree_acceleration_adjoint,
-    tree_torque,
-    tree_torque_adjoint,
-    tree_workspace,
-)
+from nbs_pin.kernels.records import Motion, State
+from nbs_pin.kernels.tree_layout import Link, pack_tree, tree_workspace
+from nbs_pin.kernels.trees import tree_acceleration, tree_acceleration_adjoint, tree_torque, tree_torque_adjoint
 from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import load_robot
 from tests.test_dynamics import GANTRY, make, relative
@@ -56,21 +51,22 @@ def vectors(n: int, count: int, seed: int) -> np.ndarray:
 
 def torque(tree: Packed, q: np.ndarray, v: np.ndarray, w: np.ndarray, a: np.ndarray) -> np.ndarray:
     tau = np.full(len(q), np.nan)
-    tree_torque(q, v, w, a, *tree, np.full(tree_workspace(tree), np.nan), tau)
+    tree_torque(Motion(q, v, w, a), tree, np.full(tree_workspace(tree), np.nan), tau)
     return tau
 
 
 def acceleration(tree: Packed, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The acceleration and the factor."""
     a, factor = np.full(len(q), np.nan), np.full((len(q), len(q)), np.nan)
-    tree_acceleration(q, v, tau, *tree, np.full(tree_workspace(tree), np.nan), factor, a)
+    tree_acceleration(State(q, v), tau, tree, np.full(tree_workspace(tree), np.nan), factor, a)
     return a, factor
 
 
 def torque_bars(tree: Packed, *arguments: np.ndarray) -> np.ndarray:
     """Derivatives of μᵀτ with respect to q, v, w, a; arguments: q, v, w, a, μ."""
     bars = np.zeros((4, len(arguments[0])))
-    tree_torque_adjoint(*arguments, *tree, np.full(tree_workspace(tree), np.nan), *bars)
+    *motion, mu = arguments
+    tree_torque_adjoint(Motion(*motion), mu, tree, np.full(tree_workspace(tree), np.nan), Motion(*bars))
     return bars
 
 
@@ -78,7 +74,8 @@ def acceleration_bars(tree: Packed, q: np.ndarray, v: np.ndarray, tau: np.ndarra
     """Derivatives of āᵀa with respect to q, v, τ."""
     bars = np.zeros((3, len(q)))
     a, factor = acceleration(tree, q, v, tau)
-    tree_acceleration_adjoint(q, v, a, a_bar, *tree, np.full(tree_workspace(tree), np.nan), factor, *bars)
+    work = np.full(tree_workspace(tree), np.nan)
+    tree_acceleration_adjoint(State(q, v), a, a_bar, tree, work, factor, State(*bars[:2]), bars[2])
     return bars
 
 
@@ -208,11 +205,11 @@ def test_adjoints_add_to_what_is_there():
     q, v, w, a, mu, *start = vectors(n, 9, 0)
     work = np.full(tree_workspace(tree), np.nan)
     bars = [x.copy() for x in start]
-    tree_torque_adjoint(q, v, w, a, mu, *tree, work, *bars)
+    tree_torque_adjoint(Motion(q, v, w, a), mu, tree, work, Motion(*bars))
     np.testing.assert_allclose(np.subtract(bars, start), torque_bars(tree, q, v, w, a, mu), rtol=1e-11, atol=1e-11)
     a, factor = acceleration(tree, q, v, w)
     bars = [x.copy() for x in start[:3]]
-    tree_acceleration_adjoint(q, v, a, mu, *tree, work, factor, *bars)
+    tree_acceleration_adjoint(State(q, v), a, mu, tree, work, factor, State(*bars[:2]), bars[2])
     np.testing.assert_allclose(
         np.subtract(bars, start[:3]), acceleration_bars(tree, q, v, w, mu), rtol=1e-11, atol=1e-11
     )
@@ -222,7 +219,8 @@ def test_one_array_may_collect_both_velocities():
     tree = pack_model(random_model(6))
     q, v, a, mu = vectors(int(tree.layout[0]), 4, 0)
     q_bar, both, a_bar = np.zeros((3, len(q)))
-    tree_torque_adjoint(q, v, v, a, mu, *tree, np.full(tree_workspace(tree), np.nan), q_bar, both, both, a_bar)
+    bars = Motion(q_bar, both, both, a_bar)
+    tree_torque_adjoint(Motion(q, v, v, a), mu, tree, np.full(tree_workspace(tree), np.nan), bars)
     expected = torque_bars(tree, q, v, v, a, mu)
     np.testing.assert_allclose(both, expected[1] + expected[2], rtol=1e-13)
 

@@ -1,6 +1,6 @@
 """How far a model of an arm is from the truth: M, C v, G, inverse and forward dynamics, and where the error grows.
 
-Any two dynamics providers can be compared; what a relative error is stands in `relative_errors.py`.
+Any two dynamics providers can be compared; what a relative error is stands in `accuracy/relative_errors.py`.
 """
 
 from collections.abc import Sequence
@@ -90,7 +90,7 @@ class ModelErrors:
     along_run: Errors | None = None
     """Errors over the states of the run and the accelerations the truth has there."""
     mismatch: Mismatch | None = None
-    """δ along the run, and the bound it keeps (`mismatch.py`)."""
+    """δ along the run, and the bound it keeps (`accuracy/mismatch.py`)."""
 
     @property
     def errors(self) -> Errors:
@@ -115,7 +115,7 @@ def compare(
     speed: |v_i| up to this [rad/s], one number or one per joint. box: (lower, upper) [rad], each one number or one per
     joint, for instance where the data of the fit lie; None takes the position limits of the truth's arm, a whole turn
     where they allow it. run: a closed loop with the truth as its plant; several starts make the bound on δ say
-    something of further ones (`mismatch.py`). motions: free ones from random states of the box; 0 saves their time.
+    something of further ones (`accuracy/mismatch.py`). motions: free ones from random states of the box; 0 saves their time.
     friction: of that plant; it is no part of M, C, G, but v̇ along the run is wrong without it.
     Joints that slide are compared in their own units beside those that turn, as M has them.
     Raises ArgumentError for another number of joints, an empty box, or a model that is not finite at some sample.

@@ -96,7 +96,7 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Row:
-    """A law on one reference, over held-out starts; figures as `studies.training.fresh_figures` has them."""
+    """A law on one reference, over held-out starts; figures as `training.evaluation.fresh_figures` has them."""
 
     arm: str
     period_s: float

@@ -26,7 +26,7 @@ from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
 
 TRAJECTORIES = 374
-"""Closed-loop motions that a learned model is judged on (`mismatch.py`)."""
+"""Closed-loop motions that a learned model is judged on (`accuracy/mismatch.py`)."""
 
 
 @dataclass(frozen=True, eq=False)

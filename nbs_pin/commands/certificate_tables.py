@@ -22,7 +22,7 @@ _GAINS = (
 
 
 def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Errors first, then what they rest on; `figures` as `studies.certifying.figures` gives them."""
+    """Errors first, then what they rest on; `figures` as `commands.certify.figures` gives them."""
     certificate = figures["certificate"]
     console.print(Text(f"{title}: {certificate['disturbance']}", style="bold"), soft_wrap=True)
     if figures["design"] is not None:

@@ -35,7 +35,7 @@ from nbs_pin.storage.checkpoints import load
 FILES = ("errors.png", "errors.csv", SUMMARY)
 """What `write_results` writes, the summary last."""
 TRAJECTORIES = 374
-"""Starts for which the bound on δ holds for 95 % of further ones, but for one chance in a million (`mismatch.py`)."""
+"""Starts for which the bound on δ holds for 95 % of further ones, but for one chance in a million (`accuracy/mismatch.py`)."""
 _ENDINGS = ("", ".nbs", ".urdf", ".xacro", ".xml")
 
 

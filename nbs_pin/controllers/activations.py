@@ -11,7 +11,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
-from nbs_pin.kernels.layout import SMOOTHED_RELU, SQUAREPLUS
+from nbs_pin.kernels.layout import ActivationCode
 
 
 class Activation(ABC):
@@ -61,7 +61,7 @@ class SmoothedReLU(Activation):
     @property
     def kernel(self) -> tuple[int, float]:
         """Code and parameter of the compiled form."""
-        return SMOOTHED_RELU, self.d
+        return ActivationCode.SMOOTHED_RELU, self.d
 
     def curvature_range(self, a: Interval) -> Interval:
         """1/d between the switches, 0 outside."""
@@ -94,7 +94,7 @@ class Squareplus(Activation):
     @property
     def kernel(self) -> tuple[int, float]:
         """Code and parameter of the compiled form."""
-        return SQUAREPLUS, self.b
+        return ActivationCode.SQUAREPLUS, self.b
 
     def curvature_range(self, a: Interval) -> Interval:
         """σ'' is one hump: its least is at an end, its largest at an end or at 0."""

@@ -8,10 +8,9 @@ from nbs_pin.base.arrays import Array, Vectors, as_vectors, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.kernels.laws import compile_laws, law_row, law_rows
+from nbs_pin.kernels.laws import compile_laws, compile_tree_law, law_signals, law_workspace, pack_tree_law, tree_law
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.threads import over_cores
-from nbs_pin.kernels.tree_laws import compile_tree_laws, tree_law, tree_law_workspace, tree_laws
 
 
 class CompiledController(MemorylessController):
@@ -28,11 +27,11 @@ class CompiledController(MemorylessController):
         self.law, self.dynamics, self._tree = law, dynamics, dynamics.packed_tree()
         if self._tree is None:
             compile_laws()
-            self._packed: tuple[np.ndarray, ...] = (*law, np.empty(int(law.layout[7])))
+            self._packed: tuple[np.ndarray, ...] = (*law, np.empty(law_workspace(law)))
             self._signals = np.empty((3, dynamics.nv))
         else:
-            compile_tree_laws()
-            self._packed = (*law, *self._tree, np.empty(tree_law_workspace(law, self._tree)))
+            compile_tree_law()
+            self._packed = (*pack_tree_law(law, self._tree), np.empty(law_workspace(law, self._tree)))
         one, two = np.zeros(dynamics.nv), np.zeros((2, dynamics.nv))
         for x in (one, two):  # so that no first call, of whatever the model compiles, happens inside a control loop
             self.torque(x, x, x, x, x)
@@ -71,9 +70,9 @@ class CompiledController(MemorylessController):
         """The torque of one state → tau; False, and nothing done, unless all have length nv."""
         if self._tree is not None:
             return tree_law(q, v, q_ref, v_ref, a_ref, *self._packed, tau)
-        v_r, a_r, feedback = self._signals
-        if not law_row(q, v, q_ref, v_ref, a_ref, *self._packed, v_r, a_r, feedback):
+        if not law_signals(q, v, q_ref, v_ref, a_ref, *self._packed, self._signals):
             return False
+        v_r, a_r, feedback = self._signals
         tau[:] = self.dynamics.reference_torque(q, v, v_r, a_r) + feedback
         return True
 
@@ -89,10 +88,11 @@ class CompiledController(MemorylessController):
         if self._tree is not None:
 
             def evaluate(part: slice) -> None:
-                tree_laws(*(x[part] for x in rows), *packed, np.empty_like(work), tau[part])
+                tree_law(*(x[part].ravel() for x in rows), *packed, np.empty_like(work), tau[part].ravel())
 
             over_cores(evaluate, len(tau))
             return tau.reshape(shape)
-        v_r, a_r, feedback = np.empty((3, *tau.shape))
-        law_rows(*rows, *packed, work, v_r, a_r, feedback)
+        signals = np.empty((3, tau.size))
+        law_signals(*(x.ravel() for x in rows), *packed, work, signals)
+        v_r, a_r, feedback = signals.reshape(3, *tau.shape)
         return (self.dynamics.reference_torque(rows[0], rows[1], v_r, a_r) + feedback).reshape(shape)

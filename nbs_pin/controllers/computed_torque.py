@@ -17,7 +17,7 @@ from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.kernels.layout import COMPUTED_TORQUE, Packed
+from nbs_pin.kernels.layout import LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
 
@@ -78,4 +78,4 @@ class ComputedTorque(ModelLaw):
 
     def _packed(self, numpy: bool) -> Packed:
         kp, kd = self.gains.value(numpy=numpy)
-        return self._pack(COMPUTED_TORQUE, (kp, kd))
+        return self._pack(LawCode.COMPUTED_TORQUE, (kp, kd))

@@ -31,7 +31,7 @@ class Controller(ABC):
         return False
 
     def packed_law(self, *, numpy: bool = True) -> Packed:
-        """Constants and weights of the law as the kernels take them (`runtime/layout.py`).
+        """Constants and weights of the law as the kernels take them (`kernels/layout.py`).
 
         numpy: True gives an array, False a tensor of the same numbers, differentiable in the law's parameters.
         Raises ArgumentError unless the law is `packable`.

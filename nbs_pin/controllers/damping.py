@@ -117,13 +117,13 @@ class Damping(nn.Module):
         return all(map(is_known, (self, self.diagonal, self.lower)))
 
     def packed(self, *, numpy: bool = True) -> Packed:
-        """The weights as the compiled form of `force` takes them (`runtime/damping.py`).
+        """The weights as the compiled form of `force` takes them (`kernels/damping.py`).
 
         numpy: True gives an array, False a tensor of the same numbers, differentiable in the parameters.
         """
         networks = self.diagonal.layers(numpy=numpy), self.lower.layers(numpy=numpy)
         d0, r = self._constants(numpy=numpy)
-        return pack_damping(networks, self.form == "paper", self.m, r, d0)
+        return pack_damping(networks, self.form, self.m, r, d0)
 
     def excess(self, radius: float) -> Interval:
         """Where T(z)² lies for |z| ≤ radius [rad/s], for one joint [N·m·s/rad]: tanh is monotone on small cells."""

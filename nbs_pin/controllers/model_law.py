@@ -53,7 +53,7 @@ class ModelLaw(MemorylessController, nn.Module):
         raise NotImplementedError
 
     def _pack(self, law: int, gains: tuple[Array, Array], **parts: Any) -> Packed:
-        """The law of that code (`runtime/layout.py`) with its gains; parts: those of `layout.pack_law`."""
+        """The law of that code (`kernels/layout.py`) with its gains; parts: those of `layout.pack_law`."""
         continuous = None if self.dynamics.robot is None else self.dynamics.robot.continuous
         f = self.friction
         return pack_law(law, gains, continuous, None if f is None else (f.viscous, f.coulomb, f.transition), **parts)

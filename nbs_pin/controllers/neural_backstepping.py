@@ -28,7 +28,7 @@ from nbs_pin.controllers.potential import Potential
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.kernels.layout import BACKSTEPPING, Packed
+from nbs_pin.kernels.layout import LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
 DAMPINGS = ("inertial", "bounded", "paper")
@@ -97,7 +97,7 @@ class NeuralBackstepping(LyapunovLaw):
         period: control period h [s].
         potential: "smooth" or "paper". damping: "inertial" (ωM + D₀ + TᵀT), "bounded" (D₀ + TᵀT) or "paper" (TᵀT).
         dynamics: None takes Pinocchio's model of `robot`. gains: None computes them (`gains_for_robot`).
-        least_share: what training leaves at least of S, Λ and D₀ (`networks.gain.Gain`).
+        least_share: what training leaves at least of S, Λ and D₀ (`Gain`).
         The paper's networks with S = I, Λ = I are built by hand: see `paper_controller`.
         Raises ArgumentError for unknown names or numbers out of range.
         """
@@ -177,7 +177,7 @@ class NeuralBackstepping(LyapunovLaw):
     def _packed(self, numpy: bool) -> Packed:
         rate = self.rate.value(numpy=numpy)
         return self._pack(
-            BACKSTEPPING,
+            LawCode.BACKSTEPPING,
             (rate, 0.0 * rate),
             inertial_rate=self.inertial_rate,
             potential=self.potential.packed(numpy=numpy),

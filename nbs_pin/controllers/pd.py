@@ -9,7 +9,7 @@ from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.kernels.layout import PD_GRAVITY, PD_REFERENCE, Packed
+from nbs_pin.kernels.layout import LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
 FEEDFORWARDS = ("gravity", "reference")
@@ -85,4 +85,4 @@ class PD(ModelLaw):
 
     def _packed(self, numpy: bool) -> Packed:
         kp, kd = self.gains.value(numpy=numpy)
-        return self._pack(PD_GRAVITY if self.feedforward == "gravity" else PD_REFERENCE, (kp, kd))
+        return self._pack(LawCode.PD_GRAVITY if self.feedforward == "gravity" else LawCode.PD_REFERENCE, (kp, kd))

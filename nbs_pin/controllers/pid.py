@@ -13,9 +13,8 @@ from nbs_pin.base.storable import storable
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, positive_gains, stored_gains
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.kernels import layout
 from nbs_pin.kernels.laws import compile_laws, pid
-from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.layout import Packed, pack_pid
 from nbs_pin.robots.robot import Robot, configuration_difference
 
 
@@ -127,9 +126,7 @@ class PID(Controller, nn.Module):
         if not self.packable:
             return super().packed_law(numpy=numpy)
         kp, ki, kd = self.gains.value(numpy=numpy)
-        constants = self.effort_limit, np.full(self.nv, self.filter_time), self.continuous.astype(float)
-        rows = [kp, ki, kd, *(constant_like(kp, row) for row in constants)]
-        return Packed(np.array([layout.PID, self.nv]), array_namespace(kp).concat(rows))
+        return pack_pid((kp, ki, kd), self.effort_limit, self.filter_time, self.continuous)
 
     def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
         """The law as machine code (`Controller.compile`)."""
@@ -144,12 +141,12 @@ class CompiledPID(Controller):
 
     def __init__(self, law: Packed) -> None:
         compile_laws()
-        self.gains = law.weights.reshape(6, int(law.layout[1]))
+        self.weights = law.weights
 
     @property
     def nv(self) -> int:
         """Number of joints."""
-        return int(self.gains.shape[1])
+        return len(self.weights) // 6
 
     def initial_memory(self, q: Vectors) -> PIDMemory:
         """No integral, derivative at rest."""
@@ -165,7 +162,7 @@ class CompiledPID(Controller):
         if isinstance(q, np.ndarray) and q.ndim == 1:
             out = np.empty((3, self.nv))
             try:
-                fits = pid(*memory, q, v, reference.q, reference.v, float(period), self.gains, out)
+                fits = pid(*memory, q, v, reference.q, reference.v, float(period), self.weights, out)
             except TypeError:  # not all contiguous float64 vectors: converted and checked below
                 fits = False
             if fits:
@@ -187,6 +184,6 @@ class CompiledPID(Controller):
         if is_torch_array(given[0]):
             raise ArgumentError("a compiled PID was given torch tensors, expected numpy arrays; convert them.")
         out = np.empty((3, given[0].size))
-        pid(*(np.array(x, dtype=float).ravel() for x in given), float(period), self.gains, out)
+        pid(*(np.array(x, dtype=float).ravel() for x in given), float(period), self.weights, out)
         tau, integral, derivative = out.reshape(3, *given[0].shape)
         return tau, PIDMemory(integral, derivative)

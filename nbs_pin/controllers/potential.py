@@ -98,7 +98,7 @@ class Potential(nn.Module):
         return all(map(is_known, (self, self.network, self.network.activation)))
 
     def packed(self, *, numpy: bool = True) -> Packed:
-        """The weights as the compiled form of `terms` takes them (`runtime/convex.py`).
+        """The weights as the compiled form of `terms` takes them (`kernels/convex.py`).
 
         numpy: True gives an array, False a tensor of the same numbers, differentiable in the parameters.
         Raises ArgumentError when the activation has no compiled form.

@@ -21,7 +21,7 @@ from nbs_pin.controllers.part_claims import check_parts, friction_claims, positi
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.kernels.layout import SLOTINE_LI, Packed
+from nbs_pin.kernels.layout import LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
 
@@ -129,4 +129,4 @@ class SlotineLi(LyapunovLaw):
 
     def _packed(self, numpy: bool) -> Packed:
         rate, gain = self.gains.value(numpy=numpy)
-        return self._pack(SLOTINE_LI, (rate, gain))
+        return self._pack(LawCode.SLOTINE_LI, (rate, gain))

@@ -18,7 +18,7 @@ from nbs_pin.dynamics.lagrangian_network import CompiledTorque, LagrangianNetwor
 from nbs_pin.dynamics.structure import POSITIVE, ModelClaims, quadratic
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import tree_workspace
-from nbs_pin.kernels.tree_rows import tree_torques
+from nbs_pin.kernels.trees import tree_torques
 
 
 @known_code
@@ -91,7 +91,7 @@ class Chain(LagrangianNetwork):
         return self.parents == parents.tolist() and self.prismatic == prismatic.tolist()
 
     def packed_tree(self) -> Packed:
-        """The same tree for the kernels of `runtime/trees.py`, r² + ε as armature."""
+        """The same tree for the kernels of `kernels/trees.py`, r² + ε as armature."""
         with torch.no_grad():
             rotations, factors = rotation_matrices(self.turns), self.factors.tril()
             inertia = (factors @ factors.mT).numpy(force=True)

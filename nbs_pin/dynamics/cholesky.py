@@ -92,7 +92,7 @@ class CholeskyNetwork(LagrangianNetwork):
         return quadratic(floored(float(self.scales.epsilon), "M̂ = LLᵀ + εI"))
 
     def compiled(self) -> CompiledTorque | None:
-        """`torque` as machine code (`runtime/cholesky.py`); None for a subclass, which may have another torque."""
+        """`torque` as machine code (`kernels/cholesky.py`); None for a subclass, which may have another torque."""
         if type(self) is not CholeskyNetwork:
             return None
         from nbs_pin.kernels.cholesky import CholeskyTorque, pack_cholesky

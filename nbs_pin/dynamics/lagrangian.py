@@ -20,7 +20,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import tree_workspace
-from nbs_pin.kernels.tree_rows import tree_accelerations
+from nbs_pin.kernels.trees import tree_accelerations
 from nbs_pin.robots.robot import Robot
 
 

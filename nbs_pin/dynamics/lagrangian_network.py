@@ -89,7 +89,7 @@ class LagrangianNetwork(nn.Module, ABC):
         return all(features.prismatic.tolist() == prismatic.tolist() for features in seen)
 
     def packed_tree(self) -> Packed | None:
-        """The network as a rigid tree for the kernels of `runtime/trees.py`, or None where it is none."""
+        """The network as a rigid tree for the kernels of `kernels/trees.py`, or None where it is none."""
         return None
 
     def structure_claims(self) -> ModelClaims | None:

@@ -12,7 +12,7 @@ _SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismatic
 
 
 def pack_model(model: pin.Model) -> Packed:
-    """A Pinocchio model with its gravity and armature as a rigid tree for the kernels of `runtime/trees.py`.
+    """A Pinocchio model with its gravity and armature as a rigid tree for the kernels of `kernels/trees.py`.
 
     Raises ArgumentError for a joint that is neither revolute nor prismatic, or whose angle is stored as two numbers.
     """

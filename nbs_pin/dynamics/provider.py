@@ -51,7 +51,7 @@ class DynamicsProvider(ABC):
         return matvec(self.mass_matrix(q), a_r) + matvec(self.coriolis_matrix(q, v), v_r) + self.gravity(q)
 
     def packed_tree(self) -> Packed | None:
-        """The model as a rigid tree for the kernels of `runtime/trees.py`, or None when it is none."""
+        """The model as a rigid tree for the kernels of `kernels/trees.py`, or None when it is none."""
         return None
 
     def suits(self, robot: Robot) -> bool:

@@ -14,7 +14,7 @@ from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY, FIRST, MASS, SECON
 from nbs_pin.robots.robot import Robot
 
 Arm: TypeAlias = "Robot | Packed | RigidTree"
-"""A robot, or any rigid tree as `runtime/tree_layout.py` packs it (a chain network's too), or what is read of it."""
+"""A robot, or any rigid tree as `kernels/tree_layout.py` packs it (a chain network's too), or what is read of it."""
 
 
 @dataclass(frozen=True, eq=False)

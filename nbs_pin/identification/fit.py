@@ -42,7 +42,7 @@ def fit(
     Coulomb friction too, which is no part of M, C, G. progress: show a bar.
     settings: loss, optimiser and iterations of a network (`fit_network`) and its widths; what `identify` takes.
     Ctrl-C ends the fit of a network and keeps the best. Raises ArgumentError for an unknown model, settings that are
-    none of its own, a missing robot or one that the data are not of (`same_arm.py`; its masses and lengths may be
+    none of its own, a missing robot or one that the data are not of (`compatibility.py`; its masses and lengths may be
     wrong), held_out of another arm, and data without torque unless the loss is that of the acceleration.
     """
     fitter = entry("model", model, MODELS).load()

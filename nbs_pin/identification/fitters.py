@@ -65,7 +65,7 @@ class Fitted:
 
 
 def fit_family(task: FitTask) -> Fitted:
-    """A network by name (`networks/families.py`), in the units that the data suggest."""
+    """A network by name (`dynamics/registry.py`), in the units that the data suggest."""
     settings = task.known("loss", "optimiser", "iterations", "transition", "widths", "epsilon")
     options: dict[str, Any] = {name: settings.pop(name) for name in ("widths", "epsilon") if name in settings}
     torque, rate = (deviation_of(x) for x in (task.data.tau, task.data.a))

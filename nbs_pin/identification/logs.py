@@ -45,7 +45,7 @@ def load_log(
     Warns of a single trajectory and of a log without torque, from which no model can be had (docs/theory.md §6).
     Raises FileNotFoundError for no file and FileFormatError naming file, row or column and remedy for a missing column,
     a number that is none, time that does not increase, v that is not dq/dt, a that is not dv/dt, degrees, and a dataset
-    of another arm than `robot` (`same_arm.py`).
+    of another arm than `robot` (`compatibility.py`).
     """
     path = Path(path)
     names = None if robot is None else robot.joint_names

@@ -17,7 +17,7 @@ from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.threads import cores
 from nbs_pin.kernels.tree_layout import tree_workspace
 from nbs_pin.kernels.tree_parameters import COLUMNS, INERTIA, ROTOR, tree_derivatives
-from nbs_pin.kernels.tree_rows import tree_torques
+from nbs_pin.kernels.trees import tree_torques
 
 R = TypeVar("R")
 _CHUNK = 512

@@ -4,129 +4,101 @@ import math
 
 import numpy as np
 
-from nbs_pin.kernels.jit import kernel
-from nbs_pin.kernels.layout import PADDING, PART_HEADER, SMOOTHED_RELU, Packed, workspace
+from nbs_pin.kernels.jit import inlined, kernel
+from nbs_pin.kernels.layout import PADDING, ActivationCode, Packed, workspace
+from nbs_pin.kernels.matrices import times_dual
+from nbs_pin.kernels.records import Dual, Vec
+from nbs_pin.kernels.views import layer, potential_of, row, take2, take4
+
+
+@inlined
+def activation(code: int, parameter: float, a: float) -> tuple[float, float, float, float]:
+    """σ(a) and its first three derivatives; where σ'' jumps, its value beyond the middle piece."""
+    if code == ActivationCode.SMOOTHED_RELU:
+        s = a / parameter
+        s = 0.0 if s < 0.0 else (1.0 if s > 1.0 else s)
+        return s * (a - 0.5 * parameter * s), s, 1.0 / parameter if 0.0 < a < parameter else 0.0, 0.0
+    if code == ActivationCode.SQUAREPLUS:
+        square = a * a + parameter
+        root, inverse = math.sqrt(square), 1.0 / square
+        bend = 0.5 * parameter * root * inverse * inverse
+        return 0.5 * (a + root), 0.5 * (1.0 + a * root * inverse), bend, -3.0 * a * inverse * bend
+    return math.nan, math.nan, math.nan, math.nan
 
 
 @kernel
-def activate(code: int, parameter: float, y: np.ndarray, dy: np.ndarray, slope: np.ndarray, bend: np.ndarray) -> None:
-    """σ(a) → y, σ'(a)ȧ → ẏ, slope ← σ'(a), bend ← σ''(a)ȧ, given a in slope and ȧ in bend."""
-    if code == SMOOTHED_RELU:
-        for i in range(len(slope)):
-            a = slope[i]
-            s = a / parameter
-            if s < 0.0:
-                s = 0.0
-            elif s > 1.0:
-                s = 1.0
-            slope[i], y[i], dy[i] = s, s * (a - 0.5 * parameter * s), s * bend[i]
-            bend[i] = bend[i] / parameter if 0.0 < a < parameter else 0.0 * bend[i]
-    else:
-        for i in range(len(slope)):
-            a = slope[i]
-            root = math.sqrt(a * a + parameter)
-            s = 0.5 * (1.0 + a / root)
-            slope[i], y[i], dy[i] = s, 0.5 * (a + root), s * bend[i]
-            bend[i] = 0.5 * parameter / (root * root * root) * bend[i]
-
-
-@kernel
-def convex_forward(
-    layout: np.ndarray, weights: np.ndarray, u: np.ndarray, du: np.ndarray, slope: np.ndarray, bend: np.ndarray
-) -> float:
+def convex_forward(part: Packed, u: Vec, du: Vec, slope: Vec, bend: Vec) -> float:
     """f(x) of a convex network, and in the tapes σ'(a) and σ''(a)ȧ of every layer, for x in u[:n] and ẋ in du[:n]."""
-    n, depth, code = layout[0], layout[1], layout[2]
+    phi = potential_of(part)
+    n, code, parameter, at = phi.n, phi.code, phi.parameter[0], 0
     u[n:], du[n:] = 0.0, 0.0
     u[n] = 1.0
-    at = 0
-    for layer in range(depth):
-        size, length, offset = layout[PART_HEADER + 3 * layer : PART_HEADER + 3 * layer + 3]
-        matrix = weights[offset : offset + size * length].reshape(size, length)
-        s, b = slope[at : at + size], bend[at : at + size]
+    for k in range(phi.depth):
+        size, length, matrix = layer(part, k)
+        s, b, y, dy = slope[at : at + size], bend[at : at + size], u[n + 1 :], du[n + 1 :]
+        times_dual(matrix, u[:length], du[:length], s, b)
         for i in range(size):
-            row = matrix[i]
-            a, da = 0.0, 0.0
-            for j in range(length):
-                a += row[j] * u[j]
-                da += row[j] * du[j]
-            s[i], b[i] = a, da
-        y, dy = u[n + 1 :], du[n + 1 :]
-        activate(code, weights[0], y, dy, s, b)
+            y[i], first, second, _ = activation(code, parameter, s[i])
+            s[i], dy[i], b[i] = first, first * b[i], second * b[i]
         y[size:], dy[size:] = 0.0, 0.0
         at += size
     return u[n + 1]
 
 
 @kernel
-def convex_reverse(
-    layout: np.ndarray, weights: np.ndarray, slope: np.ndarray, bend: np.ndarray, g: np.ndarray, dg: np.ndarray
-) -> None:
+def convex_reverse(part: Packed, slope: Vec, bend: Vec, g: Vec, dg: Vec) -> None:
     """∇f(x) → g[:n] and ∇²f(x)ẋ → dg[:n] from the tapes, which are used up: they carry λ and λ̇ from layer to layer.
 
     δ = σ'λ, δ̇ = σ''ȧλ + σ'λ̇;  ∇f = Σ Wxᵀδ, ∇²f ẋ = Σ Wxᵀδ̇;  λ ← Wyᵀδ, λ̇ ← Wyᵀδ̇.
     """
-    n, depth = layout[0], layout[1]
+    phi, at = potential_of(part), len(slope)
+    n = phi.n
     g[:], dg[:] = 0.0, 0.0
-    at = len(slope)
-    for layer in range(depth - 1, -1, -1):
-        size, length, offset = layout[PART_HEADER + 3 * layer : PART_HEADER + 3 * layer + 3]
-        matrix = weights[offset : offset + size * length].reshape(size, length)
+    g[n + 1] = 1.0
+    for k in range(phi.depth - 1, -1, -1):
+        size, length, matrix = layer(part, k)
         at -= size
         s, b = slope[at : at + size], bend[at : at + size]
-        last = layer == depth - 1
         for i in range(size):
-            lam, dlam = (1.0, 0.0) if last else (g[n + 1 + i], dg[n + 1 + i])
+            lam, dlam = g[n + 1 + i], dg[n + 1 + i]
             s[i], b[i] = s[i] * lam, b[i] * lam + s[i] * dlam
         g[n:], dg[n:] = 0.0, 0.0
         for i in range(size):
-            row = matrix[i]
-            delta, ddelta = s[i], b[i]
+            w, delta, ddelta = row(matrix, i, length), s[i], b[i]
             for j in range(length):
-                g[j] += delta * row[j]
-                dg[j] += ddelta * row[j]
+                g[j] += delta * w[j]
+                dg[j] += ddelta * w[j]
 
 
 @kernel
-def potential(
-    z: np.ndarray,
-    dz: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    gradient: np.ndarray,
-    product: np.ndarray,
-) -> float:
-    """Φ(z) [J]; ∇Φ(z) [N·m] → gradient and ∇²Φ(z) ż → product. (n,) each."""
-    n, depth, widest = layout[0], layout[1], layout[3]
-    total = 0
-    for layer in range(depth):
-        total += layout[PART_HEADER + 3 * layer]
-    room = widest + PADDING
-    u, du, g, dg = work[:room], work[room : 2 * room], work[2 * room : 3 * room], work[3 * room : 4 * room]
-    slope, bend = work[4 * room : 4 * room + total], work[4 * room + total : 4 * room + 2 * total]
-    scale, tangent = weights[2 : 2 + n], weights[2 + n : 2 + 2 * n]
-    stiffness = weights[2 + 2 * n : 2 + 2 * n + n * n].reshape(n, n)
-    for i in range(n):
-        u[i], du[i] = scale[i] * z[i], scale[i] * dz[i]
-    value = convex_forward(layout, weights, u, du, slope, bend) - weights[1]
-    convex_reverse(layout, weights, slope, bend, g, dg)
-    for i in range(n):
-        force, rate = 0.0, 0.0
-        for j in range(n):
-            force += stiffness[i, j] * z[j]
-            rate += stiffness[i, j] * dz[j]
-        value += z[i] * (0.5 * force - scale[i] * tangent[i])
-        gradient[i] = scale[i] * (g[i] - tangent[i]) + force
-        product[i] = scale[i] * dg[i] + rate
+def potential(error: Dual, part: Packed, work: Vec, out: Dual) -> float:
+    """Φ(z) [J]; ∇Φ(z) [N·m] and ∇²Φ(z) ż → out, for z and ż in error."""
+    phi, z, dz, units = potential_of(part), error.value, error.rate, 0
+    for k in range(phi.depth):
+        units += layer(part, k)[0]
+    u, du, g, dg, work = take4(work, phi.widest + PADDING)
+    slope, bend, work = take2(work, units)
+    for i in range(phi.n):
+        u[i], du[i] = phi.scale[i] * z[i], phi.scale[i] * dz[i]
+    value = convex_forward(part, u, du, slope, bend) - phi.value[0]
+    convex_reverse(part, slope, bend, g, dg)
+    times_dual(phi.stiffness, z, dz, out.value, out.rate)
+    for i in range(phi.n):
+        value += z[i] * (0.5 * out.value[i] - phi.scale[i] * phi.tangent[i])
+        out.value[i] += phi.scale[i] * (g[i] - phi.tangent[i])
+        out.rate[i] += phi.scale[i] * dg[i]
     return value
 
 
 def subtract_tangent(part: Packed) -> Packed:
-    """The potential with its f replaced by f(x) − f(0) − ∇f(0)·x, evaluated with the kernels themselves."""
-    n = int(part.layout[0])
-    weights, bare = part.weights.copy(), part.weights.copy()
-    bare[2 : 2 + n] = 1.0  # R is 1 here: ∇f itself is wanted, and to the last bit, so that ∇ψ(0) is exactly 0
-    zero, gradient, product = np.zeros((3, n))
-    weights[1] = potential(zero, zero, part.layout, bare, np.empty(workspace(part)), gradient, product)
-    weights[2 + n : 2 + 2 * n] = gradient
-    return Packed(part.layout, weights)
+    """The potential with its f replaced by f(x) − f(0) − ∇f(0)·x, evaluated with the kernels themselves.
+
+    Args:
+        part: a potential as numpy arrays, with zeros for f(0) and ∇f(0).
+    """
+    bare, whole = (Packed(part.layout, part.weights.copy()) for _ in range(2))
+    phi = potential_of(whole)
+    potential_of(bare).scale[:] = 1.0  # ∇f itself is wanted, and to the last bit, so that ∇ψ(0) is exactly 0
+    zero, product = np.zeros((2, phi.n))
+    phi.value[0] = potential(Dual(zero, zero), bare, np.empty(workspace(part)), Dual(phi.tangent, product))
+    return whole

@@ -1,16 +1,23 @@
-"""The damping force of one velocity error: two tanh networks and the products with T."""
+"""The damping force of one velocity error: two tanh networks and the products with T; and its adjoint.
 
-import numpy as np
+What s = f̄ᵀD(z)z gains, with x = Rz and y = Rf̄:  s = f̄ᵀD₀z + (Ty)ᵀ(Tx), so T̄ = (Ty)xᵀ + (Tx)yᵀ on and below the
+diagonal, x̄ = Tᵀ(Ty) and ȳ = Tᵀ(Tx) for T held still; T̄ then goes back through the two tanh networks.
+"""
 
-from nbs_pin.kernels.jit import exact_kernel, kernel
-from nbs_pin.kernels.layout import PADDING, PART_HEADER
+import math
+
+from nbs_pin.kernels.jit import exact_kernel, inlined, kernel
+from nbs_pin.kernels.layout import PADDING, DampingCode, Packed
+from nbs_pin.kernels.matrices import times, times_adjoint
+from nbs_pin.kernels.records import Vec
+from nbs_pin.kernels.views import damping_of, layer, take, take2, take3, take4
 
 _I3, _I5, _I6, _I7, _I8, _I9 = 1 / 3, 1 / 5, 1 / 6, 1 / 7, 1 / 8, 1 / 9
 _I10, _I11, _I12, _I13, _I14, _I15 = 1 / 10, 1 / 11, 1 / 12, 1 / 13, 1 / 14, 1 / 15
 
 
 @exact_kernel
-def tanh(x: np.ndarray, y: np.ndarray) -> None:
+def tanh(x: Vec, y: Vec) -> None:
     """Hyperbolic tangent of x → y, to a few units in the last place, in operations that fill vector registers.
 
     −e/(2 + e) with e = expm1(−2x), from its series at −2x/64 and six doublings expm1(2w) = e(2 + e).
@@ -24,65 +31,143 @@ def tanh(x: np.ndarray, y: np.ndarray) -> None:
         e = 1.0 + w * _I9 * (1.0 + w * _I10 * (1.0 + w * _I11 * (1.0 + w * _I12 * e)))
         e = 1.0 + w * _I5 * (1.0 + w * _I6 * (1.0 + w * _I7 * (1.0 + w * _I8 * e)))
         e = w * (1.0 + w * 0.5 * (1.0 + w * _I3 * (1.0 + w * 0.25 * e)))
-        e = e * (2.0 + e)
-        e = e * (2.0 + e)
-        e = e * (2.0 + e)
-        e = e * (2.0 + e)
-        e = e * (2.0 + e)
-        e = e * (2.0 + e)
+        for _ in range(6):
+            e = e * (2.0 + e)
         y[i] = -e / (2.0 + e)
 
 
 @kernel
-def tanh_network(
-    first: int, depth: int, layout: np.ndarray, weights: np.ndarray, x: np.ndarray, h: np.ndarray, out: np.ndarray
-) -> None:
-    """The linear output of a tanh network at x → out; h is scratch space. `first`: its first layer in the layout."""
-    size = len(x)
-    h[:size] = x
-    for layer in range(first, first + depth):
-        h[size], h[size + 1 :] = 1.0, 0.0
-        size, length, offset = layout[PART_HEADER + 3 * layer : PART_HEADER + 3 * layer + 3]
-        matrix = weights[offset : offset + size * length].reshape(size, length)
-        for i in range(size):
-            row = matrix[i]
-            a = 0.0
-            for j in range(length):
-                a += row[j] * h[j]
-            out[i] = a
-        if layer < first + depth - 1:
+def tanh_network(first: int, part: Packed, x: Vec, taped: bool, tape: Vec, out: Vec) -> int:
+    """The linear output of a tanh network at x → out; `first`: its first layer in the layout.
+
+    Taped, the inputs [h, 1, 0] of all its layers follow each other on the tape, and the number of them is returned;
+    else they replace each other at its start.
+    """
+    size, at = len(x), 0
+    for k in range(first, first + damping_of(part).depth):
+        width, length, matrix = layer(part, k)
+        h = tape[at : at + length]
+        if k == first:
+            h[:size] = x
+        else:
             tanh(out[:size], h[:size])
+        h[size], h[size + 1 :] = 1.0, 0.0
+        times(matrix, h, out[:width])
+        size = width
+        if taped:
+            at += length
+    return at
+
+
+@inlined
+def diagonal_of(code: int, m: float, x: float) -> tuple[float, float]:
+    """An entry of T's diagonal from what its network gives, and its derivative."""
+    if code == DampingCode.BOUNDED:
+        return x, 1.0
+    if code == DampingCode.PAPER:
+        return m if x < 0.0 else x + m, 1.0 if x > 0.0 else 0.0
+    return math.nan, math.nan
 
 
 @kernel
-def damping_force(z: np.ndarray, layout: np.ndarray, weights: np.ndarray, work: np.ndarray, force: np.ndarray) -> None:
-    """D(z) z = D₀z + R TᵀT Rz [N·m] → force, (n,)."""
-    n, paper, depth, widest = layout[0], layout[1], layout[2], layout[3]
-    m, scale, floor = weights[0], weights[1 : 1 + n], weights[1 + n : 1 + n + n * n].reshape(n, n)
-    room = widest + PADDING
-    x, tx, diagonal, h = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 3 * n + room]
-    out = work[3 * n + room :]
+def damping_force(z: Vec, part: Packed, work: Vec, force: Vec) -> None:
+    """D(z) z = D₀z + R TᵀT Rz [N·m] → force."""
+    d = damping_of(part)
+    n = d.n
+    x, diagonal, work = take2(work, n)
+    h, out = take(work, d.widest + PADDING)
     for i in range(n):
-        x[i] = scale[i] * z[i]
-    tanh_network(0, depth, layout, weights, x, h, out)
+        x[i] = d.scale[i] * z[i]
+    tanh_network(0, part, x, False, h, out)
     for i in range(n):
-        diagonal[i] = out[i] if not paper else (m if out[i] < 0.0 else out[i] + m)
-    tanh_network(depth, depth, layout, weights, x, h, out)
-    at = 0
-    for i in range(n):  # T x, with row i of T below the diagonal in out[at : at + i]
-        tx[i] = diagonal[i] * x[i]
+        diagonal[i], _ = diagonal_of(d.code, d.m[0], out[i])
+    tanh_network(d.depth, part, x, False, h, out)
+    force[:], at = 0.0, 0
+    for i in range(n):  # Tᵀ(T x), with row i of T below the diagonal in out[at : at + i]
+        tx = diagonal[i] * x[i]
         for j in range(i):
-            tx[i] += out[at + j] * x[j]
-        at += i
-    for i in range(n):
-        force[i] = diagonal[i] * tx[i]
-    at = 0
-    for i in range(n):
+            tx += out[at + j] * x[j]
+        force[i] += diagonal[i] * tx
         for j in range(i):
-            force[j] += out[at + j] * tx[i]
+            force[j] += out[at + j] * tx
         at += i
+    times(d.floor, z, x)
     for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += floor[i, j] * z[j]
-        force[i] = total + scale[i] * force[i]
+        force[i] = x[i] + d.scale[i] * force[i]
+
+
+@kernel
+def room_for_damping(part: Packed) -> int:
+    """How many numbers of scratch space `damping_adjoint` needs for the damping."""
+    d, tapes = damping_of(part), 0
+    for k in range(2 * d.depth):
+        tapes += layer(part, k)[1]
+    return 5 * d.n + 3 * d.widest + tapes
+
+
+@kernel
+def tanh_reverse(first: int, part: Packed, tape: Vec, out_bar: Vec, h_bar: Vec, part_bar: Packed) -> int:
+    """What is gained per x → h_bar[:n] and, added to part_bar, per weight; returns where its tape began.
+
+    tape: up to the last number that `tanh_network` wrote. out_bar, as wide as a layer, is used up.
+    """
+    at = len(tape)
+    for k in range(first + damping_of(part).depth - 1, first - 1, -1):
+        size, length, matrix = layer(part, k)
+        at -= length
+        h, total = tape[at : at + length], h_bar[:length]
+        total[:] = 0.0
+        times_adjoint(matrix, h, out_bar[:size], total, layer(part_bar, k)[2])
+        if k > first:
+            for j in range(layer(part, k - 1)[0]):
+                out_bar[j] = total[j] * (1.0 - h[j] * h[j])
+    return at
+
+
+@kernel
+def factor_adjoint(x: Vec, y: Vec, diagonal: Vec, lower: Vec, x_bar: Vec, y_bar: Vec) -> None:
+    """Tᵀ(Ty) → x_bar, Tᵀ(Tx) → y_bar, and T̄ in place of T: its diagonal, and its rows below it end to end."""
+    n, at = len(x), 0
+    x_bar[:], y_bar[:] = 0.0, 0.0
+    for i in range(n):
+        tx, ty = diagonal[i] * x[i], diagonal[i] * y[i]
+        for j in range(i):
+            tx += lower[at + j] * x[j]
+            ty += lower[at + j] * y[j]
+        x_bar[i] += diagonal[i] * ty
+        y_bar[i] += diagonal[i] * tx
+        diagonal[i] = ty * x[i] + tx * y[i]
+        for j in range(i):
+            x_bar[j] += lower[at + j] * ty
+            y_bar[j] += lower[at + j] * tx
+            lower[at + j] = ty * x[j] + tx * y[j]
+        at += i
+
+
+@kernel
+def damping_adjoint(z: Vec, force_bar: Vec, part: Packed, work: Vec, z_bar: Vec, weights_bar: Vec) -> None:
+    """Add the gradient of force_barᵀD(z)z by z and by the weights of the damping; m gets none."""
+    part_bar = Packed(part.layout, weights_bar)
+    d, d_bar = damping_of(part), damping_of(part_bar)
+    n = d.n
+    x, y, x_bar, y_bar, work = take4(work, n)
+    diagonal, work = take(work, n)
+    h_bar, upper, lower, tapes = take3(work, d.widest)
+    for i in range(n):
+        x[i], y[i] = d.scale[i] * z[i], d.scale[i] * force_bar[i]
+    used = tanh_network(0, part, x, True, tapes, upper)
+    used += tanh_network(d.depth, part, x, True, tapes[used:], lower)
+    for i in range(n):
+        diagonal[i], upper[i] = diagonal_of(d.code, d.m[0], upper[i])
+    factor_adjoint(x, y, diagonal, lower, x_bar, y_bar)
+    for i in range(n):
+        upper[i] *= diagonal[i]
+    used = tanh_reverse(d.depth, part, tapes[:used], lower, h_bar, part_bar)
+    for i in range(n):
+        x_bar[i] += h_bar[i]
+    tanh_reverse(0, part, tapes[:used], upper, h_bar, part_bar)
+    for i in range(n):
+        x_bar[i] += h_bar[i]
+        z_bar[i] += d.scale[i] * x_bar[i]
+        d_bar.scale[i] += z[i] * x_bar[i] + force_bar[i] * y_bar[i]
+    times_adjoint(d.floor, z, force_bar, z_bar, d_bar.floor)

@@ -2,189 +2,142 @@
 
 import math
 
-import numpy as np
-
+from nbs_pin.kernels import layout as at
 from nbs_pin.kernels.convex_adjoint import pull_back, room_for_potential, taped
-from nbs_pin.kernels.damping_adjoint import damping_adjoint, room_for_damping
+from nbs_pin.kernels.damping import damping_adjoint, room_for_damping
 from nbs_pin.kernels.jit import exact_kernel, kernel
-from nbs_pin.kernels.laws import difference
-from nbs_pin.kernels.layout import BACKSTEPPING, COMPUTED_TORQUE, SLOTINE_LI, Packed
-
-_TURN = 2.0 * math.pi
-_VECTORS = 10
+from nbs_pin.kernels.laws import errors, pid_terms
+from nbs_pin.kernels.layout import LawCode, Packed
+from nbs_pin.kernels.records import Dual, Memory, Signals, State, Target, Tracking, Vec
+from nbs_pin.kernels.views import damping_in, numbers, pid_of, potential_in, take2, take4, vector
 
 
 def adjoint_workspace(law: Packed) -> int:
     """How many numbers of scratch space `law_adjoint` needs for this law."""
-    layout, n = law.layout, int(law.layout[1])
-    if layout[0] != BACKSTEPPING:
-        return _VECTORS * n
-    return _VECTORS * n + int(room_for_potential(layout[layout[3] :]) + room_for_damping(layout[layout[5] :]))
+    networks = law.layout[at.LAW] == LawCode.BACKSTEPPING
+    rooms = room_for_potential(potential_in(law)) + room_for_damping(damping_in(law)) if networks else 0
+    return int(10 * law.layout[at.JOINTS] + rooms)
 
 
 @kernel
-def friction_adjoint(
-    n: int, weights: np.ndarray, v: np.ndarray, torque_bar: np.ndarray, v_bar: np.ndarray, weights_bar: np.ndarray
-) -> None:
-    """Adjoint of `laws.friction`, added to v_bar and to the bars of its three constants."""
-    viscous, coulomb, transition = weights[3 * n : 4 * n], weights[4 * n : 5 * n], weights[5 * n]
-    for i in range(n):
+def friction_adjoint(law: Packed, v: Vec, torque_bar: Vec, v_bar: Vec, law_bar: Packed) -> None:
+    """Adjoint of `laws.friction`, added to v_bar and to the cotangents of its three constants."""
+    viscous, coulomb, transition = vector(law, at.VISCOUS), vector(law, at.COULOMB), numbers(law)[at.TRANSITION]
+    viscous_bar, coulomb_bar, numbers_bar = vector(law_bar, at.VISCOUS), vector(law_bar, at.COULOMB), numbers(law_bar)
+    for i in range(len(v)):
         share = math.tanh(v[i] / transition)
         steepness = coulomb[i] * (1.0 - share * share) / transition
         v_bar[i] += (viscous[i] + steepness) * torque_bar[i]
-        weights_bar[3 * n + i] += v[i] * torque_bar[i]
-        weights_bar[4 * n + i] += share * torque_bar[i]
-        weights_bar[5 * n] -= steepness * v[i] / transition * torque_bar[i]
+        viscous_bar[i] += v[i] * torque_bar[i]
+        coulomb_bar[i] += share * torque_bar[i]
+        numbers_bar[at.TRANSITION] -= steepness * v[i] / transition * torque_bar[i]
 
 
 @kernel
 def backstepping_adjoint(
-    v: np.ndarray,
-    v_ref: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    v_r_bar: np.ndarray,
-    a_r_bar: np.ndarray,
-    feedback_bar: np.ndarray,
-    q_bar: np.ndarray,
-    v_bar: np.ndarray,
-    weights_bar: np.ndarray,
+    now: Tracking, law: Packed, work: Vec, out_bar: Signals, state_bar: State, law_bar: Packed
 ) -> None:
-    """Adjoint of `laws.backstepping` and of its friction, fed forward at v_r, with z1 in work[:n]."""
-    n, rate, omega = layout[1], weights[layout[1] : 2 * layout[1]], weights[5 * layout[1] + 1]
-    vectors = work[: _VECTORS * n].reshape(_VECTORS, n)
-    z1, dz1, v_r, z2, r_bar, z2_bar = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
-    gradient, product, gradient_bar, product_bar = vectors[6], vectors[7], vectors[8], vectors[9]
-    phi, phi_weights, phi_bar = layout[layout[3] :], weights[layout[4] :], weights_bar[layout[4] :]
-    d, d_weights, d_bar = layout[layout[5] :], weights[layout[6] :], weights_bar[layout[6] :]
-    room, d_room = work[_VECTORS * n :], work[_VECTORS * n + room_for_potential(phi) :]
+    """Adjoint of `laws.backstepping` and of its friction, fed forward at v_r."""
+    n, phi, rate, omega = len(now.v), potential_in(law), vector(law, at.FIRST), numbers(law)[at.OMEGA]
+    error, feedback_bar, a_r_bar = Dual(now.z1, now.dz1), out_bar.feedback, out_bar.a_r
+    rate_bar, numbers_bar = vector(law_bar, at.FIRST), numbers(law_bar)
+    v_r, z2, r_bar, z2_bar, work = take4(work, n)
+    gradient, product, gradient_bar, product_bar, work = take4(work, n)
+    taped(error, phi, work, Dual(gradient, product))
     for i in range(n):
-        dz1[i] = v[i] - v_ref[i]
-    taped(z1, dz1, phi, phi_weights, room, gradient, product)
+        v_r[i] = now.v_ref[i] - rate[i] * gradient[i]
+        z2[i] = now.v[i] - v_r[i]
+        r_bar[i], z2_bar[i], product_bar[i] = out_bar.v_r[i], -omega * a_r_bar[i], -feedback_bar[i]
+        numbers_bar[at.OMEGA] -= z2[i] * a_r_bar[i]
+    room = work[room_for_potential(phi) :]
+    damping_adjoint(z2, product_bar, damping_in(law), room, z2_bar, damping_in(law_bar).weights)
+    if law.layout[at.FRICTION]:
+        friction_adjoint(law, v_r, feedback_bar, r_bar, law_bar)
     for i in range(n):
-        v_r[i] = v_ref[i] - rate[i] * gradient[i]
-        z2[i] = v[i] - v_r[i]
-        r_bar[i], z2_bar[i], product_bar[i] = v_r_bar[i], -omega * a_r_bar[i], -feedback_bar[i]
-        weights_bar[5 * n + 1] -= z2[i] * a_r_bar[i]
-    damping_adjoint(z2, product_bar, d, d_weights, d_room, z2_bar, d_bar)
-    if layout[2]:
-        friction_adjoint(n, weights, v_r, feedback_bar, r_bar, weights_bar)
-    for i in range(n):
-        v_bar[i] += z2_bar[i]
+        state_bar.v[i] += z2_bar[i]
         r_bar[i] -= z2_bar[i]
         gradient_bar[i], product_bar[i] = -feedback_bar[i] - rate[i] * r_bar[i], -rate[i] * a_r_bar[i]
-        weights_bar[n + i] -= gradient[i] * r_bar[i] + product[i] * a_r_bar[i]
-    pull_back(z1, dz1, gradient_bar, product_bar, phi, phi_weights, room, q_bar, v_bar, phi_bar)
+        rate_bar[i] -= gradient[i] * r_bar[i] + product[i] * a_r_bar[i]
+    bars, error_bar = Dual(gradient_bar, product_bar), Dual(state_bar.q, state_bar.v)
+    pull_back(error, bars, phi, work, error_bar, potential_in(law_bar).weights)
 
 
 @kernel
-def linear_adjoint(
-    v: np.ndarray,
-    v_ref: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    v_r_bar: np.ndarray,
-    a_r_bar: np.ndarray,
-    feedback_bar: np.ndarray,
-    q_bar: np.ndarray,
-    v_bar: np.ndarray,
-    weights_bar: np.ndarray,
-) -> None:
-    """Adjoint of `laws.linear_law` and of its friction, with z1 in work[:n]."""
-    law, n = layout[0], layout[1]
-    first, second, first_bar, second_bar = weights[n:], weights[2 * n :], weights_bar[n:], weights_bar[2 * n :]
-    z1, r_bar, v_r = work[:n], work[n : 2 * n], work[2 * n : 3 * n]
+def linear_adjoint(now: Tracking, law: Packed, work: Vec, out_bar: Signals, state_bar: State, law_bar: Packed) -> None:
+    """Adjoint of `laws.linear_law` and of its friction; of any other law NaN."""
+    n, code, first, second = len(now.v), law.layout[at.LAW], vector(law, at.FIRST), vector(law, at.SECOND)
+    first_bar, second_bar = vector(law_bar, at.FIRST), vector(law_bar, at.SECOND)
+    r_bar, v_r, work = take2(work, n)
     for i in range(n):
-        r_bar[i], v_r[i] = v_r_bar[i], v_ref[i] - (first[i] * z1[i] if law == SLOTINE_LI else 0.0)
-    if layout[2]:
-        friction_adjoint(n, weights, v_r, feedback_bar, r_bar, weights_bar)
+        r_bar[i] = out_bar.v_r[i]
+        v_r[i] = now.v_ref[i] - (first[i] * now.z1[i] if code == LawCode.SLOTINE_LI else 0.0)
+    if law.layout[at.FRICTION]:
+        friction_adjoint(law, v_r, out_bar.feedback, r_bar, law_bar)
     for i in range(n):
-        dz1, a_bar, f_bar = v[i] - v_ref[i], a_r_bar[i], feedback_bar[i]
-        if law == SLOTINE_LI:
+        z1, dz1, a_bar, f_bar, pd_bar = now.z1[i], now.dz1[i], out_bar.a_r[i], out_bar.feedback[i], math.nan
+        if code == LawCode.SLOTINE_LI:
             r_bar[i] += second[i] * f_bar
-            q_bar[i] -= first[i] * r_bar[i]
-            v_bar[i] -= first[i] * a_bar + second[i] * f_bar
-            first_bar[i] -= z1[i] * r_bar[i] + dz1 * a_bar
-            second_bar[i] -= (v[i] - v_r[i]) * f_bar
-        else:  # the same PD, asked for as an acceleration or as a torque
-            pd_bar = a_bar if law == COMPUTED_TORQUE else f_bar
-            q_bar[i] -= first[i] * pd_bar
-            v_bar[i] -= second[i] * pd_bar - (v_r_bar[i] if law == COMPUTED_TORQUE else 0.0)
-            first_bar[i] -= z1[i] * pd_bar
-            second_bar[i] -= dz1 * pd_bar
+            state_bar.q[i] -= first[i] * r_bar[i]
+            state_bar.v[i] -= first[i] * a_bar + second[i] * f_bar
+            first_bar[i] -= z1 * r_bar[i] + dz1 * a_bar
+            second_bar[i] -= (now.v[i] - v_r[i]) * f_bar
+            continue
+        if code == LawCode.COMPUTED_TORQUE:  # the same PD as that of the others, asked for as an acceleration
+            pd_bar = a_bar
+            state_bar.v[i] += out_bar.v_r[i]
+        elif code == LawCode.PD_REFERENCE or code == LawCode.PD_GRAVITY:
+            pd_bar = f_bar
+        state_bar.q[i] -= first[i] * pd_bar
+        state_bar.v[i] -= second[i] * pd_bar
+        first_bar[i] -= z1 * pd_bar
+        second_bar[i] -= dz1 * pd_bar
 
 
 @kernel
 def law_adjoint(
-    q: np.ndarray,
-    v: np.ndarray,
-    q_ref: np.ndarray,
-    v_ref: np.ndarray,
-    a_ref: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    v_r_bar: np.ndarray,
-    a_r_bar: np.ndarray,
-    feedback_bar: np.ndarray,
-    q_bar: np.ndarray,
-    v_bar: np.ndarray,
-    weights_bar: np.ndarray,
+    state: State, target: Target, law: Packed, work: Vec, out_bar: Signals, state_bar: State, law_bar: Packed
 ) -> None:
     """Add the gradient of v_r_barᵀv_r + a_r_barᵀa_r + feedback_barᵀfeedback by q, v and the weights of the law.
 
-    For the signals of `laws.law_row` at the same state; (n,) each, weights_bar as weights. What says which joints wrap
-    gets none, nor does the reference, which training does not change.
+    For the signals of `laws.signals_of` at the same state; law_bar has cotangents for weights. What says which joints
+    wrap gets none, nor does the reference, which training does not change.
     """
-    difference(q, q_ref, weights[: layout[1]], work[: layout[1]])
-    bars = (v_r_bar, a_r_bar, feedback_bar, q_bar, v_bar, weights_bar)
-    if layout[0] == BACKSTEPPING:
-        backstepping_adjoint(v, v_ref, layout, weights, work, *bars)
+    z1, dz1, work = take2(work, len(state.q))
+    now = errors(state, target, law, z1, dz1)
+    if law.layout[at.LAW] == LawCode.BACKSTEPPING:
+        backstepping_adjoint(now, law, work, out_bar, state_bar, law_bar)
     else:
-        linear_adjoint(v, v_ref, layout, weights, work, *bars)
+        linear_adjoint(now, law, work, out_bar, state_bar, law_bar)
 
 
 @exact_kernel
 def pid_adjoint(
-    integral: np.ndarray,
-    derivative: np.ndarray,
-    q: np.ndarray,
-    v: np.ndarray,
-    q_ref: np.ndarray,
-    v_ref: np.ndarray,
+    memory: Memory,
+    state: State,
+    target: State,
     period: float,
-    gains: np.ndarray,
-    out_bar: np.ndarray,
-    integral_bar: np.ndarray,
-    derivative_bar: np.ndarray,
-    q_bar: np.ndarray,
-    v_bar: np.ndarray,
-    gains_bar: np.ndarray,
+    weights: Vec,
+    tau_bar: Vec,
+    after_bar: Memory,
+    memory_bar: Memory,
+    state_bar: State,
+    weights_bar: Vec,
 ) -> None:
-    """Add the gradient of the sum of out_bar·out by memory, state and gains, out as `laws.pid` gives it.
+    """Add the gradient of tau_barᵀτ + after_barᵀafter by memory, state and weights, for `laws.pid_step`.
 
-    out_bar: rows τ, integral, derivative; gains_bar: k_p, k_i, k_d, –, T_f, – as gains. The effort limit only decides
-    whether the integral rests, and gets none.
+    The effort limit only decides whether the integral rests, and gets none, nor does what says which joints wrap.
     """
-    n = gains.shape[1]
-    for k in range(out_bar.shape[1]):
-        i = k % n
-        z1 = q[k] - q_ref[k]
-        if gains[5, i] > 0.0:
-            z1 -= _TURN * np.ceil((z1 - math.pi) / _TURN)
-        blend, change = period / (gains[4, i] + period), v[k] - v_ref[k] - derivative[k]
-        rate = derivative[k] + blend * change
-        tau = -gains[0, i] * z1 - integral[k] - gains[2, i] * rate
-        winding = abs(tau) > gains[3, i] and tau * z1 < 0.0
-        tau_bar, rate_bar = out_bar[0, k], out_bar[2, k] - gains[2, i] * out_bar[0, k]
-        gained_bar = 0.0 if winding else period * out_bar[1, k]
-        q_bar[k] += gains[1, i] * gained_bar - gains[0, i] * tau_bar
-        v_bar[k] += blend * rate_bar
-        integral_bar[k] += out_bar[1, k] - tau_bar
-        derivative_bar[k] += (1.0 - blend) * rate_bar
-        gains_bar[0, i] -= z1 * tau_bar
-        gains_bar[1, i] += z1 * gained_bar
-        gains_bar[2, i] -= rate * tau_bar
-        gains_bar[4, i] -= change * rate_bar * blend / (gains[4, i] + period)
+    gains, bars = pid_of(weights), pid_of(weights_bar)
+    for k in range(len(tau_bar)):
+        i = k % len(gains.kp)
+        z1, blend, change, rate, _, rests = pid_terms(k, memory, state, target, period, gains)
+        rate_bar = after_bar.derivative[k] - gains.kd[i] * tau_bar[k]
+        gained_bar = 0.0 if rests else period * after_bar.integral[k]
+        state_bar.q[k] += gains.ki[i] * gained_bar - gains.kp[i] * tau_bar[k]
+        state_bar.v[k] += blend * rate_bar
+        memory_bar.integral[k] += after_bar.integral[k] - tau_bar[k]
+        memory_bar.derivative[k] += (1.0 - blend) * rate_bar
+        bars.kp[i] -= z1 * tau_bar[k]
+        bars.ki[i] += z1 * gained_bar
+        bars.kd[i] -= rate * tau_bar[k]
+        bars.filter_time[i] -= change * rate_bar * blend / (gains.filter_time[i] + period)

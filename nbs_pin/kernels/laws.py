@@ -1,181 +1,273 @@
-"""Every law of one state: what it adds to the model, τ = M(q) a_r + C(q, v) v_r + G(q) + feedback."""
+"""Every law of one state, what it adds to the model, τ = M(q) a_r + C(q, v) v_r + G(q) + feedback; and on a rigid tree
+the torque itself.
+"""
 
 import math
 
 import numpy as np
-from numba import boolean, float64, int64, void
+from numba import boolean, float64, int64
 
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.kernels import layout as at
 from nbs_pin.kernels.convex import potential
 from nbs_pin.kernels.damping import damping_force
-from nbs_pin.kernels.jit import compile_for, exact_kernel, kernel
-from nbs_pin.kernels.layout import BACKSTEPPING, COMPUTED_TORQUE, PD_GRAVITY, SLOTINE_LI
+from nbs_pin.kernels.jit import compile_for, exact_kernel, inlined, kernel
+from nbs_pin.kernels.layout import LawCode, Packed, known
+from nbs_pin.kernels.records import PID, Dual, Mat, Memory, Motion, Signals, State, Target, Tracking, Vec
+from nbs_pin.kernels.tree_layout import tree_workspace
+from nbs_pin.kernels.trees import tree_torque
+from nbs_pin.kernels.views import damping_in, numbers, pid_of, potential_in, row, take2, take3, take4, vector
 
 _TURN = 2.0 * math.pi
-
-
-_ROW, _ROWS = float64[::1], float64[:, ::1]
-_PACKED = (int64[::1], float64[::1], float64[::1])
-_SIGNALS = 3
+_VEC, _MAT, _PACKED = float64[::1], float64[:, ::1], (int64[::1], float64[::1])
 
 
 def compile_laws() -> None:
-    """Compile `law_row`, `law_rows` and `pid` for float64 arrays, so that no first call waits for the compiler."""
-    compile_for(law_row, boolean(*[_ROW] * 5, *_PACKED, *[_ROW] * _SIGNALS))
-    compile_for(law_rows, void(*[_ROWS] * 5, *_PACKED, *[_ROWS] * _SIGNALS))
-    compile_for(pid, boolean(*[_ROW] * 6, float64, _ROWS, _ROWS))
+    """Compile `law_signals` and `pid` for float64, so that no first call waits for the compiler."""
+    compile_for(law_signals, boolean(*[_VEC] * 5, *_PACKED, _VEC, _MAT))
+    compile_for(pid, boolean(*[_VEC] * 6, float64, _VEC, _MAT))
+
+
+def compile_tree_law() -> None:
+    """Compile `tree_law` for float64, so that no first call waits for the compiler."""
+    compile_for(tree_law, boolean(*[_VEC] * 5, *_PACKED, _VEC, _VEC))
+
+
+def law_workspace(law: Packed, tree: Packed | None = None) -> int:
+    """How many numbers of scratch space `law_signals` needs, or `tree_law`.
+
+    Args:
+        law: a law with a model of the arm, as `layout.pack_law` packs it.
+        tree: that model for `tree_law`.
+
+    Raises:
+        ArgumentError: for a law that no kernel knows, and for a PID, which has no model.
+    """
+    if known(int(law.layout[at.LAW]), LawCode, "law") is LawCode.PID:
+        raise ArgumentError("a PID was given as a law with a model of the arm; compile the PID itself.")
+    signals = int(law.layout[at.SCRATCH])
+    return signals if tree is None else 3 * int(law.layout[at.JOINTS]) + max(signals, tree_workspace(tree))
+
+
+def pack_tree_law(law: Packed, tree: Packed) -> Packed:
+    """A law and its model for `tree_law`: where the tree begins in layout and weights, the law, the tree.
+
+    Args:
+        law: the law, as `layout.pack_law` packs it.
+        tree: the model, as `tree_layout.pack_tree` packs it.
+    """
+    starts = [2 + len(law.layout), len(law.weights)]
+    return Packed(np.concatenate([starts, law.layout, tree.layout]), np.concatenate([law.weights, tree.weights]))
 
 
 @exact_kernel
-def difference(q: np.ndarray, q_ref: np.ndarray, continuous: np.ndarray, z1: np.ndarray) -> None:
-    """The error q ⊖ q_ref → z1 [rad] as `robot.configuration_difference` has it, wrapped where `continuous` is 1."""
+def difference(q: Vec, q_ref: Vec, wraps: Vec, z1: Vec) -> None:
+    """The error q ⊖ q_ref → z1 [rad] as `robot.configuration_difference` has it, wrapped where `wraps` is 1."""
     for i in range(len(q)):
         z1[i] = q[i] - q_ref[i]
-        if continuous[i] > 0.0:
+        if wraps[i] > 0.0:
             z1[i] -= _TURN * np.ceil((z1[i] - math.pi) / _TURN)
 
 
-@kernel
-def friction(n: int, weights: np.ndarray, v: np.ndarray, torque: np.ndarray) -> None:
-    """Add viscous·v + coulomb·tanh(v/transition) [N·m] to torque, with the constants of a law's weights."""
-    viscous, coulomb, transition = weights[3 * n : 4 * n], weights[4 * n : 5 * n], weights[5 * n]
-    for i in range(n):
+@inlined
+def errors(state: State, target: Target, law: Packed, z1: Vec, dz1: Vec) -> Tracking:
+    """z1 = q ⊖ q_ref and ż1 = v − v_ref, with what else a law reads of the two."""
+    difference(state.q, target.q, vector(law, at.WRAPS), z1)
+    for i in range(len(dz1)):
+        dz1[i] = state.v[i] - target.v[i]
+    return Tracking(z1, dz1, state.v, target.v, target.a)
+
+
+@inlined
+def friction(law: Packed, v: Vec, torque: Vec) -> None:
+    """Add viscous·v + coulomb·tanh(v/transition) [N·m] to torque."""
+    viscous, coulomb, transition = vector(law, at.VISCOUS), vector(law, at.COULOMB), numbers(law)[at.TRANSITION]
+    for i in range(len(v)):
         torque[i] += viscous[i] * v[i] + coulomb[i] * math.tanh(v[i] / transition)
 
 
-@kernel
-def backstepping(
-    v: np.ndarray,
-    v_ref: np.ndarray,
-    a_ref: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    v_r: np.ndarray,
-    a_r: np.ndarray,
-    feedback: np.ndarray,
-) -> None:
-    """v_r = φ, a_r = φ̇ − ωz2, feedback = −∇Φ(z1) − D(z2)z2, with z1 in work[:n] (docs/theory.md §2)."""
-    n, rate, omega = layout[1], weights[layout[1] : 2 * layout[1]], weights[5 * layout[1] + 1]
-    z1, dz1, z2, force = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n]
-    gradient, product, room = work[4 * n : 5 * n], work[5 * n : 6 * n], work[6 * n :]
+@inlined
+def backstepping(now: Tracking, law: Packed, work: Vec, out: Signals) -> None:
+    """v_r = φ, a_r = φ̇ − ωz2, feedback = −∇Φ(z1) − D(z2)z2 (docs/theory.md §2)."""
+    n, rate, omega = len(now.v), vector(law, at.FIRST), numbers(law)[at.OMEGA]
+    gradient, product, z2, force, work = take4(work, n)
+    potential(Dual(now.z1, now.dz1), potential_in(law), work, Dual(gradient, product))
     for i in range(n):
-        dz1[i] = v[i] - v_ref[i]
-    potential(z1, dz1, layout[layout[3] :], weights[layout[4] :], room, gradient, product)
+        out.v_r[i] = now.v_ref[i] - rate[i] * gradient[i]
+        z2[i] = now.v[i] - out.v_r[i]
+        out.a_r[i] = now.a_ref[i] - rate[i] * product[i] - omega * z2[i]
+    damping_force(z2, damping_in(law), work, force)
     for i in range(n):
-        v_r[i] = v_ref[i] - rate[i] * gradient[i]
-        z2[i] = v[i] - v_r[i]
-        a_r[i] = a_ref[i] - rate[i] * product[i] - omega * z2[i]
-    damping_force(z2, layout[layout[5] :], weights[layout[6] :], room, force)
-    for i in range(n):
-        feedback[i] = -gradient[i] - force[i]
+        out.feedback[i] = -gradient[i] - force[i]
 
 
-@kernel
-def linear_law(
-    v: np.ndarray,
-    v_ref: np.ndarray,
-    a_ref: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    v_r: np.ndarray,
-    a_r: np.ndarray,
-    feedback: np.ndarray,
-) -> None:
-    """Slotine–Li, computed torque and PD: the same signals without networks, with z1 in work[:n]."""
-    law, n = layout[0], layout[1]
-    z1, first, second = work[:n], weights[n : 2 * n], weights[2 * n : 3 * n]
-    for i in range(n):
-        dz1 = v[i] - v_ref[i]
-        if law == SLOTINE_LI:
-            v_r[i] = v_ref[i] - first[i] * z1[i]
-            a_r[i] = a_ref[i] - first[i] * dz1
-            feedback[i] = -second[i] * (v[i] - v_r[i])
-        elif law == COMPUTED_TORQUE:
-            v_r[i] = v[i]
-            a_r[i] = a_ref[i] - second[i] * dz1 - first[i] * z1[i]
-            feedback[i] = 0.0
-        else:
-            v_r[i], a_r[i] = (0.0, 0.0) if law == PD_GRAVITY else (v_ref[i], a_ref[i])
-            feedback[i] = -first[i] * z1[i] - second[i] * dz1
+@inlined
+def linear_law(now: Tracking, law: Packed, out: Signals) -> None:
+    """Slotine–Li, computed torque and PD: the same signals without networks; of any other law NaN."""
+    code, first, second = law.layout[at.LAW], vector(law, at.FIRST), vector(law, at.SECOND)
+    for i in range(len(now.v)):
+        v_r, a_r, feedback = math.nan, math.nan, math.nan
+        pd = -first[i] * now.z1[i] - second[i] * now.dz1[i]
+        if code == LawCode.SLOTINE_LI:
+            v_r, a_r = now.v_ref[i] - first[i] * now.z1[i], now.a_ref[i] - first[i] * now.dz1[i]
+            feedback = -second[i] * (now.v[i] - v_r)
+        elif code == LawCode.COMPUTED_TORQUE:
+            v_r, a_r, feedback = now.v[i], now.a_ref[i] + pd, 0.0
+        elif code == LawCode.PD_REFERENCE:
+            v_r, a_r, feedback = now.v_ref[i], now.a_ref[i], pd
+        elif code == LawCode.PD_GRAVITY:
+            v_r, a_r, feedback = 0.0, 0.0, pd
+        out.v_r[i], out.a_r[i], out.feedback[i] = v_r, a_r, feedback
 
 
-@kernel
-def law_row(
-    q: np.ndarray,
-    v: np.ndarray,
-    q_ref: np.ndarray,
-    v_ref: np.ndarray,
-    a_ref: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    v_r: np.ndarray,
-    a_r: np.ndarray,
-    feedback: np.ndarray,
-) -> bool:
-    """τ = M a_r + C v_r + G + feedback: these three for one state; False, and nothing done, unless all are (n,)."""
-    n = layout[1]
-    if not (len(q) == n and len(v) == n and len(q_ref) == n and len(v_ref) == n and len(a_ref) == n):
-        return False
-    difference(q, q_ref, weights[:n], work[:n])
-    if layout[0] == BACKSTEPPING:
-        backstepping(v, v_ref, a_ref, layout, weights, work, v_r, a_r, feedback)
+@inlined
+def signals_of(state: State, target: Target, law: Packed, work: Vec, out: Signals) -> None:
+    """v_r, a_r and feedback of one state."""
+    z1, dz1, work = take2(work, len(state.q))
+    now, code = errors(state, target, law, z1, dz1), law.layout[at.LAW]
+    if code == LawCode.BACKSTEPPING:
+        backstepping(now, law, work, out)
     else:
-        linear_law(v, v_ref, a_ref, layout, weights, work, v_r, a_r, feedback)
-    if layout[2]:
-        friction(n, weights, v_r if layout[0] == BACKSTEPPING or layout[0] == SLOTINE_LI else v_ref, feedback)
+        linear_law(now, law, out)
+    if law.layout[at.FRICTION]:
+        at_v_r = code == LawCode.BACKSTEPPING or code == LawCode.SLOTINE_LI
+        friction(law, out.v_r if at_v_r else now.v_ref, out.feedback)
+
+
+@kernel
+def torque_of(state: State, target: Target, law: Packed, tree: Packed, work: Vec, tau: Vec) -> None:
+    """M a_r + C v_r + G + feedback [N·m] of one state → tau."""
+    n = len(tau)
+    v_r, a_r, feedback, work = take3(work, n)
+    signals_of(state, target, law, work, Signals(v_r, a_r, feedback))
+    # Gravity alone does not depend on v: a v that is no number must not spoil it.
+    v = v_r if law.layout[at.LAW] == LawCode.PD_GRAVITY else state.v
+    tree_torque(Motion(state.q, v, v_r, a_r), tree, work, tau)
+    for i in range(n):
+        tau[i] += feedback[i]
+
+
+@inlined
+def fit(n: int, size: int, vectors: tuple[Vec, ...]) -> bool:
+    """Whether all are `size` long, and that a multiple of n."""
+    for x in vectors:
+        if len(x) != size:
+            return False
+    return size % n == 0
+
+
+# The entry points at control rate take single arrays: numba takes them apart sooner than tuples of them.
+
+
+@kernel
+def law_signals(
+    q: Vec, v: Vec, q_ref: Vec, v_ref: Vec, a_ref: Vec, layout: Vec, weights: Vec, work: Vec, out: Mat
+) -> bool:
+    """The signals of a law in τ = M(q) a_r + C(q, v) v_r + G(q) + feedback.
+
+    Args:
+        q: position [rad] of any number of states laid end to end, n numbers each.
+        v: velocity [rad/s].
+        q_ref: desired position [rad].
+        v_ref: desired velocity [rad/s].
+        a_ref: desired acceleration [rad/s²].
+        layout: of the law, as `layout.pack_law` packs it.
+        weights: of the law.
+        work: scratch space (`law_workspace`).
+        out: written, rows v_r [rad/s], a_r [rad/s²] and feedback [N·m], each as long as q.
+
+    Returns:
+        Whether all are as long as the rows of out, a multiple of n; nothing is done otherwise.
+    """
+    law, size = Packed(layout, weights), out.shape[1]
+    n = law.layout[at.JOINTS]
+    if not fit(n, size, (q, v, q_ref, v_ref, a_ref)):
+        return False
+    for k in range(size // n):
+        target = Target(row(q_ref, k, n), row(v_ref, k, n), row(a_ref, k, n))
+        signals = Signals(row(out[0], k, n), row(out[1], k, n), row(out[2], k, n))
+        signals_of(State(row(q, k, n), row(v, k, n)), target, law, work, signals)
     return True
 
 
 @kernel
-def law_rows(
-    q: np.ndarray,
-    v: np.ndarray,
-    q_ref: np.ndarray,
-    v_ref: np.ndarray,
-    a_ref: np.ndarray,
-    layout: np.ndarray,
-    weights: np.ndarray,
-    work: np.ndarray,
-    v_r: np.ndarray,
-    a_r: np.ndarray,
-    feedback: np.ndarray,
-) -> None:
-    """`law_row` for every row of arrays (rows, n)."""
-    for i in range(len(q)):
-        law_row(q[i], v[i], q_ref[i], v_ref[i], a_ref[i], layout, weights, work, v_r[i], a_r[i], feedback[i])
+def tree_law(
+    q: Vec, v: Vec, q_ref: Vec, v_ref: Vec, a_ref: Vec, layout: Vec, weights: Vec, work: Vec, tau: Vec
+) -> bool:
+    """The torque of a law whose model of the arm is a rigid tree.
+
+    Args:
+        q: position [rad] of any number of states laid end to end, n numbers each.
+        v: velocity [rad/s].
+        q_ref: desired position [rad].
+        v_ref: desired velocity [rad/s].
+        a_ref: desired acceleration [rad/s²].
+        layout: of law and tree, as `pack_tree_law` packs them.
+        weights: of law and tree.
+        work: scratch space (`law_workspace`).
+        tau: written [N·m].
+
+    Returns:
+        Whether all are as long as tau, a multiple of n; nothing is done otherwise.
+    """
+    law, tree, size = Packed(layout[2:], weights), Packed(layout[layout[0] :], weights[layout[1] :]), len(tau)
+    n = law.layout[at.JOINTS]
+    if not fit(n, size, (q, v, q_ref, v_ref, a_ref)):
+        return False
+    for k in range(size // n):
+        target = Target(row(q_ref, k, n), row(v_ref, k, n), row(a_ref, k, n))
+        torque_of(State(row(q, k, n), row(v, k, n)), target, law, tree, work, row(tau, k, n))
+    return True
+
+
+@exact_kernel
+def pid_terms(
+    k: int, memory: Memory, state: State, target: State, period: float, gains: PID
+) -> tuple[float, float, float, float, float, bool]:
+    """z1, blend, what the filter's input exceeds its output by, its next output, τ, whether the integral rests."""
+    i = k % len(gains.kp)
+    z1 = state.q[k] - target.q[k]
+    if gains.wraps[i] > 0.0:
+        z1 -= _TURN * np.ceil((z1 - math.pi) / _TURN)
+    blend = period / (gains.filter_time[i] + period)
+    change = state.v[k] - target.v[k] - memory.derivative[k]
+    rate = memory.derivative[k] + blend * change
+    tau = -gains.kp[i] * z1 - memory.integral[k] - gains.kd[i] * rate
+    return z1, blend, change, rate, tau, abs(tau) > gains.limit[i] and tau * z1 < 0.0
+
+
+@exact_kernel
+def pid_step(memory: Memory, state: State, target: State, period: float, gains: PID, tau: Vec, after: Memory) -> None:
+    """One step of `controllers.pid.PID` for any number of states laid end to end; the torque → tau."""
+    for k in range(len(tau)):
+        z1, _, _, rate, tau[k], rests = pid_terms(k, memory, state, target, period, gains)
+        after.integral[k] = memory.integral[k] + (0.0 if rests else gains.ki[k % len(gains.ki)] * period * z1)
+        after.derivative[k] = rate
 
 
 @exact_kernel
 def pid(
-    integral: np.ndarray,
-    derivative: np.ndarray,
-    q: np.ndarray,
-    v: np.ndarray,
-    q_ref: np.ndarray,
-    v_ref: np.ndarray,
-    period: float,
-    gains: np.ndarray,
-    out: np.ndarray,
+    integral: Vec, derivative: Vec, q: Vec, v: Vec, q_ref: Vec, v_ref: Vec, period: float, weights: Vec, out: Mat
 ) -> bool:
-    """One step of `controllers.pid.PID` for any number of states laid end to end; τ, integral, derivative → out rows.
+    """One step of `controllers.pid.PID`.
 
-    gains: rows k_p, k_i, k_d, effort limit, T_f, continuous, each (n,). False, and nothing done, unless all lengths are
-    that of the rows of out, a multiple of n.
+    Args:
+        integral: integral torque [N·m] of any number of states laid end to end, n numbers each.
+        derivative: filtered ż1 [rad/s].
+        q: position [rad].
+        v: velocity [rad/s].
+        q_ref: desired position [rad].
+        v_ref: desired velocity [rad/s].
+        period: control period [s].
+        weights: of the PID, as `layout.pack_pid` packs it, (6n,).
+        out: written, rows τ [N·m], integral [N·m], derivative [rad/s], each as long as q.
+
+    Returns:
+        Whether all are as long as the rows of out, a multiple of n; nothing is done otherwise.
     """
-    n, size = gains.shape[1], out.shape[1]
-    for x in (integral, derivative, q, v, q_ref, v_ref):
-        if len(x) != size or size % n != 0:
-            return False
-    for k in range(size):
-        i = k % n
-        z1 = q[k] - q_ref[k]
-        if gains[5, i] > 0.0:
-            z1 -= _TURN * np.ceil((z1 - math.pi) / _TURN)
-        blend = period / (gains[4, i] + period)
-        rate = derivative[k] + blend * (v[k] - v_ref[k] - derivative[k])
-        tau = -gains[0, i] * z1 - integral[k] - gains[2, i] * rate
-        winding = abs(tau) > gains[3, i] and tau * z1 < 0.0
-        out[0, k], out[1, k], out[2, k] = tau, integral[k] + (0.0 if winding else gains[1, i] * period * z1), rate
+    gains = pid_of(weights)
+    if not fit(len(gains.kp), out.shape[1], (integral, derivative, q, v, q_ref, v_ref)):
+        return False
+    after = Memory(out[1], out[2])
+    pid_step(Memory(integral, derivative), State(q, v), State(q_ref, v_ref), period, gains, out[0], after)
     return True

@@ -1,169 +1,161 @@
 """One body of a rigid tree: what it gets from its parent, what it makes of it, and what it hands back.
 
+All vectors of a body are in its own frame, whose z axis is the axis of its joint; R and p place that frame in the
+parent's: y in the body's frame is R y in the parent's, and the origin of the body's frame lies at p there.
+
 A body accelerates with a(x) = a + Bx, where B = [α]× + ½(ωωʹᵀ + ωʹωᵀ) − (ω·ωʹ)1 is [α]× + [ω]×[ω]× polarised for two
-velocities. A body of mass m, h = Σ m x and E = Σ m xxᵀ resists with the force F = m a + Bh and the moment
-N = h × a + Σ m x × Bx about its origin; the latter sum is the axial vector of BE − (BE)ᵀ.
+velocities, ω of the joint velocities v and ω' of w. A body of mass m, h = Σ m x and E = Σ m xxᵀ resists with the force
+F = m a + Bh and the moment N = h × a + Σ m x × Bx about its origin; the latter sum is the axial vector of BE − (BE)ᵀ.
 
 With the velocities u and o of the bodies at the joint velocity μ, μᵀτ is the power Σ u·F + o·N, whose derivatives are
 gathered inwards. Those with respect to u and o are F and N, summed over the body and all behind it.
 
-Each body has a row of numbers: R of its joint (parent from body), then what is named here.
+Each body has a row of numbers, matrices row by row:
+
+    R, P               R (9) and p (3) of its joint
+    V, W, ALPHA        ω and ω', angular velocities at v and w, and α, angular acceleration
+    A, B               a, acceleration of the origin, and B (9)
+    F, N               force and moment, of the body alone after `load`, of it and all behind it after `hand_force`
+    U, SPIN            u and o, velocity of the origin and angular velocity at μ
+    V_BAR … B_BAR      derivatives of the power with respect to ω, ω', α, a, B
+    COMPOSITE          m, h, E of it and all behind it, while M(q) is made
+
+The row of the base has ω = ω' = α = 0 and a = −gravity.
 """
 
-import numpy as np
+import math
+from collections import namedtuple
 
-from nbs_pin.kernels.jit import kernel
-from nbs_pin.kernels.tree_layout import FIRST, MASS, SECOND
+from nbs_pin.kernels.jit import inlined
+from nbs_pin.kernels.layout import JointCode, Packed
+from nbs_pin.kernels.records import Vec
+from nbs_pin.kernels.spatial import Three, add, cross, dot, get, plus, put, scaled, times, transposed_times
+from nbs_pin.kernels.tree_layout import BASE, BODY, FIRST, MASS, PER_JOINT, ROW, SECOND, TREE_JOINTS
 
-P, V, W, ALPHA, A, B, F, N = 9, 12, 15, 18, 21, 24, 33, 36
-"""Where p, ω, ω', α, a, B, F, N lie in a row."""
+R, P, V, W, ALPHA, A, B, F, N = 0, 9, 12, 15, 18, 21, 24, 33, 36
 U, SPIN = 39, 42
-"""Where u and o lie in a row."""
 V_BAR, W_BAR, ALPHA_BAR, A_BAR, B_BAR = 45, 48, 51, 54, 57
-"""Where ω̄, ω̄', ᾱ, ā, B̄ lie in a row: the derivatives of the power with respect to ω, ω', α, a, B."""
 COMPOSITE = 12
-"""Where m, h, E of the body and all behind it lie in a row, while M(q) is made."""
+"""Where things lie in a row, as above."""
+
+Joint = namedtuple("Joint", "slide body row up")
+"""A joint and the body behind it: 1 for a prismatic joint, 0 for a revolute one; its weights (`tree_layout.py`), its
+row of numbers, and its parent's."""
 
 
-@kernel
-def to_parent(r: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """R y: from a body to its parent."""
-    return r[0] * x + r[1] * y + r[2] * z, r[3] * x + r[4] * y + r[5] * z, r[6] * x + r[7] * y + r[8] * z
+@inlined
+def joint_of(i: int, tree: Packed, work: Vec) -> Joint:
+    """Joint i; `slide` of a joint that is neither prismatic nor revolute is NaN, and so is all that follows from it."""
+    at, start, slide = TREE_JOINTS + PER_JOINT * i, BASE + BODY * i, math.nan
+    parent, code = tree.layout[at], tree.layout[at + 1]
+    if code == JointCode.REVOLUTE:
+        slide = 0.0
+    elif code == JointCode.PRISMATIC:
+        slide = 1.0
+    row, up = work[ROW * (i + 1) : ROW * (i + 2)], work[ROW * parent : ROW * (parent + 1)]
+    return Joint(slide, tree.weights[start : start + BODY], row, up)
 
 
-@kernel
-def from_parent(r: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Rᵀ y: from the parent to the body."""
-    return r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z
+@inlined
+def along(slide: float, force: float, moment: float) -> float:
+    """What acts along a prismatic joint or about a revolute one."""
+    if slide == 1.0:
+        return force
+    return moment if slide == 0.0 else math.nan
 
 
-@kernel
-def move(slide: float, v: float, w: float, a: float, up: np.ndarray, row: np.ndarray) -> None:
-    """ω, ω', α, a and B of a body from those of its parent."""
-    turn = 1.0 - slide
-    vx, vy, vz = from_parent(row, up[V], up[V + 1], up[V + 2])
-    wx, wy, wz = from_parent(row, up[W], up[W + 1], up[W + 2])
-    x, y, z = from_parent(row, up[ALPHA], up[ALPHA + 1], up[ALPHA + 2])
-    px, py, pz = row[P], row[P + 1], row[P + 2]
-    ax, ay, az = from_parent(
-        row,
-        up[A] + up[B] * px + up[B + 1] * py + up[B + 2] * pz,
-        up[A + 1] + up[B + 3] * px + up[B + 4] * py + up[B + 5] * pz,
-        up[A + 2] + up[B + 6] * px + up[B + 7] * py + up[B + 8] * pz,
-    )
-    kx, ky = vy * w + wy * v, vx * w + wx * v  # (ω × z) w + (ω' × z) v is (kx, −ky, 0)
+@inlined
+def move(joint: Joint, v: float, w: float, a: float) -> None:
+    """ω, ω', α, a and B of a body from those of its parent, which R and p bring into its frame first: ω₀ = Rᵀω, ….
+
+    revolute    ω = ω₀ + v z, ω' = ω'₀ + w z, α = α₀ + a z + ½k, a = Rᵀ(a + Bp), with k = (ω₀ × z) w + (ω'₀ × z) v
+    prismatic   ω = ω₀, ω' = ω'₀, α = α₀, a = Rᵀ(a + Bp) + a z + k
+    """
+    row, up, slide, turn = joint.row, joint.up, joint.slide, 1.0 - joint.slide
+    vx, vy, vz = transposed_times(row, R, get(up, V))
+    wx, wy, wz = transposed_times(row, R, get(up, W))
+    x, y, z = transposed_times(row, R, get(up, ALPHA))
+    ax, ay, az = transposed_times(row, R, plus(get(up, A), times(up, B, get(row, P))))
+    kx, ky = vy * w + wy * v, -(vx * w + wx * v)
     vz, wz = vz + turn * v, wz + turn * w
-    x, y, z = x + 0.5 * turn * kx, y - 0.5 * turn * ky, z + turn * a
-    row[A], row[A + 1], row[A + 2] = ax + slide * kx, ay - slide * ky, az + slide * a
-    row[V], row[V + 1], row[V + 2] = vx, vy, vz
-    row[W], row[W + 1], row[W + 2] = wx, wy, wz
-    row[ALPHA], row[ALPHA + 1], row[ALPHA + 2] = x, y, z
+    x, y, z = x + 0.5 * turn * kx, y + 0.5 * turn * ky, z + turn * a
+    put(row, A, (ax + slide * kx, ay + slide * ky, az + slide * a))
+    put(row, V, (vx, vy, vz))
+    put(row, W, (wx, wy, wz))
+    put(row, ALPHA, (x, y, z))
     xx, yy, zz = vx * wx, vy * wy, vz * wz
     xy, xz, yz = 0.5 * (vx * wy + vy * wx), 0.5 * (vx * wz + vz * wx), 0.5 * (vy * wz + vz * wy)
-    row[B], row[B + 1], row[B + 2] = -yy - zz, xy - z, xz + y
-    row[B + 3], row[B + 4], row[B + 5] = xy + z, -xx - zz, yz - x
-    row[B + 6], row[B + 7], row[B + 8] = xz - y, yz + x, -xx - yy
+    put(row, B, (-yy - zz, xy - z, xz + y))
+    put(row, B + 3, (xy + z, -xx - zz, yz - x))
+    put(row, B + 6, (xz - y, yz + x, -xx - yy))
 
 
-@kernel
-def load(body: np.ndarray, row: np.ndarray) -> None:
-    """F = m a + Bh and N = h × a + Σ m x × Bx of a body."""
-    m, hx, hy, hz = body[MASS], body[FIRST], body[FIRST + 1], body[FIRST + 2]
-    exx, exy, exz = body[SECOND], body[SECOND + 1], body[SECOND + 2]
-    eyy, eyz, ezz = body[SECOND + 3], body[SECOND + 4], body[SECOND + 5]
-    ax, ay, az = row[A], row[A + 1], row[A + 2]
-    bxx, bxy, bxz = row[B], row[B + 1], row[B + 2]
-    byx, byy, byz = row[B + 3], row[B + 4], row[B + 5]
-    bzx, bzy, bzz = row[B + 6], row[B + 7], row[B + 8]
-    row[F] = m * ax + bxx * hx + bxy * hy + bxz * hz
-    row[F + 1] = m * ay + byx * hx + byy * hy + byz * hz
-    row[F + 2] = m * az + bzx * hx + bzy * hy + bzz * hz
-    row[N] = hy * az - hz * ay + bzx * exy + bzy * eyy + bzz * eyz - byx * exz - byy * eyz - byz * ezz
-    row[N + 1] = hz * ax - hx * az + bxx * exz + bxy * eyz + bxz * ezz - bzx * exx - bzy * exy - bzz * exz
-    row[N + 2] = hx * ay - hy * ax + byx * exx + byy * exy + byz * exz - bxx * exy - bxy * eyy - bxz * eyz
+@inlined
+def second_moments(body: Vec) -> tuple[Three, Three, Three]:
+    """The rows of E."""
+    (xx, xy, xz), (yy, yz, zz) = get(body, SECOND), get(body, SECOND + 3)
+    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 
 
-@kernel
-def hand_force(row: np.ndarray, up: np.ndarray) -> None:
-    """Add F and N of a body to those of its parent."""
-    fx, fy, fz = to_parent(row, row[F], row[F + 1], row[F + 2])
-    x, y, z = to_parent(row, row[N], row[N + 1], row[N + 2])
-    px, py, pz = row[P], row[P + 1], row[P + 2]
-    up[F] += fx
-    up[F + 1] += fy
-    up[F + 2] += fz
-    up[N] += x + py * fz - pz * fy
-    up[N + 1] += y + pz * fx - px * fz
-    up[N + 2] += z + px * fy - py * fx
+@inlined
+def load(joint: Joint) -> None:
+    """F = m a + Bh and N = h × a + Σ m x × Bx of a body alone."""
+    body, row = joint.body, joint.row
+    h, a, (ex, ey, ez) = get(body, FIRST), get(row, A), second_moments(body)
+    bx, by, bz = get(row, B), get(row, B + 3), get(row, B + 6)
+    put(row, F, plus(scaled(body[MASS], a), times(row, B, h)))
+    axial = dot(bz, ey) - dot(by, ez), dot(bx, ez) - dot(bz, ex), dot(by, ex) - dot(bx, ey)
+    put(row, N, plus(cross(h, a), axial))
 
 
-@kernel
-def couple(body: np.ndarray, row: np.ndarray) -> None:
+@inlined
+def hand_force(joint: Joint) -> None:
+    """Add F and N of a body to those of its parent: R F and R N + p × R F."""
+    row, force = joint.row, times(joint.row, R, get(joint.row, F))
+    add(joint.up, F, force)
+    add(joint.up, N, plus(times(row, R, get(row, N)), cross(get(row, P), force)))
+
+
+@inlined
+def couple(joint: Joint) -> None:
     """ω̄, ω̄', ᾱ, ā and B̄ of a body, from u and o and what its children handed over.
 
-    B̄ = u hᵀ + [o]×E, and B̄ reaches α by its axial vector, ω and ω' by its symmetric part less its trace.
+    The power of F and N is linear in a and B: ā = m u + o × h and B̄ = u hᵀ + [o]×E, to which the children's ā has
+    added ā pᵀ. Through B = [α]× + ½(ωωʹᵀ + ωʹωᵀ) − (ω·ωʹ)1, B̄ reaches α by the axial vector of B̄ − B̄ᵀ, and ω and ω'
+    by ω̄ = Kω' and ω̄' = Kω with K = ½(B̄ + B̄ᵀ) − tr(B̄)1.
     """
-    m, hx, hy, hz = body[MASS], body[FIRST], body[FIRST + 1], body[FIRST + 2]
-    exx, exy, exz = body[SECOND], body[SECOND + 1], body[SECOND + 2]
-    eyy, eyz, ezz = body[SECOND + 3], body[SECOND + 4], body[SECOND + 5]
-    ux, uy, uz = row[U], row[U + 1], row[U + 2]
-    x, y, z = row[SPIN], row[SPIN + 1], row[SPIN + 2]
-    row[A_BAR] += m * ux + y * hz - z * hy
-    row[A_BAR + 1] += m * uy + z * hx - x * hz
-    row[A_BAR + 2] += m * uz + x * hy - y * hx
-    bxx = row[B_BAR] + ux * hx + y * exz - z * exy
-    bxy = row[B_BAR + 1] + ux * hy + y * eyz - z * eyy
-    bxz = row[B_BAR + 2] + ux * hz + y * ezz - z * eyz
-    byx = row[B_BAR + 3] + uy * hx + z * exx - x * exz
-    byy = row[B_BAR + 4] + uy * hy + z * exy - x * eyz
-    byz = row[B_BAR + 5] + uy * hz + z * exz - x * ezz
-    bzx = row[B_BAR + 6] + uz * hx + x * exy - y * exx
-    bzy = row[B_BAR + 7] + uz * hy + x * eyy - y * exy
-    bzz = row[B_BAR + 8] + uz * hz + x * eyz - y * exz
-    row[ALPHA_BAR] += bzy - byz
-    row[ALPHA_BAR + 1] += bxz - bzx
-    row[ALPHA_BAR + 2] += byx - bxy
-    kxx, kyy, kzz = -byy - bzz, -bxx - bzz, -bxx - byy
-    kxy, kxz, kyz = 0.5 * (bxy + byx), 0.5 * (bxz + bzx), 0.5 * (byz + bzy)
-    x, y, z = row[W], row[W + 1], row[W + 2]
-    row[V_BAR] += kxx * x + kxy * y + kxz * z
-    row[V_BAR + 1] += kxy * x + kyy * y + kyz * z
-    row[V_BAR + 2] += kxz * x + kyz * y + kzz * z
-    x, y, z = row[V], row[V + 1], row[V + 2]
-    row[W_BAR] += kxx * x + kxy * y + kxz * z
-    row[W_BAR + 1] += kxy * x + kyy * y + kyz * z
-    row[W_BAR + 2] += kxz * x + kyz * y + kzz * z
+    body, row = joint.body, joint.row
+    h, u, o, (ex, ey, ez) = get(body, FIRST), get(row, U), get(row, SPIN), second_moments(body)
+    add(row, A_BAR, plus(scaled(body[MASS], u), cross(o, h)))
+    add(row, B_BAR, plus(scaled(u[0], h), plus(scaled(o[1], ez), scaled(-o[2], ey))))
+    add(row, B_BAR + 3, plus(scaled(u[1], h), plus(scaled(o[2], ex), scaled(-o[0], ez))))
+    add(row, B_BAR + 6, plus(scaled(u[2], h), plus(scaled(o[0], ey), scaled(-o[1], ex))))
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = get(row, B_BAR), get(row, B_BAR + 3), get(row, B_BAR + 6)
+    add(row, ALPHA_BAR, (zy - yz, xz - zx, yx - xy))
+    kxy, kxz, kyz = 0.5 * (xy + yx), 0.5 * (xz + zx), 0.5 * (yz + zy)
+    kx, ky, kz = (-yy - zz, kxy, kxz), (kxy, -xx - zz, kyz), (kxz, kyz, -xx - yy)
+    v, w = get(row, V), get(row, W)
+    add(row, V_BAR, (dot(kx, w), dot(ky, w), dot(kz, w)))
+    add(row, W_BAR, (dot(kx, v), dot(ky, v), dot(kz, v)))
 
 
-@kernel
-def hand_bars(row: np.ndarray, up: np.ndarray) -> tuple[float, float, float]:
-    """Add ω̄, ω̄', ᾱ, ā and what ā makes of B̄ to those of the parent; R ā."""
+@inlined
+def hand_bars(joint: Joint) -> Three:
+    """Add ω̄, ω̄', ᾱ, ā and what ā makes of B̄, ā pᵀ, to those of the parent; R ā."""
+    row, up = joint.row, joint.up
     for at in (V_BAR, W_BAR, ALPHA_BAR):
-        x, y, z = to_parent(row, row[at], row[at + 1], row[at + 2])
-        up[at] += x
-        up[at + 1] += y
-        up[at + 2] += z
-    x, y, z = to_parent(row, row[A_BAR], row[A_BAR + 1], row[A_BAR + 2])
-    px, py, pz = row[P], row[P + 1], row[P + 2]
-    up[A_BAR] += x
-    up[A_BAR + 1] += y
-    up[A_BAR + 2] += z
-    up[B_BAR] += x * px
-    up[B_BAR + 1] += x * py
-    up[B_BAR + 2] += x * pz
-    up[B_BAR + 3] += y * px
-    up[B_BAR + 4] += y * py
-    up[B_BAR + 5] += y * pz
-    up[B_BAR + 6] += z * px
-    up[B_BAR + 7] += z * py
-    up[B_BAR + 8] += z * pz
-    return x, y, z
+        add(up, at, times(row, R, get(row, at)))
+    a_bar, p = times(row, R, get(row, A_BAR)), get(row, P)
+    add(up, A_BAR, a_bar)
+    for k in range(3):
+        add(up, B_BAR + 3 * k, scaled(a_bar[k], p))
+    return a_bar
 
 
-@kernel
-def joint_bars(slide: float, v: float, w: float, row: np.ndarray) -> tuple[float, float, float]:
+@inlined
+def joint_bars(joint: Joint, v: float, w: float) -> Three:
     """Derivatives with respect to v, w and a of one joint; adds to ω̄ and ω̄' what α and a take of them there."""
-    turn = 1.0 - slide
+    row, slide, turn = joint.row, joint.slide, 1.0 - joint.slide
     x = 0.5 * turn * row[ALPHA_BAR] + slide * row[A_BAR]
     y = 0.5 * turn * row[ALPHA_BAR + 1] + slide * row[A_BAR + 1]
     row[V_BAR] -= y * w
@@ -175,46 +167,48 @@ def joint_bars(slide: float, v: float, w: float, row: np.ndarray) -> tuple[float
     return v_bar, w_bar, turn * row[ALPHA_BAR + 2] + slide * row[A_BAR + 2]
 
 
-@kernel
-def turn_bar(v: float, w: float, row: np.ndarray) -> float:
-    """Derivative with respect to the angle of a joint: −z · Σ y × ȳ over all y = Rᵀ(…) of its body."""
-    total = row[V] * row[V_BAR + 1] - row[V + 1] * row[V_BAR]
-    total += row[W] * row[W_BAR + 1] - row[W + 1] * row[W_BAR]
-    total += row[A] * row[A_BAR + 1] - row[A + 1] * row[A_BAR]
-    total += row[U] * row[F + 1] - row[U + 1] * row[F]
-    total += row[SPIN] * row[N + 1] - row[SPIN + 1] * row[N]
-    x = row[ALPHA] - 0.5 * (row[V + 1] * w + row[W + 1] * v)
-    y = row[ALPHA + 1] + 0.5 * (row[V] * w + row[W] * v)
-    return y * row[ALPHA_BAR] - x * row[ALPHA_BAR + 1] - total
+@inlined
+def turn_bar(joint: Joint, v: float, w: float, a: float, mu: float) -> Three:
+    """Derivative with respect to a turn δ of the joint's frame, R → R exp[δ]×, of which z is the joint's angle.
+
+    It turns all y₀ = Rᵀ(…) that the body has from its parent: Σ ȳ × y₀ over ω, ω', α, a, u (ū = F) and o (ō = N), y₀
+    being y less what the joint's own motion adds (`move`, `trees.spread`).
+    """
+    row, slide, turn = joint.row, joint.slide, 1.0 - joint.slide
+    (vx, vy, vz), (wx, wy, wz) = get(row, V), get(row, W)
+    kx, ky = vy * w + wy * v, -(vx * w + wx * v)
+    total = plus(cross(get(row, V_BAR), (vx, vy, vz - turn * v)), cross(get(row, W_BAR), (wx, wy, wz - turn * w)))
+    x, y, z = get(row, ALPHA)
+    total = plus(total, cross(get(row, ALPHA_BAR), (x - 0.5 * turn * kx, y - 0.5 * turn * ky, z - turn * a)))
+    x, y, z = get(row, A)
+    total = plus(total, cross(get(row, A_BAR), (x - slide * kx, y - slide * ky, z - slide * a)))
+    x, y, z = get(row, U)
+    total = plus(total, cross(get(row, F), (x, y, z - slide * mu)))
+    x, y, z = get(row, SPIN)
+    return plus(total, cross(get(row, N), (x, y, z - turn * mu)))
 
 
-@kernel
-def slide_bar(x: float, y: float, z: float, row: np.ndarray, up: np.ndarray) -> float:
-    """Derivative with respect to the travel of a joint along R z, with R ā in x, y, z: R ā · B R z + F · (o × z)."""
-    dx, dy, dz = row[2], row[5], row[8]
-    total = row[F] * row[SPIN + 1] - row[F + 1] * row[SPIN]
-    total += x * (up[B] * dx + up[B + 1] * dy + up[B + 2] * dz)
-    total += y * (up[B + 3] * dx + up[B + 4] * dy + up[B + 5] * dz)
-    return total + z * (up[B + 6] * dx + up[B + 7] * dy + up[B + 8] * dz)
+@inlined
+def shift_bar(joint: Joint, a_bar: Three) -> Three:
+    """Derivative with respect to p, with R ā in a_bar: Bᵀ R ā + R F × o, B and o of the parent."""
+    force = times(joint.row, R, get(joint.row, F))
+    return plus(transposed_times(joint.up, B, a_bar), cross(force, get(joint.up, SPIN)))
 
 
-@kernel
-def join(row: np.ndarray, up: np.ndarray) -> None:
+@inlined
+def join(joint: Joint) -> None:
     """Add m, h and E of a body and all behind it to its parent's: E → RERᵀ + (Rh)pᵀ + p(Rh)ᵀ + m ppᵀ."""
-    m, at = row[COMPOSITE], COMPOSITE + 4
-    hx, hy, hz = to_parent(row, row[COMPOSITE + 1], row[COMPOSITE + 2], row[COMPOSITE + 3])
-    sx, sy, sz = to_parent(row, row[at], row[at + 1], row[at + 2])
-    tx, ty, tz = to_parent(row, row[at + 1], row[at + 3], row[at + 4])
-    ux, uy, uz = to_parent(row, row[at + 2], row[at + 4], row[at + 5])
-    px, py, pz = row[P], row[P + 1], row[P + 2]
-    gx, gy, gz = hx + m * px, hy + m * py, hz + m * pz
+    row, up, at, p = joint.row, joint.up, COMPOSITE + 4, get(joint.row, P)
+    m, h = row[COMPOSITE], times(row, R, get(row, COMPOSITE + 1))
+    moved = plus(h, scaled(m, p))
     up[COMPOSITE] += m
-    up[COMPOSITE + 1] += gx
-    up[COMPOSITE + 2] += gy
-    up[COMPOSITE + 3] += gz
-    up[at] += sx * row[0] + tx * row[1] + ux * row[2] + (hx + gx) * px
-    up[at + 1] += sx * row[3] + tx * row[4] + ux * row[5] + gx * py + px * hy
-    up[at + 2] += sx * row[6] + tx * row[7] + ux * row[8] + gx * pz + px * hz
-    up[at + 3] += sy * row[3] + ty * row[4] + uy * row[5] + (hy + gy) * py
-    up[at + 4] += sy * row[6] + ty * row[7] + uy * row[8] + gy * pz + py * hz
-    up[at + 5] += sz * row[6] + tz * row[7] + uz * row[8] + (hz + gz) * pz
+    add(up, COMPOSITE + 1, moved)
+    (xx, xy, xz), (yy, yz, zz) = get(row, at), get(row, at + 3)
+    ex, ey, ez = times(row, R, (xx, xy, xz)), times(row, R, (xy, yy, yz)), times(row, R, (xz, yz, zz))
+    k = at
+    for i in range(3):
+        for j in range(i, 3):  # (R E Rᵀ)_ij from the rows of E Rᵀ
+            up[k] += (
+                ex[i] * row[3 * j] + ey[i] * row[3 * j + 1] + ez[i] * row[3 * j + 2] + moved[i] * p[j] + p[i] * h[j]
+            )
+            k += 1

@@ -3,7 +3,7 @@
 A joint is R₀Rz(q) and p when it turns, R₀ and p + q R₀z when it slides. A body is m, h = Σ m x and E = Σ m xxᵀ about
 its frame's origin.
 
-    tree layout     n, then per joint: parent (0 is the base, i + 1 the body of joint i), 1 for a prismatic joint
+    tree layout     n, then per joint: parent (0 is the base, i + 1 the body of joint i), its `JointCode`
     tree weights    −gravity (3), then per joint: R₀ (9), p (3), m, h (3), E (xx, xy, xz, yy, yz, zz), armature
 """
 
@@ -13,12 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.layout import JointCode, Packed
 
+TREE_SIZE, TREE_JOINTS, PER_JOINT = 0, 1, 2
+"""Where n lies in the layout and where the joints begin, and numbers in the layout for each of them."""
 BODY, ROW, BASE = 23, 67, 3
 """Numbers per joint in the weights and in the scratch space, and before the first joint in the weights."""
-MASS, FIRST, SECOND, ARMATURE = 12, 13, 16, 22
-"""Where m, h, E and the armature of a joint's body lie, after R₀ (at 0) and p (at 9)."""
+PLACE, MASS, FIRST, SECOND, ARMATURE = 9, 12, 13, 16, 22
+"""Where p, m, h, E and the armature of a joint's body lie, after R₀ (at 0)."""
 
 
 class Link(NamedTuple):
@@ -44,9 +46,14 @@ class Link(NamedTuple):
 
 
 def pack_tree(links: Sequence[Link], gravity: np.ndarray) -> Packed:
-    """The tree for the kernels below; gravity: acceleration (3,) in the base frame [m/s²].
+    """The tree for the kernels of `trees.py`.
 
-    Raises ArgumentError when a parent does not come before its child.
+    Args:
+        links: joints and bodies, parents first.
+        gravity: its acceleration in the base frame, (3,) [m/s²].
+
+    Raises:
+        ArgumentError: when a parent does not come before its child.
     """
     layout, weights, frames = [len(links)], [-np.asarray(gravity)], [np.eye(3)]
     for i, link in enumerate(links):
@@ -58,14 +65,14 @@ def pack_tree(links: Sequence[Link], gravity: np.ndarray) -> Packed:
         centre, inertia = frame.T @ link.centre, frame.T @ link.inertia @ frame
         second = 0.5 * np.trace(inertia) * np.eye(3) - inertia + link.mass * np.outer(centre, centre)
         moments = [[link.mass], link.mass * centre, second[np.triu_indices(3)], [link.armature]]
-        layout += [link.parent, int(link.prismatic)]
+        layout += [link.parent, JointCode.PRISMATIC if link.prismatic else JointCode.REVOLUTE]
         weights += [rotation.ravel(), position, *moments]
     return Packed(np.array(layout, dtype=np.int64), np.concatenate(weights).astype(float))
 
 
 def tree_workspace(part: Packed) -> int:
     """How many numbers of scratch space each kernel of a tree needs."""
-    n = int(part.layout[0])
+    n = int(part.layout[TREE_SIZE])
     return (n + 1) * ROW + 2 * n
 
 

@@ -1,7 +1,7 @@
 """Desired motions: callables ref(t) -> Reference(q, v, a) whose v and a are the exact derivatives of q.
 
 t is a time [s], giving shapes (n,), or an array of times, giving shapes (..., n). Any callable like that will do for
-`simulate`; motions from files are in `reference_files.py`.
+`simulate`; motions from files are in `motions/reference_files.py`.
 """
 
 from collections.abc import Callable

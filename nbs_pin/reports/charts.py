@@ -88,7 +88,7 @@ def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
 def plot_comparison(rows: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
     """Draws the convergence times of the fair comparison and writes the picture (PNG); returns its path.
 
-    rows: those of `studies.fair.Row` as dictionaries. A panel per arm and period, all with one time axis; per law, a
+    rows: those of `benchmarks.fair.Row` as dictionaries. A panel per arm and period, all with one time axis; per law, a
     dot at the median of its starts for each reference and a line to the worst one. What does not converge ends in an
     arrow at the right edge.
     """

@@ -76,7 +76,7 @@ class AuthorsLaw(MemorylessController):
         return inertial + self.dynamics.gravity(q) - gradient - self._damping(z2)
 
     def _potential(self, z: torch.Tensor, dz: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """∇Φ(z) and ∇²Φ(z)dz: tangents of a forward and a reverse pass, as in `networks/convex.py`."""
+        """∇Φ(z) and ∇²Φ(z)dz: tangents of a forward and a reverse pass, as in `controllers/convex.py`."""
         w, tape = self.weights, []
         y = dy = torch.zeros(())
         for i in range(4):

@@ -15,8 +15,8 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.model_law import ModelLaw
-from nbs_pin.kernels.layout import Packed
-from nbs_pin.kernels.rollouts import INTEGRATOR_CODES, Scene, rollout, rollout_adjoint, rollout_workspace
+from nbs_pin.kernels.layout import IntegratorCode, Packed, known
+from nbs_pin.kernels.rollouts import Course, Rollout, Scene, rollout, rollout_adjoint, rollout_workspace
 from nbs_pin.kernels.threads import over_cores
 from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.robots.robot import configuration_difference
@@ -179,13 +179,18 @@ def _scene(controller: Controller, loop: Loop) -> Scene | None:
     if truth is None or belief is None:
         return None
     n, friction = plant.nv, plant.friction
+    viscous, coulomb = np.zeros((2, n)) if friction is None else np.array([friction.viscous, friction.coulomb])
     return Scene(
-        clock=np.array([loop.period, loop.step, 1.0 if friction is None else friction.transition]),
-        counts=np.array([INTEGRATOR_CODES[plant.integrator], loop.substeps]),
+        period=float(loop.period),
+        step=float(loop.step),
+        substeps=int(loop.substeps),
+        integrator=int(known(plant.integrator, IntegratorCode, "integrator")),
         limit=loop.limit,
-        friction=np.zeros((2, n)) if friction is None else np.array([friction.viscous, friction.coulomb]),
-        belief=tuple(belief),
-        truth=tuple(truth),
+        viscous=viscous,
+        coulomb=coulomb,
+        transition=1.0 if friction is None else float(friction.transition),
+        belief=belief,
+        truth=truth,
     )
 
 
@@ -207,7 +212,8 @@ class _ByKernels(torch.autograd.Function):
         def run(part: slice) -> None:
             work = np.zeros(size)
             for k in range(count)[part]:
-                rollout(batch.aims[k], batch.leads, tau_d[k], scene, *law, work, q[k], v[k], command[k], memory[k])
+                motion = Rollout(q[k], v[k], command[k], memory[k])
+                rollout(Course(batch.aims[k], batch.leads, tau_d[k]), scene, law, work, motion)
 
         over_cores(run, count, fewest=1)
         ctx.saved = law, batch, tau_d, scene, q, v, command, memory
@@ -218,17 +224,18 @@ class _ByKernels(torch.autograd.Function):
     def backward(ctx: Any, *cotangents: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         law, batch, tau_d, scene, q, v, command, memory = ctx.saved
         q_bar, v_bar, command_bar = (np.array(x.numpy(), order="C") for x in cotangents)
-        tau_d_bar, total = np.empty(command.shape), np.zeros(len(law.weights))
+        tau_d_bar, memory_bar, total = np.empty(command.shape), np.zeros(memory.shape), np.zeros(len(law.weights))
         weights_bar = np.empty((min(len(batch), _TOGETHER), len(law.weights)))
         size = rollout_workspace(law, scene)
 
         def run(part: slice) -> None:
             work = np.zeros(size)
             for k in range(first, len(batch))[part]:
-                rollout_adjoint(
-                    batch.aims[k], batch.leads, tau_d[k], scene, *law, q[k], v[k], command[k], memory[k], work,
-                    q_bar[k], v_bar[k], command_bar[k], tau_d_bar[k], weights_bar[k - first],
-                )  # fmt: skip
+                course = Course(batch.aims[k], batch.leads, tau_d[k])
+                motion = Rollout(q[k], v[k], command[k], memory[k])
+                bars = Rollout(q_bar[k], v_bar[k], command_bar[k], memory_bar[k])
+                law_bar = Packed(law.layout, weights_bar[k - first])
+                rollout_adjoint(course, scene, law, work, motion, bars, tau_d_bar[k], law_bar)
 
         for first in range(0, len(batch), _TOGETHER):
             together = min(_TOGETHER, len(batch) - first)

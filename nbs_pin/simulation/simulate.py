@@ -53,7 +53,7 @@ def simulate(
     q0, v0: start [rad], [rad/s]. Without q0 the start is the reference's (q and v); with q0 and no v0 it is at rest.
     Leading axes of q0 simulate many starts at once.
     effort_limit: largest |τ| [N·m], a number or one per joint; None takes the arm's (`plant.robot`), inf for none.
-    disturbance: τ_d(t, q, v) [N·m], evaluated at every plant step and held over it (`disturbances.py`, any callable).
+    disturbance: τ_d(t, q, v) [N·m], evaluated at every plant step and held over it (`motions/disturbances.py`, any callable).
     lookahead: how far [s] ahead the controller is evaluated, on the reference of that time and the state predicted with
     the reference's acceleration. A held torque acts half a period late on average, so None takes half a period, which
     removes that lag (the tracking error of a panda at 1 kHz falls tenfold); 0 is the plain sampled law.

@@ -1,7 +1,7 @@
 """Controllers and models in files: settings and weights, the arm they are for, and where a training stood.
 
 A file holds `controller.json` (settings, arm, versions), `controller.safetensors` (the `state_dict`, float64) and, for
-a training that can be resumed, `training.json` and `training.safetensors`, sealed as `archives.py` has it. No pickle.
+a training that can be resumed, `training.json` and `training.safetensors`, sealed as `base/archives.py` has it. No pickle.
 """
 
 import json
