@@ -10,7 +10,7 @@ import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.attack import attack, random_disturbances, worst_of
-from nbs_pin.certificates.ensemble import Arena, motions_of, slowest_rate
+from nbs_pin.certificates.ensemble import LoopEnsemble, motions_of, slowest_rate
 from nbs_pin.certificates.torque_waves import KINDS
 from nbs_pin.motions.references import Hold
 from nbs_pin.reproduction.certificate_study import constant_damping, one_joint
@@ -100,8 +100,8 @@ def test_a_law_without_kernels_is_attacked_too(two_link):
 
     weaker = Weaker(two_link.dynamics, two_link.potential, two_link.damping, inertial_rate=two_link.inertial_rate)
     hold = Hold([0.3, -0.4])
-    arena = Arena.of(weaker, hold, None, 0.012, 0.001, np.inf, 0)
-    assert arena.engine == "torch"
+    ensemble = LoopEnsemble.of(weaker, hold, None, 0.012, 0.001, np.inf, 0)
+    assert ensemble.engine == "torch"
     plain = nbs.NeuralBackstepping(
         two_link.dynamics, two_link.potential, two_link.damping, inertial_rate=two_link.inertial_rate
     )

@@ -28,8 +28,8 @@ from nbs_pin.identification.levenberg_marquardt import Normal, levenberg_marquar
 from nbs_pin.identification.measurement import Noise
 from nbs_pin.identification.physical_tree import FREE, PARALLEL, RIGHT, PhysicalTree
 from nbs_pin.identification.regressor import RobotGeometry, Scalars
-from nbs_pin.identification.tree_search import Measured, TreeGuess
-from nbs_pin.identification.unidentifiable import unexcited
+from nbs_pin.identification.tree_search import Measurements, TreeEstimate
+from nbs_pin.identification.unidentifiable import unidentifiable
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import BODY, tree_workspace
 from nbs_pin.kernels.tree_parameters import COLUMNS, tree_derivatives
@@ -269,18 +269,18 @@ def test_derivatives_with_respect_to_the_tree_are_slopes(tree, seed):
 # Guesses.
 
 
-def guess_and_data(tree=BRANCHED, kinds=2) -> tuple[TreeGuess, Measured]:
+def guess_and_data(tree=BRANCHED, kinds=2) -> tuple[TreeEstimate, Measurements]:
     """A guess away from the tree that moved, and what was measured of that."""
     network = scrambled(*tree)
     data, rng = dataset(network, 40), np.random.default_rng(5)
     scale = rng.uniform(0.5, 2.0, network.nv)
     factors = Scalars(kinds > 0, False, 0.3).factors(data.v, data.a)
-    measured = Measured(data.q, data.v, data.a, data.tau, scale, factors)
-    guess = TreeGuess.of(random_tree(network.nv, rng), network.packed_tree().layout, kinds)
+    measured = Measurements(data.q, data.v, data.a, data.tau, scale, factors)
+    guess = TreeEstimate.of(random_tree(network.nv, rng), network.packed_tree().layout, kinds)
     return replace(guess, drag=rng.uniform(0.5, 2.0, guess.drag.shape)), measured
 
 
-def parameters(guess: TreeGuess) -> int:
+def parameters(guess: TreeEstimate) -> int:
     return 3 + 16 * len(guess.bodies) - 6 + guess.drag.size
 
 
@@ -313,11 +313,11 @@ def test_the_frame_of_the_base_does_not_matter(tree):
     network = scrambled(*tree, epsilon=1e-15)
     arrays = Tree(*(getattr(network, name).detach().numpy() for name in Tree._fields))
     arrays = arrays._replace(factors=np.tril(arrays.factors))
-    guess = TreeGuess.of(arrays, network.packed_tree().layout, 0)
+    guess = TreeEstimate.of(arrays, network.packed_tree().layout, 0)
     np.testing.assert_array_equal(guess.positions[0], 0.0)
     np.testing.assert_allclose(guess.rotations[0], np.eye(3), atol=1e-15)
     data = dataset(network, 20)
-    unit = Measured(data.q, data.v, data.a, data.tau, np.ones(network.nv), np.zeros((0, *data.q.shape)))
+    unit = Measurements(data.q, data.v, data.a, data.tau, np.ones(network.nv), np.zeros((0, *data.q.shape)))
     assert relative(guess.residual(unit), data.tau) < 1e-12
     again = Chain(network.parents, network.prismatic, 1e-15)
     with torch.no_grad():
@@ -341,7 +341,7 @@ def test_the_regressor_of_an_arms_own_geometry_spans_pinocchios():
     parents, prismatic = robot.parents, robot.prismatic
     packed = PinocchioDynamics(robot).packed_tree()
     joints = packed.weights[3:].reshape(robot.nv, BODY)
-    guess = TreeGuess(
+    guess = TreeEstimate(
         packed.layout,
         packed.weights[:3],
         joints[:, :9].reshape(-1, 3, 3),
@@ -357,7 +357,7 @@ def test_the_regressor_of_an_arms_own_geometry_spans_pinocchios():
 
 
 @functools.cache
-def physical_and_data() -> tuple[PhysicalTree, Measured]:
+def physical_and_data() -> tuple[PhysicalTree, Measurements]:
     """Bodies as `explain` finds them for the geometry of a guess."""
     network = scrambled(*BRANCHED)
     data = dataset(network, 60, noise=1.0, friction=JointFriction(np.full(4, 0.5), np.full(4, 0.5), 0.3))
@@ -365,7 +365,7 @@ def physical_and_data() -> tuple[PhysicalTree, Measured]:
     guess, _ = guess_and_data()
     bodies = explain(TreeGeometry(guess), data, scalars, 0.3)
     factors = scalars.factors(data.v, data.a)
-    measured = Measured(data.q, data.v, data.a, data.tau, bodies.report.noise, factors)
+    measured = Measurements(data.q, data.v, data.a, data.tau, bodies.report.noise, factors)
     return PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.expected, 0.3), measured
 
 
@@ -514,7 +514,7 @@ def test_any_tree_is_found_from_its_motions(tree, seed):
     network = scrambled(*tree, seed)
     found = fit_chain(dataset(network, 300), seed)
     assert errors(*map(LagrangianDynamics, (found.network, network)), network.prismatic).max() < 1e-8
-    assert found.bodies.unexcited == ()
+    assert found.bodies.unidentifiable == ()
     assert found.friction is None
     assert found.costs.min() == found.history[-1]
     assert 1 <= len(found.costs) <= 64
@@ -613,7 +613,7 @@ def test_still_poses_say_nothing_of_moments_of_inertia():
     still = replace(data, v=0.0 * data.v, a=0.0 * data.a, tau=LagrangianDynamics(network).gravity(data.q))
     found = fit_chain(still)
     assert found.bodies.excited < found.bodies.base_parameters
-    assert any("joint 1" in line for line in found.bodies.unexcited)
+    assert any("joint 1" in line for line in found.bodies.unidentifiable)
     model = LagrangianDynamics(found.network)
     mass = model.mass_matrix(data.q)
     assert np.linalg.eigvalsh(mass).min() > -1e-14 * np.abs(mass).max()
@@ -627,7 +627,7 @@ def test_torques_that_never_change_are_data_too():
     tau = LagrangianDynamics(network).gravity(q)
     found = fit_chain(replace(dataset(network, 60), q=q, v=0.0 * q, a=0.0 * q, tau=tau))
     np.testing.assert_allclose(LagrangianDynamics(found.network).gravity(q), tau, rtol=1e-6)
-    assert found.bodies.unexcited
+    assert found.bodies.unidentifiable
 
 
 @pytest.mark.parametrize(
@@ -719,15 +719,15 @@ def test_a_small_box_leaves_what_lies_elsewhere_open():
     robot = load_robot("ur5")
     network, data = chain_of(robot), collect(robot, "uniform", 150, 0)
     small = replace(data, q=0.02 * data.q / np.pi)
-    assert unexcited(network, small)[0].startswith("inertia of joint 1: ")
-    assert unexcited(network, data) == ()
+    assert unidentifiable(network, small)[0].startswith("inertia of joint 1: ")
+    assert unidentifiable(network, data) == ()
 
 
 def test_noise_alone_is_said_to_be_noise():
     data = collect(nbs.load_robot("two_link"), "uniform", 300, 0)
     noise = np.random.default_rng(0).normal(size=data.tau.shape)
     report = fit(replace(data, tau=noise), "chain", starts=8).report
-    assert report.unexcited[0].startswith("everything: ")
+    assert report.unidentifiable[0].startswith("everything: ")
     assert report.train_nmse > 0.9
 
 

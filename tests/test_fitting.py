@@ -15,11 +15,11 @@ from nbs_pin.identification import network_fit
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.compatibility import arm_fault
 from nbs_pin.identification.datasets import Dataset
-from nbs_pin.identification.fit import MODELS, fit, parted
+from nbs_pin.identification.fit import MODELS, fit, split_data
 from nbs_pin.identification.fit_report import torque_errors, torque_nmse
 from nbs_pin.identification.network_equations import Equation, Equations
 from nbs_pin.identification.network_fit import fit_network
-from nbs_pin.identification.unidentifiable import unexcited
+from nbs_pin.identification.unidentifiable import unidentifiable
 from nbs_pin.robots.catalogue import find
 
 ROBOT = nbs.load_robot("two_link")
@@ -113,7 +113,7 @@ def test_levenberg_marquardt_finds_the_arm(cholesky):
 
 
 def test_the_report_says_what_was_done(cholesky):
-    report, (train, test) = cholesky.report, parted(states(800))
+    report, (train, test) = cholesky.report, split_data(states(800))
     assert (report.model, report.seed, report.samples) == ("cholesky", 0, 640)
     assert report.parameters == sum(p.numel() for p in cholesky.network.parameters())
     assert report.train_nmse == pytest.approx(torque_nmse(cholesky, train))
@@ -122,7 +122,7 @@ def test_the_report_says_what_was_done(cholesky):
     assert report.history[0] > 100.0 * report.history[-1]
     assert report.seconds > 0.0
     assert report.evaluations > len(report.history)
-    assert report.unexcited == ()
+    assert report.unidentifiable == ()
     assert cholesky.robot is ROBOT
     assert cholesky.friction is None
 
@@ -138,7 +138,7 @@ def test_what_is_held_out_chooses_the_iteration():
     data = states(120, noise=8.0)
     model = fit(data, "cholesky", widths=(16, 16))
     report = model.report
-    train, test = parted(data)
+    train, test = split_data(data)
     unit = train.tau.std(axis=0)
     assert np.mean((torque_errors(model, test) / unit) ** 2) == pytest.approx(min(report.held_out), rel=1e-9)
     assert int(np.argmin(report.held_out)) < len(report.held_out) - 1
@@ -222,11 +222,11 @@ def test_a_start_that_leads_nowhere_is_replaced(monkeypatch):
 def test_data_at_rest_leave_the_inertia_open_and_data_of_few_poses_the_rest():
     still = states(400, still=True)
     network = fit(still, "cholesky", widths=(8, 8), iterations=20).network
-    told = unexcited(network, still, names=ROBOT.joint_names)
+    told = unidentifiable(network, still, names=ROBOT.joint_names)
     assert {line.split(":")[0] for line in told} == {f"inertia of {joint}" for joint in ROBOT.joint_names}
     moving = states(400)
-    assert unexcited(network, moving) == ()
-    assert unexcited(network, moving.take(np.cos(moving.q[:, 1]) < -0.9))
+    assert unidentifiable(network, moving) == ()
+    assert unidentifiable(network, moving.take(np.cos(moving.q[:, 1]) < -0.9))
 
 
 def test_data_without_torque_leave_the_scale_open():
@@ -234,7 +234,7 @@ def test_data_without_torque_leave_the_scale_open():
     zero = 0.0 * data.q
     free = replace(data, a=nbs.forward_dynamics(TRUTH, data.q, data.v, zero), tau=zero)
     model = fit(free, "cholesky", widths=(6,), loss="acceleration", iterations=4, epsilon=0.1)
-    assert model.report.unexcited[0].startswith("the torque's scale")
+    assert model.report.unidentifiable[0].startswith("the torque's scale")
     assert np.isnan(model.report.train_nmse)
     for name, robot in (("cholesky", None), ("identified", ROBOT)):
         with pytest.raises(ArgumentError, match=r"no torque"):
@@ -254,13 +254,13 @@ def test_nmse_is_the_mean_over_joints_whose_torque_varies():
 
 def test_whole_trajectories_are_held_out():
     data = replace(states(40), trajectory=np.repeat(np.arange(4), 10))
-    train, test = parted(data, 0.25)
+    train, test = split_data(data, 0.25)
     assert set(train.trajectory).isdisjoint(test.trajectory)
     assert (len(train), len(test)) == (30, 10)
-    assert parted(data, 0.0) == (data, None)
+    assert split_data(data, 0.0) == (data, None)
     one = data.take(data.trajectory == 0)
-    assert parted(one) == (one, None)
-    assert parted(data, one) == (data, one)
+    assert split_data(one) == (one, None)
+    assert split_data(data, one) == (data, one)
 
 
 @pytest.mark.parametrize(
@@ -305,7 +305,7 @@ def test_data_of_another_arm_are_refused():
     with pytest.raises(ArgumentError, match="held_out is of xarm7 and the data of panda"):
         fit(data, "identified", robot=panda, held_out=rows(xarm))
     with pytest.raises(ArgumentError, match="held_out is of xarm7"):
-        parted(data, rows(xarm))
+        split_data(data, rows(xarm))
 
 
 @pytest.mark.parametrize("change", [{"parents": np.array([0, 0])}, {"prismatic": np.array([True, False])}])
@@ -328,7 +328,7 @@ def test_a_nominal_arm_may_be_wrong(tmp_path):
     assert fit(rows(nominal), "identified", robot=ROBOT).report.train_nmse < 1e-5
     for robot in (nominal, nbs.load_robot("two_link", gravity=9.0), ROBOT.with_effort_limit(3.0)):
         assert arm_fault(data, robot) == ""
-    assert parted(data, rows(ROBOT.with_effort_limit(30.0), seed=1))[1] is not None
+    assert split_data(data, rows(ROBOT.with_effort_limit(30.0), seed=1))[1] is not None
     assert arm_fault(states(5), ROBOT) == arm_fault(replace(states(5), robot="mine"), ROBOT) == ""
 
 

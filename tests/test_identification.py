@@ -140,7 +140,7 @@ def test_clean_data_give_the_arm_to_rounding_and_its_own_bodies_are_not_looked_a
     robot = load_robot(name)
     model = identify(clean(robot), unlike(robot))
     assert errors(model, PinocchioDynamics(robot)).max() < 1e-10
-    assert (model.report.base_parameters, model.report.excited, model.report.unexcited) == (base, base, ())
+    assert (model.report.base_parameters, model.report.excited, model.report.unidentifiable) == (base, base, ())
     assert model.report.train_nmse < 1e-20
     assert np.linalg.eigvalsh(pseudo_inertia(model.parameters)).min() > -1e-12
 
@@ -255,8 +255,8 @@ def test_still_poses_say_nothing_of_moments_of_inertia():
     data = dataset(robot, q, 0.0 * v, 0.0 * a, PinocchioDynamics(robot).gravity(q))
     model = identify(data, robot)
     assert (model.report.base_parameters, model.report.excited) == (6, 4)
-    assert len(model.report.unexcited) == 2
-    assert all("I" in line for line in model.report.unexcited)
+    assert len(model.report.unidentifiable) == 2
+    assert all("I" in line for line in model.report.unidentifiable)
     assert errors(model, PinocchioDynamics(robot))[2] < 1e-8
     assert np.linalg.eigvalsh(model.mass_matrix(q)).min() > 0.0
 
@@ -268,10 +268,10 @@ def test_a_joint_that_never_moves_keeps_the_friction_expected_of_it():
     friction = JointFriction(np.ones(3), np.ones(3))
     tau = PinocchioDynamics(robot).reference_torque(q, v, v, a) + friction.torque(v)
     model = identify(dataset(robot, q, v, a, tau), robot, friction=True)
-    unexcited = " ".join(model.report.unexcited)
+    unidentifiable = " ".join(model.report.unidentifiable)
     joint = robot.joint_names[1]
-    assert f"viscous({joint})" in unexcited
-    assert f"coulomb({joint})" in unexcited
+    assert f"viscous({joint})" in unidentifiable
+    assert f"coulomb({joint})" in unidentifiable
     assert model.friction is not None
     np.testing.assert_allclose(model.friction.viscous[[0, 2]], 1.0, rtol=1e-8)
     assert model.friction.viscous[1] < 20.0
@@ -280,7 +280,7 @@ def test_a_joint_that_never_moves_keeps_the_friction_expected_of_it():
 def test_few_noisy_samples_give_bodies_that_exist():
     robot = load_robot("xarm7")
     model = identify(collect(robot, "excited", 300, seed=3, noise=REAL), robot)
-    assert model.report.unexcited
+    assert model.report.unidentifiable
     assert np.linalg.eigvalsh(pseudo_inertia(model.parameters)).min() > 0.0
     q, _, _ = states(7, 200)
     assert np.linalg.eigvalsh(model.mass_matrix(q)).min() > 0.0

@@ -12,7 +12,7 @@ from nbs_pin import cli
 from nbs_pin.commands import learn as learning
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import load_dataset
-from nbs_pin.identification.fit import parted
+from nbs_pin.identification.fit import split_data
 from nbs_pin.identification.fit_report import torque_errors
 from tests.test_plotting import png_size
 
@@ -48,7 +48,7 @@ def test_the_files_are_a_model_and_how_it_came_about(path, network):
     said, model = summary(network), nbs.load(network / "model.nbs")
     assert said["settings"]["model"] == "cholesky"
     assert said["robot_sha256"] == ROBOT.sha256 == model.robot.sha256
-    figures, (train, test) = said["figures"], parted(load_dataset(path), 0.2, 3)
+    figures, (train, test) = said["figures"], split_data(load_dataset(path), 0.2, 3)
     assert figures["samples"] == len(train)
     assert figures["test_samples"] == len(test)
     expected = np.sqrt(np.square(torque_errors(model, test)).mean(axis=0))

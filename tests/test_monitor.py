@@ -16,7 +16,7 @@ from nbs_pin.certificates.assumptions import Promise, jumps
 from nbs_pin.certificates.attack import attack, random_disturbances
 from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.claims import Assumption
-from nbs_pin.certificates.energy_balance import Instants, balance, beyond, storage_of
+from nbs_pin.certificates.energy_balance import LoopSamples, balance, beyond, storage_of
 from nbs_pin.certificates.monitor import monitor
 from nbs_pin.certificates.online_monitor import Watch
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -61,7 +61,7 @@ def residual(law, run):
 
 
 def flow_of(law, run):
-    at = Instants.of(run).rows(0)
+    at = LoopSamples.of(run).rows(0)
     return balance(law, at.rows(slice(-1)), at.rows(slice(1, None)), np.diff(storage_of(law, at)))
 
 
@@ -296,12 +296,12 @@ def test_a_smooth_reference_is_never_said_to_jump(rate):
     robot = nbs.load_robot("two_link")
     law, t = nbs.NeuralBackstepping.for_robot(robot), 0.001 * np.arange(4000.0)
     aim = Sinusoid(np.array([0.5, -1.0]), rate, np.array([0.0, 1.0]))(t)
-    at = Instants(t, aim.q, aim.v, aim.q, aim.v, aim.a, 0.0 * aim.q, 0.0 * aim.q)
+    at = LoopSamples(t, aim.q, aim.v, aim.q, aim.v, aim.a, 0.0 * aim.q, 0.0 * aim.q)
     assert not jumps(law, at)[Assumption.REFERENCE].any()
     after = (t >= t[2000])[:, None]
     drift = 0.7 * rate * after
     for q, v in ((aim.q + 0.7 * after, aim.v), (aim.q + drift * (t - t[2000])[:, None], aim.v + drift)):
-        broken = jumps(law, Instants(t, q, v, q, v, aim.a, 0.0 * q, 0.0 * q))[Assumption.REFERENCE]
+        broken = jumps(law, LoopSamples(t, q, v, q, v, aim.a, 0.0 * q, 0.0 * q))[Assumption.REFERENCE]
         assert np.flatnonzero(broken).tolist() == [1999]
 
 
@@ -432,7 +432,7 @@ def test_beyond_is_the_least_torque_to_take_away(admissible):
 def test_storage_of_many_states_is_that_of_each(law):
     rng = np.random.default_rng(0)
     rows = [rng.normal(size=(3, 1500, 2)) for _ in range(7)]
-    at = Instants(np.zeros((3, 1500)), *rows)  # more than fit at once
+    at = LoopSamples(np.zeros((3, 1500)), *rows)  # more than fit at once
     few = law.storage(*(x[:, ::500] for x in rows[:4]))
     assert storage_of(law, at)[:, ::500] == pytest.approx(few, rel=1e-12)
 

@@ -135,7 +135,10 @@ def test_options_reach_the_training(tmp_path, capsys, cost, folder):
 # Stopping and going on.
 
 
-@pytest.mark.parametrize(("optimiser", "call"), [("cautious", 6), ("cautious", 13), ("cautious", 15), ("lbfgs", 11)])
+@pytest.mark.parametrize(
+    ("optimiser", "call"),
+    [("adam-backtracking", 6), ("adam-backtracking", 13), ("adam-backtracking", 15), ("lbfgs", 11)],
+)
 def test_ctrl_c_at_any_moment_and_resume_are_one_training(folder, tmp_path, capsys, monkeypatch, optimiser, call):
     """Interrupted in the middle of a cost or a gradient, --resume goes on to the same last bit."""
     calls, cost = [], trainer.running_cost

@@ -30,7 +30,13 @@ def trained(name: str) -> NeuralBackstepping:
     law = untrained(name)
     plant, reference = DynamicsPlant(law.dynamics), Sinusoid.for_robot(law.dynamics.robot)
     settings = dict(
-        starts=6, held_out=0, start_error=0.3, duration=0.4, period=0.005, optimiser="cautious", learning_rate=0.02
+        starts=6,
+        held_out=0,
+        start_error=0.3,
+        duration=0.4,
+        period=0.005,
+        optimiser="adam-backtracking",
+        learning_rate=0.02,
     )
     result = train(law, plant, [reference], epochs=20, **settings)
     assert result.history[result.best_epoch] < 0.9 * result.history[0]

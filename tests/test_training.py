@@ -134,7 +134,7 @@ def test_gradients_of_many_starts_are_the_sum_of_those_of_few(monkeypatch):
     robot = arm("two_link")
     controller, batch = law_for(robot), problem(robot, starts=7)
     whole = value_and_gradient(controller, batch, squared_error, "kernels")
-    monkeypatch.setattr("nbs_pin.simulation.rollout._TOGETHER", 3)
+    monkeypatch.setattr("nbs_pin.simulation.rollout._BATCH", 3)
     parts = value_and_gradient(controller, batch, squared_error, "kernels")
     torch.testing.assert_close(parts[1], whole[1], rtol=1e-12, atol=1e-15)
 
@@ -198,7 +198,7 @@ def quick(controller, robot, **settings):
 
 
 @pytest.mark.parametrize("name", COMPILED)
-@pytest.mark.parametrize("optimiser", ["cautious", "adam", "lbfgs"])
+@pytest.mark.parametrize("optimiser", ["adam-backtracking", "adam", "lbfgs"])
 def test_training_lowers_the_held_out_cost_and_leaves_the_given_law_alone(name, optimiser):
     robot = arm("two_link")
     controller = build_law(name, robot, period=PERIOD)
@@ -249,7 +249,7 @@ def test_a_regulariser_keeps_weights_small():
     assert bound.history[0] == pytest.approx(free.history[0] + 10.0 * float(size(controller).detach()))
 
 
-@pytest.mark.parametrize("optimiser", ["cautious", "adam", "lbfgs"])
+@pytest.mark.parametrize("optimiser", ["adam-backtracking", "adam", "lbfgs"])
 def test_a_resumed_training_is_the_same_to_the_last_bit(optimiser, tmp_path, monkeypatch):
     robot = arm("two_link")
     controller = build_law("nbs", robot, period=PERIOD)

@@ -214,7 +214,7 @@ def _train(setting: Setting, law: Any, rate: float, epochs: int, seed: int) -> T
         period=setting.period,
         cost=TimeOutside(PAPER_THRESHOLD),
         epochs=epochs,
-        optimiser="cautious",
+        optimiser="adam-backtracking",
         learning_rate=rate,
         seed=seed,
     )

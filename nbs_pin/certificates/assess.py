@@ -42,7 +42,7 @@ class Certified:
     """Whether the adversary climbed, or only waves were tried."""
     diverged: str = ""
     """Why no motion was found, where one left the finite numbers."""
-    beaten: Monitored | None = None
+    exceeding: Monitored | None = None
     """The worst motion held against the certificate, where it or another one exceeded a bound."""
     watched: Monitored | None = None
     """The run that was given, held against it."""
@@ -125,10 +125,10 @@ def assess(
         )
     watched = None if run is None else monitor(run, certificate)
     found, diverged = _attacked(certificate, task, thorough, progress)
-    beaten = None
+    exceeding = None
     if found is not None and exceeds(found, certificate):
-        beaten = monitor(found.run, certificate)
-    return Certified(certificate, loads, found, thorough, diverged, beaten, watched, proposal)
+        exceeding = monitor(found.run, certificate)
+    return Certified(certificate, loads, found, thorough, diverged, exceeding, watched, proposal)
 
 
 def exceeds(found: Attack, certificate: Certificate) -> bool:

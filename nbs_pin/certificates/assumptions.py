@@ -14,7 +14,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.certify import Certificate
 from nbs_pin.certificates.claims import Assumption
-from nbs_pin.certificates.energy_balance import Balance, Instants, beyond
+from nbs_pin.certificates.energy_balance import Balance, LoopSamples, beyond
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 
 WRONG = "the certificate is wrong"
@@ -125,7 +125,7 @@ class Setting(NamedTuple):
     """Torques below this are not told from the error of differences over a period [N·m]."""
 
     @classmethod
-    def of(cls, certificate: Certificate, flow: Balance, at: Instants) -> "Setting":
+    def of(cls, certificate: Certificate, flow: Balance, at: LoopSamples) -> "Setting":
         """Of the periods between those instants."""
         admissible, mismatch, step = certificate.admissible, certificate.mismatch, np.diff(at.t)
         size = float(np.linalg.norm(admissible.box)) if admissible.box is not None else admissible.radius or 0.0
@@ -225,7 +225,7 @@ JUMPS = (Assumption.WRAP, Assumption.REFERENCE)
 """Assumptions without which V itself jumps, so that no power accounts for what it does."""
 
 
-def jumps(controller: LyapunovLaw, at: Instants) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
+def jumps(controller: LyapunovLaw, at: LoopSamples) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
     """When an error leapt from one end of its turn to the other, and when the reference is no motion with a velocity.
 
     Between two instants a smooth reference moves by the mean of its velocities, but for a share of these and of their

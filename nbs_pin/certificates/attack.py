@@ -18,7 +18,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.ensemble import Arena, Peaks, law_of
+from nbs_pin.certificates.ensemble import LoopEnsemble, Peaks, law_of
 from nbs_pin.certificates.torque_waves import FASTEST, SLOWEST, constant, in_step, random_disturbances, square
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -82,26 +82,26 @@ def attack(
     """
     for name, value, least in (("rounds", rounds, 0), ("starts", starts, 1), ("seed", seed, 0)):
         _check_count(name, value, least)
-    arena = Arena.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
+    ensemble = LoopEnsemble.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
     admissible, rng = Admissible.of(disturbance, controller.nv), np.random.default_rng(seed)
-    names, motion, waves = _waves(arena, admissible, rng)
-    peaks = arena.peaks(motion, waves, progress)
-    pack = _Pack.of(motion, waves, peaks, starts)
+    names, motion, waves = _waves(ensemble, admissible, rng)
+    peaks = ensemble.peaks(motion, waves, progress)
+    pack = _Ascent.of(motion, waves, peaks, starts)
     history = [float(peaks.error.max())]
     for k in tracked(range(rounds), lambda: f"attack: {history[-1]:.4g} rad so far", progress):
-        pack = pack.climb(arena, admissible, at_end=k % 2 == 0)
+        pack = pack.ascend(ensemble, admissible, at_end=k % 2 == 0)
         history.append(max(history[-1], float(pack.peaks.error.max())))
     worst = int(pack.peaks.error.argmax())
     ascent = "bang-bang ascent" if admissible.radius is None else "steepest ascent"
-    found_by = ascent if pack.climbed[worst] else names[pack.origin[worst]]
+    found_by = ascent if pack.ascended[worst] else names[pack.origin[worst]]
     return Attack(
         error=history[-1],
         joint_errors=np.maximum(peaks.joint_errors.max(axis=0), pack.joint_errors),
         disturbance=pack.torque[worst],
-        run=arena.run(int(pack.motion[worst]), pack.torque[worst], attack=found_by),
+        run=ensemble.run(int(pack.motion[worst]), pack.torque[worst], attack=found_by),
         found_by=found_by,
         history=np.array(history),
-        duration=arena.loop.steps * period,
+        duration=ensemble.loop.steps * period,
         period=period,
     )
 
@@ -131,8 +131,8 @@ def worst_of(
     if not np.isfinite(disturbances).all():
         raise ArgumentError("the disturbances hold numbers that are not finite; correct them.")
     duration = disturbances.shape[1] * period
-    arena = Arena.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
-    return arena.peaks(np.arange(len(disturbances)) % len(arena.scenes), disturbances, progress)
+    ensemble = LoopEnsemble.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
+    return ensemble.peaks(np.arange(len(disturbances)) % len(ensemble.scenes), disturbances, progress)
 
 
 def _check_count(name: str, value: int, least: int) -> None:
@@ -141,17 +141,17 @@ def _check_count(name: str, value: int, least: int) -> None:
 
 
 def _waves(
-    arena: Arena, admissible: Admissible, rng: np.random.Generator
+    ensemble: LoopEnsemble, admissible: Admissible, rng: np.random.Generator
 ) -> tuple[list[str], Int[np.ndarray, " count"], Float[np.ndarray, "count steps n"]]:
     """Constants, square waves of one rate and of a rate per joint, on every motion: names, motions and torques."""
-    n, t = arena.loop.plant.nv, arena.loop.period * np.arange(arena.loop.steps)
+    n, t = ensemble.loop.plant.nv, ensemble.loop.period * np.arange(ensemble.loop.steps)
     names, motion, waves = [], [], []
     rates = np.geomspace(SLOWEST, FASTEST, 12).tolist()
-    for k, rate in product(range(len(arena.scenes)), [None, None, *rates]):
+    for k, rate in product(range(len(ensemble.scenes)), [None, None, *rates]):
         names.append("constant" if rate is None else "square wave")
         motion.append(k)
         waves.append(constant(admissible, t, n, rng) if rate is None else in_step(admissible, t, n, rng, rate))
-    for k, _ in product(range(len(arena.scenes)), range(4)):
+    for k, _ in product(range(len(ensemble.scenes)), range(4)):
         names.append("square wave")
         motion.append(k)
         waves.append(square(admissible, t, n, rng))
@@ -159,7 +159,7 @@ def _waves(
 
 
 @dataclass(frozen=True, eq=False)
-class _Pack:
+class _Ascent:
     """Disturbances that climb side by side; each keeps the worst it has been."""
 
     motion: Int[np.ndarray, " count"]
@@ -169,7 +169,7 @@ class _Pack:
     """What each climbs, Σ w_i z1_i²: all joints, or one."""
     origin: Int[np.ndarray, " count"]
     """The wave each began as."""
-    climbed: Bool[np.ndarray, " count"]
+    ascended: Bool[np.ndarray, " count"]
     """Whether it is another by now."""
     share: Float[np.ndarray, " count"]
     """How much of what the gradient promises the next step takes."""
@@ -181,7 +181,7 @@ class _Pack:
     @classmethod
     def of(
         cls, motion: Int[np.ndarray, " waves"], waves: Float[np.ndarray, "waves steps n"], peaks: Peaks, starts: int
-    ) -> "_Pack":
+    ) -> "_Ascent":
         """The worst wave of every motion, then the second worst …, and for each joint the one that moves it most."""
         order = np.argsort(-peaks.error, kind="stable")
         rank = np.array([int((motion[order[:k]] == motion[order[k]]).sum()) for k in range(len(order))])
@@ -193,17 +193,17 @@ class _Pack:
             torque=waves[chosen],
             weights=np.concatenate([np.ones((len(first), n)), np.eye(n)]),
             origin=chosen,
-            climbed=np.zeros(count, dtype=bool),
+            ascended=np.zeros(count, dtype=bool),
             share=np.ones(count),
             peaks=Peaks(*(x[chosen] for x in peaks)),
             joint_errors=peaks.joint_errors.max(axis=0),
         )
 
-    def climb(self, arena: Arena, admissible: Admissible, *, at_end: bool) -> "_Pack":
+    def ascend(self, ensemble: LoopEnsemble, admissible: Admissible, *, at_end: bool) -> "_Ascent":
         """One step each; one that gained nothing is undone, and its next step is a quarter as long."""
-        gradient = arena.climb(self.motion, self.torque, self.weights, at_end)
+        gradient = ensemble.torque_gradient(self.motion, self.torque, self.weights, at_end)
         trial = _towards(admissible, self.torque, gradient, self.share)
-        found = arena.peaks(self.motion, trial)
+        found = ensemble.peaks(self.motion, trial)
         before, after = (np.sqrt((self.weights * p.joint_errors**2).max(axis=1)) for p in (self.peaks, found))
         whole = self.weights.all(axis=1)
         better = np.where(whole, found.error > self.peaks.error, after > before)
@@ -213,7 +213,7 @@ class _Pack:
             self,
             torque=kept[0],
             peaks=Peaks(*kept[1:]),
-            climbed=self.climbed | better,
+            ascended=self.ascended | better,
             share=np.where(better, np.minimum(1.0, 2.0 * self.share), 0.25 * self.share),
             joint_errors=np.maximum(self.joint_errors, found.joint_errors.max(axis=0)),
         )

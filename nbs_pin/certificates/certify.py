@@ -17,7 +17,7 @@ from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.comparison_system import ComparisonSystem, Level, decay, level, reach
 from nbs_pin.certificates.constants import Constants, constants_of
 from nbs_pin.certificates.error_bounds import errors, radians
-from nbs_pin.certificates.margins import headroom, room, sampled_control, units
+from nbs_pin.certificates.margins import effort_margin, position_margin, sampled_control, units
 from nbs_pin.certificates.model_error import ModelError, model_error
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.controllers.controller import Controller
@@ -275,8 +275,8 @@ def _along(
         lines = (*lines, Claim("V(0) of the start", initial, "J", certificate.label, because, Group.BOUNDS))
     conditions = [*certificate.conditions, *_no_wrap(robot, joints, certificate.label)]
     if reference is not None and robot is not None:
-        conditions += headroom(robot, law.dynamics, certificate.admissible, reference, duration)
-        conditions += room(robot, joints, reference, duration)
+        conditions += effort_margin(robot, law.dynamics, certificate.admissible, reference, duration)
+        conditions += position_margin(robot, joints, reference, duration)
     certificate = replace(certificate, conditions=tuple(conditions), lines=lines, overshoot=overshoot)
     return replace(certificate, label=Label.EMPIRICAL) if certificate.void else certificate
 

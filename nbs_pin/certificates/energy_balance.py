@@ -20,10 +20,10 @@ from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.equations import inverse_dynamics
 
-_TOGETHER = 4096  # states a network sees at once
+_BATCH = 4096  # states a network sees at once
 
 
-class Instants(NamedTuple):
+class LoopSamples(NamedTuple):
     """What is known of a loop at control instants, any number of them."""
 
     t: Float[np.ndarray, "*rows"]
@@ -44,16 +44,16 @@ class Instants(NamedTuple):
     """Torque asked for [N·m]."""
 
     @classmethod
-    def of(cls, run: Run) -> "Instants":
+    def of(cls, run: Run) -> "LoopSamples":
         """All instants of a run, its starts one after the other: (starts·rows, …)."""
         starts = int(np.prod(run.q.shape[1:-1], dtype=int))
         named = (run.q, run.v, run.q_ref, run.v_ref, run.a_ref, run.tau, run.tau_command)
         rows = (x.reshape(len(run.t), starts, run.nv).swapaxes(0, 1) for x in named)
         return cls(np.tile(run.t, (starts, 1)), *rows)
 
-    def rows(self, which: Any) -> "Instants":
+    def rows(self, which: Any) -> "LoopSamples":
         """Those rows of every field."""
-        return Instants(*(x[which] for x in self))
+        return LoopSamples(*(x[which] for x in self))
 
 
 class Balance(NamedTuple):
@@ -83,15 +83,15 @@ class Balance(NamedTuple):
     """‖q‖ [rad] and ‖v‖ [rad/s]."""
 
 
-def storage_of(controller: LyapunovLaw, at: Instants) -> Float[np.ndarray, "*rows"]:
+def storage_of(controller: LyapunovLaw, at: LoopSamples) -> Float[np.ndarray, "*rows"]:
     """V [J] at the instants."""
     return _in_parts(controller.storage, at.q, at.v, at.q_ref, at.v_ref)[0]
 
 
 def balance(
     controller: LyapunovLaw,
-    before: Instants,
-    after: Instants,
+    before: LoopSamples,
+    after: LoopSamples,
     change: Float[np.ndarray, "*rows"],
     law: MemorylessController | None = None,
 ) -> Balance:
@@ -170,8 +170,8 @@ def _in_parts(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.nda
     shape, n = arrays[0].shape[:-1], arrays[0].shape[-1]
     rows = [np.ascontiguousarray(x).reshape(-1, n) for x in arrays]
     found = []
-    for k in range(0, max(len(rows[0]), 1), _TOGETHER):
-        value = function(*(x[k : k + _TOGETHER] for x in rows))
+    for k in range(0, max(len(rows[0]), 1), _BATCH):
+        value = function(*(x[k : k + _BATCH] for x in rows))
         found.append(value if isinstance(value, tuple) else (value,))
     return tuple(np.concatenate(x).reshape((*shape, *x[0].shape[1:])) for x in zip(*found, strict=True))
 

@@ -27,7 +27,7 @@ POSTURES = 7
 """Postures held still, beside the arm's own motion, where no reference is given."""
 TIME_CONSTANTS, MOST_PERIODS = 7.0, 4000
 """Default duration: so many of the slowest, but no more periods than these."""
-_TOGETHER = 128  # motions in memory at once
+_BATCH = 128  # motions in memory at once
 _PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
 
 
@@ -41,7 +41,7 @@ class Peaks(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Arena:
+class LoopEnsemble:
     """A closed loop and the motions it can be made to follow; `of` makes it."""
 
     controller: ModelLaw
@@ -59,7 +59,7 @@ class Arena:
         period: float,
         effort_limit: PerJoint,
         seed: int,
-    ) -> "Arena":
+    ) -> "LoopEnsemble":
         """The loop with the arguments of `attack`; raises ArgumentError when they do not fit."""
         law = law_of(controller)
         positive("period", period, "s")
@@ -87,7 +87,7 @@ class Arena:
         self, motion: Int[np.ndarray, " count"], tau_d: Float[np.ndarray, "count steps n"], progress: bool = False
     ) -> Peaks:
         """Largest errors of those motions under those torques [N·m]."""
-        parts = [slice(k, k + _TOGETHER) for k in range(0, len(motion), _TOGETHER)]
+        parts = [slice(k, k + _BATCH) for k in range(0, len(motion), _BATCH)]
         found = []
         with torch.no_grad():
             for part in tracked(parts, "motions under disturbance", progress):
@@ -95,7 +95,7 @@ class Arena:
                 found.append((np.linalg.norm(z1, axis=-1).max(axis=1), z1.max(axis=1)))
         return Peaks(*(np.concatenate(x) for x in zip(*found, strict=True)))
 
-    def climb(
+    def torque_gradient(
         self,
         motion: Int[np.ndarray, " count"],
         tau_d: Float[np.ndarray, "count steps n"],

@@ -41,7 +41,7 @@ def sampled_control(controller: LyapunovLaw, period: float | None) -> tuple[tupl
     return lines, (Condition(name, hold, period, "s", Label.EMPIRICAL, _RULE),)
 
 
-def headroom(
+def effort_margin(
     robot: Robot, dynamics: DynamicsProvider, admissible: Admissible, reference: DesiredMotion, duration: float
 ) -> tuple[Condition, ...]:
     """Whether every joint's effort limit exceeds what reference and disturbance ask of it together [N·m].
@@ -60,7 +60,9 @@ def headroom(
     return (Condition(name, float(robot.effort_limit[worst]), float(total[worst]), "N·m", Label.EMPIRICAL, because),)
 
 
-def room(robot: Robot, errors: JointArray, reference: DesiredMotion, duration: float) -> tuple[Condition, ...]:
+def position_margin(
+    robot: Robot, errors: JointArray, reference: DesiredMotion, duration: float
+) -> tuple[Condition, ...]:
     """Whether the reference with the errors around it stays inside the position limits, for the joint with least room.
 
     Raises CertificateRefused where the reference alone leaves them: the box is too small for it.

@@ -26,7 +26,7 @@ from nbs_pin.certificates.assumptions import (
 )
 from nbs_pin.certificates.certify import Certificate
 from nbs_pin.certificates.claims import Assumption
-from nbs_pin.certificates.energy_balance import Balance, Instants, balance, storage_of
+from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, storage_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
     check_certificate(certificate)
     _check_run(run, certificate, start)
     controller, starts = certificate.controller, int(np.prod(run.q.shape[1:-1], dtype=int))
-    at, recorded = Instants.of(run).rows(start), run.disturbance.reshape(len(run.t), starts, run.nv)[:, start]
+    at, recorded = LoopSamples.of(run).rows(start), run.disturbance.reshape(len(run.t), starts, run.nv)[:, start]
     storage, z1 = storage_of(controller, at), controller.dynamics.difference(at.q, at.q_ref)
     flow = balance(controller, at.rows(slice(-1)), at.rows(slice(1, None)), np.diff(storage))
     promise, values = Promise(certificate, float(storage[0])), quantities(storage, z1)

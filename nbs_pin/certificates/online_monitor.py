@@ -27,7 +27,7 @@ from nbs_pin.certificates.assumptions import (
 )
 from nbs_pin.certificates.certify import Certificate
 from nbs_pin.certificates.claims import Assumption
-from nbs_pin.certificates.energy_balance import Balance, Instants, balance, storage_of
+from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, storage_of
 from nbs_pin.controllers.controller import MemorylessController
 
 
@@ -38,7 +38,7 @@ class WatchMemory(NamedTuple):
     """Time of the first instant [s]."""
     initial: float
     """V at that time [J]."""
-    last: Instants
+    last: LoopSamples
     """The instant before."""
     storage: float
     """V then [J]."""
@@ -123,7 +123,7 @@ class Watch:
 
         Raises ArgumentError for an instant that is not after the last one.
         """
-        now = Instants(np.array(t), q, v, reference.q, reference.v, reference.a, tau, tau_command)
+        now = LoopSamples(np.array(t), q, v, reference.q, reference.v, reference.a, tau, tau_command)
         storage = float(storage_of(self.certificate.controller, now))
         if memory is None:
             memory = WatchMemory(t, storage, now, storage, 0.0, 0.0, 1.0, ())
@@ -131,7 +131,7 @@ class Watch:
         step = t - float(memory.last.t)
         if not step > 0.0:
             raise ArgumentError(f"the instant t = {t} s is not after the last, {memory.last.t} s; give them in order.")
-        both = Instants(*(np.stack([a, b]) for a, b in zip(memory.last, now, strict=True)))
+        both = LoopSamples(*(np.stack([a, b]) for a, b in zip(memory.last, now, strict=True)))
         change = np.array([storage - memory.storage])
         flow = balance(self.certificate.controller, both.rows(slice(1)), both.rows(slice(1, None)), change, self._law)
         setting, decay = Setting.of(self.certificate, flow, both), self.certificate.level.c
@@ -157,7 +157,7 @@ class Watch:
         return _Seen(values[0], bounds[0], over[0], bool((over & (values > accounted)).any()))
 
     def _broken(
-        self, memory: WatchMemory, flow: Balance, setting: Setting, both: Instants, seen: _Seen
+        self, memory: WatchMemory, flow: Balance, setting: Setting, both: LoopSamples, seen: _Seen
     ) -> tuple[Assumption, ...]:
         """The assumptions that have failed, those of the last period among them."""
         controller = self.certificate.controller

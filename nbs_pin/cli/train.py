@@ -40,7 +40,7 @@ class Train:
     cost: Literal["torque-aware", "squared-error", "time-outside"] = "torque-aware"
     """What is made small: error, its rate and torque beyond the limits; the error alone, as in the paper; or the time
     spent 0.1 rad and more away."""
-    optimiser: Literal["cautious", "adam", "lbfgs"] = "cautious"
+    optimiser: Literal["adam-backtracking", "adam", "lbfgs"] = "adam-backtracking"
     """How: Adam that retreats with half the step when the cost rises, Adam with its step halved after every fifth of
     the epochs as in the paper, or L-BFGS with line search."""
     learning_rate: Annotated[

@@ -16,7 +16,7 @@ from nbs_pin.commands.results import SUMMARY, Results, sha256_of, table
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
-from nbs_pin.identification.fit import fit, parted
+from nbs_pin.identification.fit import fit, split_data
 from nbs_pin.identification.fit_report import FitReport, torque_errors
 from nbs_pin.identification.logs import load_log
 from nbs_pin.reports.plotting import ACTUAL, LIMIT, REFERENCE, picture
@@ -92,7 +92,7 @@ def data_and_arm(path: str | Path, arm: str | None) -> tuple[Dataset, Robot | No
 
 def learn(data: Dataset, model: str, robot: Robot | None, seed: int = 0, **settings: Any) -> Learned:
     """The model that `fit` makes of the data, settings and errors as there, and the data it did not learn from."""
-    train, test = parted(data, settings.pop("held_out", None), seed)
+    train, test = split_data(data, settings.pop("held_out", None), seed)
     found: Any = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
     joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
     return Learned(found, found.report, found.friction, train, test, joints, tuple(data.prismatic.tolist()))
@@ -186,7 +186,7 @@ def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
 
 def _lines(figures: dict[str, Any]) -> list[str]:
     train, test = (figures[name] for name in ("train_nmse", "test_nmse"))
-    shown, more = figures["unexcited"][:3], len(figures["unexcited"]) - 3
+    shown, more = figures["unidentifiable"][:3], len(figures["unidentifiable"]) - 3
     return [
         f"mean square of the torque error over the torque's variance: {_short(train)} on {figures['samples']} samples"
         + ("" if test is None else f", {_short(test)} on {figures['test_samples']} of trajectories held out"),

@@ -30,7 +30,7 @@ from nbs_pin.identification.identify import Bodies, IdentificationReport, explai
 from nbs_pin.identification.levenberg_marquardt import Descent, levenberg_marquardt
 from nbs_pin.identification.physical_tree import PhysicalTree
 from nbs_pin.identification.regressor import Scalars
-from nbs_pin.identification.tree_search import Measured, TreeGuess
+from nbs_pin.identification.tree_search import Measurements, TreeEstimate
 from nbs_pin.kernels.threads import cores
 
 _FEW = 400
@@ -146,7 +146,7 @@ class _Try(NamedTuple):
     """Physical bodies for one tree of the search."""
 
     cost: float
-    descent: Descent[TreeGuess]
+    descent: Descent[TreeEstimate]
     bodies: Bodies
     physical: PhysicalTree
     reached: bool
@@ -157,7 +157,7 @@ class _Try(NamedTuple):
 class TreeGeometry:
     """The placements of a guess, as `identification` asks for them."""
 
-    guess: TreeGuess
+    guess: TreeEstimate
 
     @property
     def names(self) -> Sequence[str]:
@@ -176,23 +176,23 @@ class TreeGeometry:
         return self.guess.regressor(q, v, a)
 
 
-def _measured(data: Dataset, scalars: Scalars) -> Measured:
+def _measured(data: Dataset, scalars: Scalars) -> Measurements:
     """The data with every joint weighted by the spread of its torque, at least a thousandth of the largest."""
     least = 1e-3 * np.sqrt(np.square(data.tau).mean(axis=0).max())
     scale = np.maximum(data.tau.std(axis=0), least)
     kinds = scalars.factors(data.v, data.a)
     q, v, a, tau = (np.ascontiguousarray(x) for x in (data.q, data.v, data.a, data.tau))
-    return Measured(q, v, a, tau, scale, kinds)
+    return Measurements(q, v, a, tau, scale, kinds)
 
 
-def _in_handy_units(data: Measured, layout: np.ndarray) -> Measured:
+def _in_handy_units(data: Measurements, layout: np.ndarray) -> Measurements:
     """The torques in the unit in which random trees of 1 kg make such torques.
 
     Descents scale placements and bodies alike, so both should be about one. The bodies that are found in this unit are
     not looked at: only their geometry is.
     """
     rng, still = np.random.default_rng(0), replace(data, tau=np.zeros_like(data.tau))
-    trees = [TreeGuess.of(random_tree(len(layout) // 2, rng), layout, len(data.kinds)) for _ in range(_USUAL)]
+    trees = [TreeEstimate.of(random_tree(len(layout) // 2, rng), layout, len(data.kinds)) for _ in range(_USUAL)]
     usual = np.mean([np.square(tree.residual(still)).mean() for tree in trees])
     unit = np.sqrt(np.square(data.tau).mean() / usual)
     return replace(data, tau=data.tau / unit, scale=data.scale / unit)
@@ -203,24 +203,24 @@ def _layout(parents: Int[np.ndarray, " n"], prismatic: Bool[np.ndarray, " n"]) -
     return np.concatenate([[len(parents)], np.column_stack([parents, prismatic]).ravel()]).astype(np.int64)
 
 
-def _cost(descent: Descent[TreeGuess]) -> float:
+def _cost(descent: Descent[TreeEstimate]) -> float:
     return descent.cost if np.isfinite(descent.cost) else np.inf
 
 
 def _search(
-    data: Measured, layout: np.ndarray, starts: int, rng: np.random.Generator, progress: bool
-) -> tuple[list[Descent[TreeGuess]], bool]:
+    data: Measurements, layout: np.ndarray, starts: int, rng: np.random.Generator, progress: bool
+) -> tuple[list[Descent[TreeEstimate]], bool]:
     """Descents from random trees on a few samples, until one is good enough or the best has been met often enough.
 
     Also whether Ctrl-C ended it, which it does once there is a tree to go on with.
     """
     few = data.some(np.sort(rng.permutation(len(data.q))[:_FEW]))
-    descents: list[Descent[TreeGuess]] = []
+    descents: list[Descent[TreeEstimate]] = []
 
-    def descend(child: np.random.Generator) -> Descent[TreeGuess]:
-        start = TreeGuess.of(random_tree(len(layout) // 2, child), layout, len(data.kinds))
+    def descend(child: np.random.Generator) -> Descent[TreeEstimate]:
+        start = TreeEstimate.of(random_tree(len(layout) // 2, child), layout, len(data.kinds))
         return levenberg_marquardt(
-            start, lambda x: x.normal(few), lambda x: x.cost(few), TreeGuess.moved, iterations=150, patience=12
+            start, lambda x: x.normal(few), lambda x: x.cost(few), TreeEstimate.moved, iterations=150, patience=12
         )
 
     def label() -> str:
@@ -254,15 +254,17 @@ def _settled(costs: np.ndarray) -> bool:
     )
 
 
-def _polished(guess: TreeGuess, data: Measured) -> Descent[TreeGuess]:
+def _polished(guess: TreeEstimate, data: Measurements) -> Descent[TreeEstimate]:
     """The descent on all samples, then again with every joint weighted by what it was left with."""
-    even = levenberg_marquardt(guess, lambda x: x.normal(data), lambda x: x.cost(data), TreeGuess.moved)
+    even = levenberg_marquardt(guess, lambda x: x.normal(data), lambda x: x.cost(data), TreeEstimate.moved)
     left = np.sqrt(np.mean(np.square(even.at.residual(data)), axis=0))
     fair = replace(data, scale=np.maximum(left, _LEAST * data.scale))
-    return levenberg_marquardt(even.at, lambda x: x.normal(fair), lambda x: x.cost(fair), TreeGuess.moved)
+    return levenberg_marquardt(even.at, lambda x: x.normal(fair), lambda x: x.cost(fair), TreeEstimate.moved)
 
 
-def _physical(guess: TreeGuess, bodies: Bodies, data: Measured, strength: float, right_angles: bool) -> PhysicalTree:
+def _physical(
+    guess: TreeEstimate, bodies: Bodies, data: Measurements, strength: float, right_angles: bool
+) -> PhysicalTree:
     """The descent over placements and physical bodies together, then again with the angles that it leaves likely."""
     fair = replace(data, scale=bodies.report.noise)
 

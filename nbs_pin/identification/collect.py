@@ -58,7 +58,7 @@ def collect(
       "passive"    one swing from rest at zero with no torque, a sample every 1 ms: the paper's data, which cannot tell
                    M, G from c·M, c·G (docs/theory.md §6)
       "uniform"    independent states: q uniform in the ranges, a turn at most, |v| ≤ `speed`, random torques inside the
-                   limits; no arm can be measured so, but nothing is left unexcited
+                   limits; no arm can be measured so, but nothing is left unidentifiable
     samples: how many. seed: of everything random; the same seed gives the same data.
     noise: what encoders and torque sensors do to the record.
     acceleration: v̇ as the "simulator" knows it or "differentiated" from v (Savitzky–Golay); None is "simulator" unless

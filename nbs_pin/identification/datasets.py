@@ -1,4 +1,4 @@
-"""Measured motions to learn from: states, accelerations and torques, sorted into trajectories."""
+"""Measurements motions to learn from: states, accelerations and torques, sorted into trajectories."""
 
 import json
 from collections.abc import Mapping

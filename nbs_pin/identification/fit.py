@@ -50,7 +50,7 @@ def fit(
     if fault:
         raise ArgumentError(f"{fault}.")
     start = time.perf_counter()
-    train, test = parted(data, held_out, seed)
+    train, test = split_data(data, held_out, seed)
     fitted = fitter(FitTask(model, train, test, seed, robot, friction, progress, settings))
     bare = fitted.assemble(None)
     report = FitReport(
@@ -65,13 +65,13 @@ def fit(
         train_nmse=torque_nmse(bare, train, fitted.friction),
         test_nmse=None if test is None else torque_nmse(bare, test, fitted.friction),
         stopped=fitted.stopped,
-        unexcited=_useless(bare, train, fitted.friction) + fitted.unexcited,
+        unidentifiable=_useless(bare, train, fitted.friction) + fitted.unidentifiable,
         details=fitted.details,
     )
     return fitted.assemble(report)
 
 
-def parted(data: Dataset, held_out: Dataset | float | None = None, seed: int = 0) -> tuple[Dataset, Dataset | None]:
+def split_data(data: Dataset, held_out: Dataset | float | None = None, seed: int = 0) -> tuple[Dataset, Dataset | None]:
     """What is learned from, and what is held out for `fit` with these arguments; raises as `fit` does."""
     if isinstance(held_out, Dataset):
         fault = other_data_fault(data, held_out, "held_out")

@@ -38,7 +38,7 @@ class FitReport:
     stopped: str
     """Why it ended: "converged", "iterations", "held out" (no better there any more), "interrupted", or, of a chain,
     "starts": no other random tree met the best minimum, or no physical bodies reach it; give more data or starts."""
-    unexcited: tuple[str, ...]
+    unidentifiable: tuple[str, ...]
     """What the data leave open, the worst first."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """What only this kind of model has to say, as JSON can store it."""

@@ -21,7 +21,7 @@ from nbs_pin.identification.fit_report import FitReport
 from nbs_pin.identification.identify import identify
 from nbs_pin.identification.network_equations import deviation_of
 from nbs_pin.identification.network_fit import NetworkFit, fit_network
-from nbs_pin.identification.unidentifiable import unexcited
+from nbs_pin.identification.unidentifiable import unidentifiable
 from nbs_pin.robots.robot import Robot
 
 
@@ -60,7 +60,7 @@ class Fitted:
     held_out: tuple[float, ...] = ()
     evaluations: int = 0
     stopped: str = "converged"
-    unexcited: tuple[str, ...] = ()
+    unidentifiable: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -98,7 +98,7 @@ def fit_rigid_tree(task: FitTask) -> Fitted:
         history=tuple(found.history.tolist()),
         evaluations=found.evaluations,
         stopped=found.stopped,
-        unexcited=unexcited(network, task.data, friction=found.friction, names=names),
+        unidentifiable=unidentifiable(network, task.data, friction=found.friction, names=names),
         details={
             "starts": len(found.costs),
             "nmse_of_starts": found.costs.tolist(),
@@ -141,7 +141,7 @@ def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport 
         held_out=tuple(found.held_out),
         evaluations=found.evaluations,
         stopped=found.stopped,
-        unexcited=unexcited(found.network, task.data, friction=found.friction, loss=loss, names=names),
+        unidentifiable=unidentifiable(found.network, task.data, friction=found.friction, loss=loss, names=names),
     )
 
 
@@ -159,7 +159,7 @@ def fit_identified(task: FitTask) -> Fitted:
         friction=found.friction,
         parameters=numbers + (0 if found.friction is None else 2 * task.data.nv),
         evaluations=report.steps,
-        unexcited=report.unexcited,
+        unidentifiable=report.unidentifiable,
         details={"noise_Nm": np.asarray(report.noise).tolist(), "condition": float(report.condition)},
     )
 

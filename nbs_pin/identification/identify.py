@@ -59,7 +59,7 @@ class IdentificationReport:
     """How many of them the data say better than what was expected before any data."""
     condition: float
     """Largest over smallest singular value of the weighted regressor on the base parameters, in expected units."""
-    unexcited: tuple[str, ...]
+    unidentifiable: tuple[str, ...]
     """The other directions, least excited first: combinations of parameters that stay about as expected."""
     steps: int
     """Newton steps."""
@@ -137,7 +137,7 @@ def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation:
         base_parameters=base.shape[1],
         excited=base.shape[1] - len(weak),
         condition=float(values[0] / values[-1]) if values[-1] > 0.0 else np.inf,
-        unexcited=tuple(_direction(x, expected, scalars.names(geometry.names)) for x in weak),
+        unidentifiable=tuple(_direction(x, expected, scalars.names(geometry.names)) for x in weak),
         steps=fit.steps,
     )
     found = (fit.scalars * expected.scalars).reshape(-1, data.nv)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from nbs_pin.dynamics.pseudo_inertia import BASIS, coordinates, symmetric
 from nbs_pin.identification.levenberg_marquardt import Normal
 from nbs_pin.identification.regressor import Expected
-from nbs_pin.identification.tree_search import JOINT, PLACE, Measured, TreeGuess
+from nbs_pin.identification.tree_search import JOINT, PLACE, Measurements, TreeEstimate
 
 FREE, PARALLEL, RIGHT = 0, 1, 2
 
@@ -25,7 +25,7 @@ FREE, PARALLEL, RIGHT = 0, 1, 2
 class PhysicalTree:
     """Placements from `guess`, whose own bodies and friction are not looked at, and physical bodies and friction."""
 
-    guess: TreeGuess
+    guess: TreeEstimate
     factors: Float[np.ndarray, "n 4 4"]
     """L of the pseudo-inertias LLᵀ, in any order of columns."""
     drag: Float[np.ndarray, "kinds n"]
@@ -36,11 +36,11 @@ class PhysicalTree:
     angles: tuple[int, ...] = ()
     """FREE, PARALLEL or RIGHT: what the axis of each joint is held to make with its parent's; empty holds none."""
 
-    def whole(self) -> TreeGuess:
+    def whole(self) -> TreeEstimate:
         """The tree that the kernels see."""
         return replace(self.guess, bodies=self.factors @ self.factors.swapaxes(1, 2), drag=self.drag)
 
-    def cost(self, data: Measured) -> float:
+    def cost(self, data: Measurements) -> float:
         """The objective per residual."""
         local, share = self._in_units(), self.drag / self._usual()
         _, logarithm = np.linalg.slogdet(local)
@@ -48,7 +48,7 @@ class PhysicalTree:
         divergence += (share - np.log(share) - 1.0).sum()
         return self.whole().cost(data) + 2.0 * self.strength * float(divergence) / data.q.size
 
-    def normal(self, data: Measured) -> Normal:
+    def normal(self, data: Measurements) -> Normal:
         """The same with its normal equations in the steps of `moved`."""
         plain, chart, free = self.whole().normal(data), self._chart(), self._free()
         local, weight = self._in_units(), self.strength / data.q.size
@@ -60,7 +60,7 @@ class PhysicalTree:
         return Normal(self.cost(data), free.T @ gradient, free.T @ hessian @ free)
 
     def moved(self, step: Float[np.ndarray, " parameters"]) -> "PhysicalTree":
-        """The tree a step away, in the order of `TreeGuess.moved` without the directions that `angles` forbid."""
+        """The tree a step away, in the order of `TreeEstimate.moved` without the directions that `angles` forbid."""
         n, whole = len(self.factors), self._free() @ step
         inner = 3 + JOINT * n - PLACE
         bodies = np.concatenate([np.zeros(PLACE), whole[3:inner]]).reshape(n, JOINT)[:, PLACE:]
@@ -72,7 +72,7 @@ class PhysicalTree:
             drag=self.drag * np.exp(whole[inner:].reshape(self.drag.shape)),
         )
 
-    def at_right_angles(self, data: Measured, errors: float) -> "PhysicalTree":
+    def at_right_angles(self, data: Measurements, errors: float) -> "PhysicalTree":
         """The tree with every axis parallel or perpendicular to its parent's that is so within as many standard errors.
 
         They are from the curvature at this tree, which should be a minimum.
@@ -118,7 +118,7 @@ class PhysicalTree:
         return columns[:, keep]
 
     def _chart(self) -> np.ndarray:
-        """Derivative of the parameters of `TreeGuess` with respect to a step."""
+        """Derivative of the parameters of `TreeEstimate` with respect to a step."""
         n, kinds = len(self.factors), self.drag.size
         size = 3 + JOINT * n - PLACE + kinds
         chart = np.eye(size)

@@ -26,7 +26,7 @@ PLACE, JOINT = 6, 16
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class Measurements:
     """Rows of states and torques, and how much a residual of each joint counts."""
 
     q: Float[np.ndarray, "rows n"]
@@ -38,14 +38,14 @@ class Measured:
     kinds: Float[np.ndarray, "kinds rows n"]
     """What the torque of a joint is linear in beside the bodies (`regressor.Scalars`): v, its sign, v̇."""
 
-    def some(self, rows: np.ndarray) -> "Measured":
+    def some(self, rows: np.ndarray) -> "Measurements":
         """Those rows."""
         states = {name: np.ascontiguousarray(getattr(self, name)[rows]) for name in ("q", "v", "a", "tau")}
         return replace(self, **states, kinds=self.kinds[:, rows])
 
 
 @dataclass(frozen=True, eq=False)
-class TreeGuess:
+class TreeEstimate:
     """Placements and bodies of a tree, and friction.
 
     Bodies are any symmetric matrices here, as torque is linear in them: bounds that keep them physical make bad minima
@@ -61,10 +61,10 @@ class TreeGuess:
     bodies: Float[np.ndarray, "n 4 4"]
     """Pseudo-inertias [[Σ m xxᵀ, Σ m x], [·, m]]."""
     drag: Float[np.ndarray, "kinds n"]
-    """Coefficients of `Measured.kinds`: of friction, and rotor inertias."""
+    """Coefficients of `Measurements.kinds`: of friction, and rotor inertias."""
 
     @classmethod
-    def of(cls, tree: Tree, layout: np.ndarray, kinds: int) -> "TreeGuess":
+    def of(cls, tree: Tree, layout: np.ndarray, kinds: int) -> "TreeEstimate":
         """A tree without friction; the base frame becomes that of joint 0 at q = 0."""
         rotations, positions = Rotation.from_rotvec(tree.turns).as_matrix(), tree.positions.copy()
         base, at_base = rotations[0].copy(), layout[1::2] == 0
@@ -84,7 +84,7 @@ class TreeGuess:
             weights += [rotation.ravel(), position, body, np.zeros(1)]
         return Packed(self.layout, np.concatenate(weights))
 
-    def residual(self, data: Measured) -> Float[np.ndarray, "rows n"]:
+    def residual(self, data: Measurements) -> Float[np.ndarray, "rows n"]:
         """Torque [N·m] that is left to explain."""
         tree, tau = self.packed(), np.empty(data.q.shape)
 
@@ -95,11 +95,11 @@ class TreeGuess:
         _by_chunks(evaluate, len(tau))
         return data.tau - tau - self._dragged(data.kinds)
 
-    def cost(self, data: Measured) -> float:
+    def cost(self, data: Measurements) -> float:
         """Mean square of the weighted residuals."""
         return float(np.mean(np.square(self.residual(data) / data.scale)))
 
-    def normal(self, data: Measured) -> Normal:
+    def normal(self, data: Measurements) -> Normal:
         """The same with its normal equations in the parameters that `moved` takes steps of."""
 
         def evaluate(part: slice) -> tuple[float, np.ndarray, np.ndarray]:
@@ -124,7 +124,7 @@ class TreeGuess:
         bodies = np.concatenate(tables)[..., 3:].reshape(*q.shape, n, COLUMNS)[..., INERTIA:ROTOR]
         return (bodies @ _MOMENTS).reshape(*q.shape, 10 * n)
 
-    def moved(self, step: Float[np.ndarray, " parameters"]) -> "TreeGuess":
+    def moved(self, step: Float[np.ndarray, " parameters"]) -> "TreeEstimate":
         """The guess a step away: gravity, the body of joint 0, placement and body of each other joint, friction."""
         n = len(self.bodies)
         inner = 3 + JOINT * n - PLACE

@@ -19,7 +19,7 @@ _STILL = 0.1  # rad/s, rad/s²; where data move less, this is what they are aske
 _TERMS = ("inertia", "Coriolis torque", "gravity")
 
 
-def unexcited(
+def unidentifiable(
     network: LagrangianNetwork,
     data: Dataset,
     *,

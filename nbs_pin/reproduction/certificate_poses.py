@@ -20,7 +20,7 @@ from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import load_robot
 
 FILE = "inertia_bounds.csv"
-_TOGETHER = 5_000
+_BATCH = 5_000
 _ANGLES = 24
 
 
@@ -76,8 +76,8 @@ def on_arm(name: str, scale: Scale, seed: int = 0) -> Row:
         return np.asarray(np.linalg.eigvalsh(dynamics.mass_matrix(q))[:, [0, -1]])
 
     found, starts = [], []
-    for first in range(0, scale.samples, _TOGETHER):
-        q = rng.uniform(low, high, (min(_TOGETHER, scale.samples - first), robot.nv))
+    for first in range(0, scale.samples, _BATCH):
+        q = rng.uniform(low, high, (min(_BATCH, scale.samples - first), robot.nv))
         found.append(spectra(q))
         starts += [q[np.argsort(found[-1][:, 0])[: scale.climbs]], q[np.argsort(-found[-1][:, 1])[: scale.climbs]]]
     half = max(1, scale.climbs // 2)

@@ -33,7 +33,7 @@ TORQUE = 5.0
 """Bound on the disturbance of every joint of an arm [N·m]."""
 MODULI, DAMPINGS = (0.25, 0.5, 1.0, 2.0), (0.5, 1.0, 2.0)
 """μ = 2S [N·m/rad] and D [N·m·s/rad] of the laws for one joint."""
-_TOGETHER = 250
+_BATCH = 250
 _ONE_JOINT = (
     '<robot name="one_joint"><link name="base"/><link name="rotor"><inertial><mass value="1"/>'
     '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
@@ -181,8 +181,8 @@ def held(case: Case, scale: Scale, seed: int) -> Row:
     )
     steps = min(worst.disturbance.shape[0], scale.longest)
     rng, errors, joints = np.random.default_rng((seed, n)), [], []
-    for first in range(0, case.random, _TOGETHER):
-        count = min(_TOGETHER, case.random - first)
+    for first in range(0, case.random, _BATCH):
+        count = min(_BATCH, case.random - first)
         torques = random_disturbances(admissible, steps, case.period, count, rng)
         peaks = worst_of(controller, torques, reference, period=case.period, seed=seed)
         errors.append(peaks.error)

@@ -20,7 +20,7 @@ class Schedule(NamedTuple):
     """Control instants of a loop and the reference at them."""
 
     times: np.ndarray
-    """Instants [s], (rows,)."""
+    """LoopSamples [s], (rows,)."""
     leads: np.ndarray
     """How far ahead of each the law is evaluated [s], (rows,)."""
     desired: Reference

@@ -28,7 +28,7 @@ Engine: TypeAlias = Literal["kernels", "torch"]
 """Compiled kernels with adjoints written by hand, or the law and the plant in torch as they are written."""
 
 
-_TOGETHER = 256  # gradients of so many starts are kept apart, so that no thread waits and their sum is always the same
+_BATCH = 256  # gradients of so many starts are kept apart, so that no thread waits and their sum is always the same
 
 
 class Motions(NamedTuple):
@@ -225,7 +225,7 @@ class _ByKernels(torch.autograd.Function):
         law, batch, tau_d, scene, q, v, command, memory = ctx.saved
         q_bar, v_bar, command_bar = (np.array(x.numpy(), order="C") for x in cotangents)
         tau_d_bar, memory_bar, total = np.empty(command.shape), np.zeros(memory.shape), np.zeros(len(law.weights))
-        weights_bar = np.empty((min(len(batch), _TOGETHER), len(law.weights)))
+        weights_bar = np.empty((min(len(batch), _BATCH), len(law.weights)))
         size = rollout_workspace(law, scene)
 
         def run(part: slice) -> None:
@@ -237,8 +237,8 @@ class _ByKernels(torch.autograd.Function):
                 law_bar = Packed(law.layout, weights_bar[k - first])
                 rollout_adjoint(course, scene, law, work, motion, bars, tau_d_bar[k], law_bar)
 
-        for first in range(0, len(batch), _TOGETHER):
-            together = min(_TOGETHER, len(batch) - first)
+        for first in range(0, len(batch), _BATCH):
+            together = min(_BATCH, len(batch) - first)
             weights_bar[:] = 0.0
             over_cores(run, together, fewest=1)
             total += weights_bar[:together].sum(axis=0)

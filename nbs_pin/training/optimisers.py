@@ -8,23 +8,23 @@ import torch
 from nbs_pin.base.checks import positive
 from nbs_pin.base.exceptions import ArgumentError
 
-OptimiserName: TypeAlias = Literal["cautious", "adam", "lbfgs"]
+OptimiserName: TypeAlias = Literal["adam-backtracking", "adam", "lbfgs"]
 """Adam that goes back to the best parameters with half the step whenever the cost has risen by `RISE` of theirs;
 Adam with its step halved after every fifth of the epochs, as in the paper; or L-BFGS with a strong Wolfe line search.
 
 A sampled loop has cliffs, where gains become too high for the period and the cost leaps. Adam steps over them and then
 searches on the far side; a line search stops before them for good."""
-LEARNING_RATES: dict[str, float] = {"cautious": 1e-2, "adam": 1e-2, "lbfgs": 1.0}
+LEARNING_RATES: dict[str, float] = {"adam-backtracking": 1e-2, "adam": 1e-2, "lbfgs": 1.0}
 """Step of each unless another is asked for; the paper takes 1e-3 for Adam."""
 RISE = 0.02
-"""Share of the lowest cost by which "cautious" lets the cost rise."""
+"""Share of the lowest cost by which "adam-backtracking" lets the cost rise."""
 STAGES = 5
 
 
 def optimiser(name: str, parameters: Sequence[torch.nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
     """The optimiser of that name; raises ArgumentError for an unknown one or a rate that is not positive."""
     positive("learning_rate", learning_rate, "")
-    if name in ("adam", "cautious"):
+    if name in ("adam", "adam-backtracking"):
         return torch.optim.Adam(parameters, lr=learning_rate)
     if name == "lbfgs":
         # One iteration per epoch; its line search takes as many evaluations of the cost as it needs, mostly one.

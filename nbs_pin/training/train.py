@@ -41,7 +41,7 @@ def train(
     regulariser: Regulariser | None = None,
     gains: bool = True,
     epochs: int = 200,
-    optimiser: str = "cautious",
+    optimiser: str = "adam-backtracking",
     learning_rate: float | None = None,
     patience: int | None = None,
     seed: int = 0,
@@ -60,7 +60,7 @@ def train(
     same for motions that are never trained on and that choose the best epoch; None draws a quarter as many (none when
     starts are given). plant_step [s]: None takes one step per period, unlike `simulate`. disturbance: constant torque.
     cost: l; None takes `TorqueAware` with the effort limits. gains: whether S, Λ and D₀ are trained too, never below
-    their `least_share`. optimiser: "cautious", "adam" or "lbfgs" (`training/optimisers.py`). patience: epochs without a
+    their `least_share`. optimiser: "adam-backtracking", "adam" or "lbfgs" (`training/optimisers.py`). patience: epochs without a
     better held-out cost after which to stop. seed: of the starts drawn. checkpoint: a file kept up to date, from which
     `resume` goes on bit for bit. engine: None takes the fastest (`closed_loop.engine_for`).
     Ctrl-C ends training early and keeps the best, from the first epoch on.

@@ -196,9 +196,9 @@ class Trainer:
             self._set(stepped)
 
     def _has_risen(self, value: float) -> bool:
-        """Whether "cautious" goes back from this cost."""
+        """Whether "adam-backtracking" goes back from this cost."""
         lowest = self.at.history[self.at.best_epoch]
-        return self.task.optimiser == "cautious" and lowest is not None and value - lowest > RISE * abs(lowest)
+        return self.task.optimiser == "adam-backtracking" and lowest is not None and value - lowest > RISE * abs(lowest)
 
     def _closure(self) -> float:
         self.optimiser.zero_grad()
