@@ -75,7 +75,7 @@ from .simulation.dynamics_plant import DynamicsPlant as DynamicsPlant
 from .simulation.mujoco_plant import MujocoPlant as MujocoPlant
 from .simulation.plant import Plant as Plant
 from .simulation.simulate import simulate as simulate, stream as stream
-from .storage.checkpoints import load as load, save as save
+from .storage.checkpoints import about as about, load as load, save as save
 from .training.train import Training as Training, train as train
 
 __version__: str

@@ -173,9 +173,9 @@ def test_references_are_taken_in_turn_and_made_without_any(two_link):
         ({"rounds": "many"}, "rounds is many"),
         ({"starts": 0}, "starts"),
         ({"seed": -1}, "seed"),
-        ({"reference": 3.0}, "3.0 is no motion"),
-        ({"reference": [Hold([0.0, 0.0]), "fast"]}, "fast is no motion"),
-        ({"reference": lambda t: t}, "no motion"),
+        ({"reference": 3.0}, "3.0 is not a motion"),
+        ({"reference": [Hold([0.0, 0.0]), "fast"]}, "fast is not a motion"),
+        ({"reference": lambda t: t}, "is not a motion"),
         ({"reference": []}, "empty list"),
         ({"period": 0.0}, "period"),
         ({"duration": 0.0015}, "whole number"),
@@ -190,9 +190,9 @@ def test_what_is_no_law_with_a_model_is_refused(two_link, without_type_checks):
     """A PID, a compiled law, a certificate, an arm: each in one sentence."""
     robot = two_link.dynamics.robot
     for other in (nbs.PID.for_robot(robot), two_link.compile(), nbs.certify(two_link, [1.0, 1.0]), robot, None):
-        with pytest.raises(ArgumentError, match=f"a {type(other).__name__} is no law with a model"):
+        with pytest.raises(ArgumentError, match=f"a {type(other).__name__} is not a law with a model"):
             attack(other, [1.0, 1.0])
-        with pytest.raises(ArgumentError, match="is no law with a model"):
+        with pytest.raises(ArgumentError, match="is not a law with a model"):
             worst_of(other, np.zeros((2, 10, 2)))
     with pytest.raises(ArgumentError, match="expected numbers"):
         attack(two_link, nbs.certify(two_link, [1.0, 1.0]))

@@ -44,7 +44,7 @@ def test_compare_names_what_moved_by_more_than_a_tenth():
     }
     assert bench.compare(new, bench.rows_of(old)) == [("control step/panda/nbs", "p50_us", 10.0, 12.0)]
     for wrong in ({}, [], {"rows": [{}]}, {"rows": 1}):
-        with pytest.raises(ArgumentError, match=r"is no summary\.json of a bench"):
+        with pytest.raises(ArgumentError, match=r"is not a summary\.json of a bench"):
             bench.rows_of(wrong)
 
 
@@ -64,7 +64,7 @@ def test_the_command_writes_its_summary_and_picture(tmp_path, monkeypatch, capsy
     assert (tmp_path / "b" / "joints.png").stat().st_size > 5000
     (tmp_path / "no.json").write_text("{")
     assert main(["bench", "--compare", str(tmp_path / "no.json")]) == 2
-    assert "is no JSON" in capsys.readouterr().err
+    assert "is not JSON" in capsys.readouterr().err
 
 
 def test_too_few_calls_are_refused():

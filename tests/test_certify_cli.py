@@ -149,21 +149,21 @@ def test_a_motion_beyond_its_bound_is_told_why(tmp_path, capsys):
     assert found["exceeds"]
     assert found["certified_over_found"] < 1.0
     assert str(Assumption.TIME) in found["verdict"]
-    assert f"WORSE THAN ITS BOUND; that motion held against the certificate: {found['verdict']}" in printed
+    assert f"BOUND EXCEEDED; the check of this motion against the certificate: {found['verdict']}" in printed
 
 
 def test_bounds_whose_conditions_fail_are_kept_and_said_to_be_no_promise(tmp_path, capsys):
-    """Torques that no motor holds against, under which the adversary's motions leave the finite numbers."""
+    """Torques that no motor holds against, under which the adversary's motions diverge."""
     assert run(tmp_path / "a", "two_link", "--disturbance", "1e6") == 0
     figures, printed = summary(tmp_path / "a")["figures"], capsys.readouterr().out
     certificate = figures["certificate"]
     assert certificate["label"] == "EMPIRICAL"
     assert any(name.startswith("effort limit of joint") for name in certificate["void"])
-    last = f"EMPIRICAL: the bounds are not promised, as this does not hold here: {'; '.join(certificate['void'])}"
+    last = f"EMPIRICAL: the bounds are void, as these conditions fail: {'; '.join(certificate['void'])}"
     assert printed.splitlines()[-3] == last
     assert figures["attack"] is None
-    assert "left the finite numbers" in figures["attack_diverged"]
-    assert f"no worst motion to hold beside the bounds: {figures['attack_diverged']}" in printed
+    assert "diverged" in figures["attack_diverged"]
+    assert f"no worst motion to compare with the bounds: {figures['attack_diverged']}" in printed
     assert (tmp_path / "a" / "certificate.png").read_bytes().startswith(PNG)
 
 
@@ -248,12 +248,12 @@ def test_results_of_another_certificate_are_kept(certified, capsys):
         (["two_link", "--disturbance", "-1"], "--disturbance is '-1'"),
         (["two_link", "--disturbance", "1,2,3"], "3 torques were given for 2 joints"),
         (["two_link", "--disturbance", "1,2", "--norm"], "a norm is one number"),
-        (["two_link", "--norm", "--payload", "1"], "--norm is about --disturbance"),
-        (["two_link", "--disturbance", "5", "--link", "tip"], "--link is about --payload"),
-        (["two_link", "--disturbance", "5", "--margin", "2"], "--margin is about --payload, --friction, --gravity"),
+        (["two_link", "--norm", "--payload", "1"], "--norm needs --disturbance"),
+        (["two_link", "--disturbance", "5", "--link", "tip"], "--link needs --payload"),
+        (["two_link", "--disturbance", "5", "--margin", "2"], "--margin needs one of --payload, --friction, --gravity"),
         (
             ["two_link", "--disturbance", "5", "--trajectories", "9"],
-            "--trajectories is about a model that is not exact",
+            "--trajectories applies to a model that is not exact",
         ),
         (["two_link", "--payload", "0"], "--payload is '0'"),
         (["two_link", "--payload", "1", "--link", "moon"], "no moving link 'moon'"),
@@ -263,7 +263,7 @@ def test_results_of_another_certificate_are_kept(certified, capsys):
         (["two_link", "--disturbance", "99", "--wanted", "0.1"], "no gains can help"),
         (["law.nbs", "--disturbance", "5", "--wanted", "0.1"], "give an arm"),
         (["two_link", "--disturbance", "5", "--reference", "moon"], "no reference 'moon'"),
-        (["panda", "--disturbance", "5", "--reference", "paper"], "the joint limits is too small for the reference"),
+        (["panda", "--disturbance", "5", "--reference", "paper"], "with its error leaves the joint limits"),
         (["no_arm", "--disturbance", "5"], "no robot 'no_arm'"),
         (["two_link", "--disturbance", "5", "--against", "panda"], "the controller has 2 joints and panda 7"),
         (["two_link", "--disturbance", "5", "--monitor", "none.npz"], "none.npz"),

@@ -209,9 +209,9 @@ def test_with_the_parameters_of_an_arm_the_chain_is_the_arm(name):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (((0, 2), (False, False)), r"parents \[0, 2\] .* make no tree"),
-        (((-1,), (False,)), "make no tree"),
-        (((0, 1), (False,)), "make no tree"),
+        (((0, 2), (False, False)), r"parents \[0, 2\] .* do not form a tree"),
+        (((-1,), (False,)), "do not form a tree"),
+        (((0, 1), (False,)), "do not form a tree"),
         (((0,), (False,), 0.0), "epsilon is 0.0"),
         (((0,), (False,), float("nan")), "epsilon is nan"),
     ],
@@ -646,7 +646,7 @@ def test_settings_that_cannot_be_meant_are_refused(options, words):
 
 def test_a_motion_without_torque_is_refused():
     data = dataset(scrambled(*BRANCHED), 50)
-    with pytest.raises(ArgumentError, match="arms of every scale move so"):
+    with pytest.raises(ArgumentError, match="arms of every scale move alike"):
         fit_chain(replace(data, tau=0.0 * data.tau))
 
 

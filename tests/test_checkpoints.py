@@ -474,14 +474,14 @@ def test_tensors_that_make_no_controller_are_refused(path, change, message):
         (lambda d: d["controller"].update(kind=["PID"]), "is unknown"),
         (lambda d: d["controller"].update(apha=1.0), "'apha' of NeuralBackstepping is unknown"),
         (lambda d: d["controller"].pop("friction"), "'friction' of NeuralBackstepping is missing"),
-        (lambda d: d["controller"].update(inertial_rate="fast"), "make no controller"),
+        (lambda d: d["controller"].update(inertial_rate="fast"), "do not form a controller"),
         (lambda d: d["controller"].update(inertial_rate=-1.0), "give a number ≥ 0"),
         (lambda d: d["controller"]["potential"].update(form="rough"), "potential 'rough' is unknown"),
         (lambda d: d["controller"]["potential"]["activation"].update(b=-1.0), "give a positive number"),
-        (lambda d: d["controller"].update(potential=None), "make no controller"),
-        (lambda d: d["controller"].update(dynamics=d["controller"]["potential"]["activation"]), "make no controller"),
+        (lambda d: d["controller"].update(potential=None), "do not form a controller"),
+        (lambda d: d["controller"].update(dynamics=d["controller"]["potential"]["activation"]), "do not form a"),
         (lambda d: d["controller"]["dynamics"].update(robot={"kind": "Squareplus", "b": 1.0}), "is a Squareplus"),
-        (lambda d: d["controller"]["dynamics"].update(robot=None), "make no controller"),
+        (lambda d: d["controller"]["dynamics"].update(robot=None), "do not form a controller"),
         (lambda d: d["controller"]["dynamics"]["robot"].update(sha256=1), "'sha256' of the arm is 1"),
         (lambda d: d["controller"]["dynamics"]["robot"].update(effort_limit=[1.0]), "effort limit is"),
         (lambda d: d["controller"]["dynamics"]["robot"]["options"].update(spin=1), "options that this version"),
@@ -490,10 +490,10 @@ def test_tensors_that_make_no_controller_are_refused(path, change, message):
             r"gravity is .1.0, 2.0.",
         ),
         (lambda d: d.update(controller=[]), "kind None is unknown"),
-        (lambda d: d.update(controller=d["controller"]["potential"]), "a Potential is no controller"),
-        (lambda d: d.update(controller=d["controller"]["dynamics"]["robot"]), "a Robot is no controller"),
-        (lambda d: d.update(more=1), "not what we write"),
-        (lambda d: d.pop("versions"), "not what we write"),
+        (lambda d: d.update(controller=d["controller"]["potential"]), "a Potential is neither a controller"),
+        (lambda d: d.update(controller=d["controller"]["dynamics"]["robot"]), "a Robot is neither a controller"),
+        (lambda d: d.update(more=1), "expected other keys"),
+        (lambda d: d.pop("versions"), "expected other keys"),
     ],
 )
 def test_settings_that_make_no_controller_are_refused(path, change, message):
@@ -518,7 +518,7 @@ def test_entries_and_formats_that_are_not_ours_are_refused(path):
         nbs.load(path)
     for wrong in ({**entries, "code.py": b""}, {**entries, "training.json": b"{}"}, {"controller.json": b"{}"}, {}):
         reseal(path, wrong)
-        with pytest.raises(FileFormatError, match="not what a checkpoint holds"):
+        with pytest.raises(FileFormatError, match="not the entries of a checkpoint"):
             nbs.load(path)
     reseal(path, {**entries, "controller.safetensors": b"\xff" * 20})
     with pytest.raises(FileFormatError, match=r"'controller.safetensors' is damaged"):

@@ -200,7 +200,7 @@ REFUSED = {
     "track": "ROBOT",
     "track pand": "did you mean panda?",
     "track no/arm.urdf": "no file 'no/arm.urdf'",
-    "track panda x": "cannot use the word 'x'",
+    "track panda x": "takes no argument 'x'",
     "track panda --durtion 3": "did you mean --duration?",
     "track panda --duration": "Missing value for argument '--duration'",
     "track panda --plant gazebo": "--plant is 'gazebo'; give mujoco, pinocchio.",
@@ -219,7 +219,7 @@ REFUSED = {
     "track two_link --disturbance constant:1,2,3": "3 torques for 2 joints",
     "track two_link --out /proc/nowhere": "'/proc/nowhere': no such file",
     "replay none.npz": "'none.npz': no such file",
-    "robots panda": "cannot use the word 'panda'",
+    "robots panda": "takes no argument 'panda'",
     **{
         f"track panda {flag} {value}": f"{flag} is '{value}'"
         for flag, values in {

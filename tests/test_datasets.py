@@ -153,7 +153,7 @@ def test_numbers_of_other_kinds_become_float64():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"q": [[1.0, 2.0], [3.0]]}, "dataset's q is .*equal rows"),
+        ({"q": [[1.0, 2.0], [3.0]]}, "dataset's q is .*rows of equal length"),
         ({"tau": "none"}, "dataset's tau is none"),
         ({"trajectory": np.full(12, 0.5)}, "trajectory is .*expected whole numbers"),
         ({"trajectory": np.full(12, np.nan)}, "trajectory is .*expected whole numbers"),
@@ -486,7 +486,7 @@ SPOILT = {
     "all in degrees": ({"q": DEGREES, "v": DEGREES, "a": DEGREES}, "looks like degrees; give degrees=True"),
     "v in degrees": ({"v": DEGREES, "a": DEGREES}, "v of joint .* convert v from degrees"),
     "a in degrees": ({"a": DEGREES}, "a of joint .* convert a from degrees"),
-    "v turned round": ({"v": -1.0}, "signs is turned round, so correct v"),
+    "v turned round": ({"v": -1.0}, "signs is wrong, so correct v"),
     "a in other units": ({"a": 0.1}, "a of joint .* changes 10 times"),
     "a at random": ({"a": "shuffled"}, "a of joint .* leave a out"),
 }
@@ -530,7 +530,7 @@ def test_logs_from_which_nothing_can_be_learned_are_told(tmp_path, measured):
     with pytest.warns(UserWarning, match="one trajectory"):
         load_log(write_csv(tmp_path / "one.csv", columns(one, leave_out=("trajectory",))))
     np.savez(tmp_path / "idle.npz", **{k: getattr(measured, k) for k in ARRAYS[:6] if k != "tau"}, tau=0 * measured.tau)
-    with pytest.warns(UserWarning, match="no torque but zero"):
+    with pytest.warns(UserWarning, match="only zero torque"):
         load_log(tmp_path / "idle.npz")
 
 

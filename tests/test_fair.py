@@ -88,7 +88,7 @@ def test_a_longer_training_that_betters_nothing_is_not_taken(monkeypatch):
         return Training(law, held_out, held_out, int(held_out.argmin()), "epochs", 0.0)
 
     monkeypatch.setattr(fair, "train", given)
-    monkeypatch.setattr(fair, "_built", lambda *_: law)
+    monkeypatch.setattr(fair, "build_law", lambda *_, **__: law)
     tuned = fair.tune(SMALL, "computed torque")
     assert tuned.learning_rate == score(tuned.training) == min(fair.LEARNING_RATES)
 
@@ -152,14 +152,14 @@ def test_the_protocol_is_made_from_the_settings(rows, monkeypatch):
 )
 def test_a_lead_of_less_than_a_period_is_told(second, words):
     ours = fair.Row("two_link", 0.02, 1.0, "NBS, trained", 0.5, 0.7, 1e-9, 90.0, 20.0, 0.1)
-    other = replace(ours, law="PD+", convergence_time_median_s=second)
+    other = ours._replace(law="PD+", convergence_time_median_s=second)
     told = fair._findings([other, ours] if second > 0.5 else [ours, other])
     assert words in told
-    assert ", as it was built" in fair._findings([replace(ours, checking_cost=0.2, checking_cost_tuned=0.2)] * 2)
+    assert ", as it was built" in fair._findings([ours._replace(checking_cost=0.2, checking_cost_tuned=0.2)] * 2)
     assert told.endswith("Trained NBS: median 0.500 s, worst start 0.700 s, steady error 1.0e-09 rad².")
 
 
 def test_no_law_is_first_where_none_converges():
     row = fair.Row("two_link", 0.02, 1.0, "NBS, trained", math.inf, math.inf, math.nan, math.nan, math.nan, math.nan)
-    assert "no law converges from most starts. " in fair._findings([row, replace(row, law="PID")])
+    assert "no law converges from most starts. " in fair._findings([row, row._replace(law="PID")])
     assert fair._tables([row]).count("not finite") == 4

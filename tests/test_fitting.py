@@ -311,7 +311,7 @@ def test_data_of_another_arm_are_refused():
 @pytest.mark.parametrize("change", [{"parents": np.array([0, 0])}, {"prismatic": np.array([True, False])}])
 def test_data_of_another_tree_are_refused(change):
     data, other = states(20), replace(states(20), **change)
-    with pytest.raises(ArgumentError, match=r"those of two_link turning on the base, turning on joint 1; give the arm"):
+    with pytest.raises(ArgumentError, match=r"those of two_link revolute on the base, revolute on joint 1; give"):
         fit(other, "identified", robot=ROBOT)
     with pytest.raises(ArgumentError, match="the joints of held_out are"):
         fit(data, "identified", robot=ROBOT, held_out=other)

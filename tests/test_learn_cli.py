@@ -128,7 +128,7 @@ def test_what_cannot_be_meant_is_refused(path, tmp_path, capsys, options, words)
 def test_data_of_another_arm_are_refused(tmp_path, capsys):
     collect(nbs.load_robot("panda"), "uniform", 40).save(tmp_path / "panda.npz")
     assert run(tmp_path / "panda.npz", tmp_path / "out", "--robot", "xarm7") == 2
-    assert "the data are of panda, not of xarm7; give the arm they are of" in capsys.readouterr().err
+    assert "the data are of panda, not of xarm7; give the arm they were recorded on" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from nbs_pin.identification.collect import collect
 from nbs_pin.identification.fit import fit
 from nbs_pin.motions.references import paper_reference
 from nbs_pin.reports.markdown import Section, page
-from nbs_pin.reproduction import figure5, learned_loop, passive_data
+from nbs_pin.reproduction import figure5, learned_loop, passive_data, study
 from nbs_pin.reproduction.figure5 import Weightless
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.simulation import metrics
@@ -190,7 +189,7 @@ def small(tmp_path_factory, chain):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learned_loop, "ARMS", ("three_link",))
         patch.setattr(learned_loop, "learn_chains", lambda *_: chains)
-        patch.setattr(passive_data, "cores", lambda: 1)
+        patch.setattr(study, "cores", lambda: 1)
         return folder, learned_loop.reproduce_learned(folder, seed=3, scale=SMALL)
 
 
@@ -215,18 +214,15 @@ def test_the_page_and_the_files_carry_what_was_found(small):
     assert 'refuses: "' in text
 
 
-def test_the_sentences_follow_the_numbers(small):
+def test_the_sentences_follow_the_numbers(small, tmp_path):
     _, sections = small
     rows = [learned_loop.Row(**entry) for entry in sections[0].figures["learned_loop"]]
-    told = [replace_ratio(row) if row.law == learned_loop.CLEAN else row for row in rows]
+    told = [row._replace(ratio=1.2345) if row.law == learned_loop.CLEAN else row for row in rows]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learned_loop, "ARMS", ("three_link",))
-        assert "at most 1.234500 times" in learned_loop._section(told, replace(SMALL, samples=77), 3).markdown
-        assert "from 77 clean samples" in learned_loop._section(told, replace(SMALL, samples=77), 3).markdown
-
-
-def replace_ratio(row):
-    return row._replace(ratio=1.2345)
+        text = learned_loop._section(told, SMALL._replace(samples=77), 3, tmp_path).markdown
+    assert "at most 1.234500 times" in text
+    assert "from 77 clean samples" in text
 
 
 def test_the_command_has_the_part(tmp_path, monkeypatch):

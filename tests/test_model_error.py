@@ -491,7 +491,7 @@ def test_a_map_needs_two_joints_of_the_arm(joints):
 
 
 def test_doubt_is_a_chance(run):
-    with pytest.raises(ArgumentError, match="expected a chance"):
+    with pytest.raises(ArgumentError, match="expected a probability"):
         mismatch.mismatch(TRUTH, TRUTH, run, doubt=0.0)
 
 

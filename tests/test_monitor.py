@@ -410,7 +410,7 @@ def test_what_is_no_certificate_or_no_run_is_refused(law, certificate, without_t
         monitor(run, law)
     with pytest.raises(ArgumentError, match="give the certificate"):
         Watch(law)
-    with pytest.raises(ArgumentError, match="is no run"):
+    with pytest.raises(ArgumentError, match="is not a Run"):
         monitor(certificate, certificate)
 
 

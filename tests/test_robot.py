@@ -200,7 +200,7 @@ def test_what_is_not_found_says_what_exists(tmp_path):
     assert isinstance(caught.value, FileNotFoundError)
     with pytest.raises(RobotNotFound, match=r"no file '.*gone\.urdf'"):
         load_robot(tmp_path / "gone.urdf")
-    with pytest.raises(RobotNotFound, match=r"is a directory; give one file in it \(no \.urdf lies here\)"):
+    with pytest.raises(RobotNotFound, match=r"is a directory; give one file in it \(it contains no \.urdf\)"):
         load_robot(tmp_path)
     (tmp_path / "arm.urdf").write_text("<robot/>")
     with pytest.raises(RobotNotFound, match=r"give one file in it \(arm\.urdf\)"):

@@ -354,7 +354,7 @@ class Raw(Counter):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_torque_that_is_not_finite_stops_the_run_before_any_clip(value):
-    with pytest.raises(SimulationDiverged, match=r"Raw asked for the torque .* at t = 0\.03 s"):
+    with pytest.raises(SimulationDiverged, match=r"Raw commanded the torque .* at t = 0\.03 s"):
         simulate(PLANT, Raw([0.0, value]), STILL, 0.1, 0.01, effort_limit=1.0)
 
 
@@ -372,7 +372,7 @@ def test_a_disturbance_that_is_not_finite_stops_the_run():
 def test_an_unstable_loop_is_reported_with_its_time_and_no_warnings():
     wild = Law(lambda q, v, ref: 1e4 * q**3)
     plant = DynamicsPlant(Masses(), "euler")
-    with pytest.raises(SimulationDiverged, match=r"Law asked for the torque .*inf.* at t = 0\.\d+ s"):
+    with pytest.raises(SimulationDiverged, match=r"Law commanded the torque .*inf.* at t = 0\.\d+ s"):
         simulate(plant, wild, STILL, 1.0, 0.01, q0=[1.0, 1.0], plant_step=0.01)
 
 

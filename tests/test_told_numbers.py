@@ -49,7 +49,7 @@ def test_the_bandwidth_that_a_warning_names_is_the_largest_without_it(name):
     largest = told(message, "take at most")
     assert not warned(lambda: warn_if_too_fast(robot, dynamics, largest * (1.0 - 6e-3)))  # told in three digits
     assert warned(lambda: warn_if_too_fast(robot, dynamics, largest * (1.0 + 6e-3)))
-    share = told(message, "of \\w+ for")
+    share = told(message, f"of {name} for")
     assert share == pytest.approx(6.0 * (100.0 / largest) ** 2, rel=0.02)
 
 

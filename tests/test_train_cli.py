@@ -161,7 +161,7 @@ def test_ctrl_c_at_any_moment_and_resume_are_one_training(folder, tmp_path, caps
     assert summary(tmp_path / "parts")["interrupted"]
     assert len(summary(tmp_path / "parts")["history"]) in range(1, 7)
     assert train(tmp_path / "parts", *options) == 2  # neither --resume nor --force
-    assert "--resume to go on with it" in capsys.readouterr().err
+    assert "--resume to continue it" in capsys.readouterr().err
     assert train(tmp_path / "parts", *options, "--resume") == 0
     assert outcome(tmp_path / "parts") == outcome(whole)
 

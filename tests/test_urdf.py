@@ -194,7 +194,7 @@ def test_u3_another_format(root, tmp_path):
 
 
 def test_u9_a_long_axis_is_normalised_with_a_warning(tmp_path):
-    with pytest.warns(UserWarning, match=r"arm\.urdf:10: joint 'j1': axis xyz '0.0 3.0 4.0' is no unit vector"):
+    with pytest.warns(UserWarning, match=r"arm\.urdf:10: joint 'j1': axis xyz '0.0 3.0 4.0' is not a unit vector"):
         urdf = read_urdf(write(tmp_path, mutated('"0 0 1"', '"0 3 4"')))
     assert b'xyz="0.0 0.6 0.8"' in urdf.without_geometry()
     read_urdf(write(tmp_path, mutated('"0 0 1"', '"0 0 0.99999999"')))  # rounding is silent

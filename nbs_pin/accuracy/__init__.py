@@ -1,1 +1,1 @@
-"""How far a model is from another."""
+"""Comparison of dynamics models."""

@@ -1,7 +1,4 @@
-"""How far a model of an arm is from the truth: M, C v, G, inverse and forward dynamics, and where the error grows.
-
-Any two dynamics providers can be compared; what a relative error is stands in `accuracy/relative_errors.py`.
-"""
+"""Errors of a dynamics model relative to a true one, as defined in `accuracy/relative_errors.py`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,76 +18,76 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
-"""Shares of the box's speed at which `ModelErrors.by_speed` looks."""
+"""Multiples of the box's speed in `ModelErrors.by_speed`."""
 DISTANCES = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
-"""Sizes of the box, on whose surface `ModelErrors.by_distance` looks."""
+"""Scale factors of the box in `ModelErrors.by_distance`."""
 _GROWTH_SAMPLES, _RUN_STATES = 500, 5_000
 
 
 class Growth(NamedTuple):
-    """How the errors change with speed, or with the distance from the middle of the box."""
+    """Errors as a function of speed, or of the distance from the centre of the box."""
 
     at: tuple[float, ...]
-    """Shares of the box's speed, or sizes of the box; 1 is the box itself."""
+    """Multiples of the box's speed or of its size; 1 is the box itself."""
     errors: tuple[Errors, ...]
-    """The errors there."""
+    """Errors at these multiples."""
 
 
 class Scale(NamedTuple):
-    """The one factor by which all torques of a model may be wrong: free motion alone cannot tell it."""
+    """Common scale factor of all torques of a model, which free motion does not determine (docs/theory.md §6)."""
 
     factor: float
-    """c with τ ≈ c τ̂ in least squares; 1 for a model whose scale is right (docs/theory.md §6)."""
+    """c with τ ≈ c τ̂ in least squares; 1 for a model with the correct scale."""
     error: float
-    """Relative error of c τ̂, never above that of τ̂: small beside `inverse` where only the scale is wrong."""
+    """Relative error of c τ̂, at most that of τ̂; small compared with `inverse` if only the scale is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModelErrors:
-    """What `compare` found; relative errors are Frobenius ones over the samples (0.01 is one per cent)."""
+    """Result of `compare`; relative errors are in the Frobenius norm over the samples (0.01 is one per cent)."""
 
     mass_matrix: float
     """‖M̂ − M‖_F/‖M‖_F."""
     coriolis: float
-    """The same of C(q, v) v."""
+    """Relative error of C(q, v) v."""
     gravity: float
-    """The same of G; inf for an arm without gravity whose model has some."""
+    """Relative error of G; inf if only the model has gravity."""
     inverse: float
-    """The same of the torque M v̇ + C v + G for uniform v̇."""
+    """Relative error of the torque M v̇ + C v + G for uniformly distributed v̇."""
     forward: float
-    """The same of the acceleration under the true torque for those v̇."""
+    """Relative error of the acceleration under the true torque for these v̇."""
     torque_nmse: float
-    """Mean over joints of the torque's mean squared error ÷ variance."""
+    """Mean squared error of the torque ÷ its variance, averaged over the joints."""
     torque_rms: JointArray
     """Root mean square of the torque error per joint [N·m]."""
     torque_deviation: JointArray
     """Standard deviation of the true torque per joint [N·m]."""
     eigenvalue_margin: float
-    """Least eigenvalue of M̂ over the samples [kg·m²]; positive, or the model is none."""
+    """Smallest eigenvalue of M̂ over the samples [kg·m²]; positive for a valid model."""
     mass_ratio: tuple[float, float]
     """(lo, hi) with lo·M ⪯ M̂ ⪯ hi·M at every sample; (1, 1) for the truth."""
     energy_drift: float
-    """How far the true energy strays along the model's free motion, worst start and time; NaN without motions."""
+    """Largest relative deviation of the true energy along free motions of the model; NaN without motions."""
     scale: Scale
-    """The best common factor of all torques."""
+    """Best common factor of all torques."""
     by_speed: Growth
-    """Errors for |v_i| up to these shares of the box's speed."""
+    """Errors for |v_i| up to multiples of the box's speed."""
     by_distance: Growth
-    """Errors on the surface of the box, shrunk and grown about its middle by these factors."""
+    """Errors on the surface of the box scaled about its centre."""
     each: Errors
-    """The samples' own errors, (samples,) each, as shares of the RMS size."""
+    """Errors of the samples, (samples,) each, relative to the RMS size."""
     motion: FreeMotion | None
-    """Free motions of both from the same starts, or None where none were asked for."""
+    """Free motions of both models from the same initial states, or None if `motions` was 0."""
     box: Box
-    """Where the samples are."""
+    """Box from which the samples are drawn."""
     samples: int
-    """How many they are."""
+    """Number of samples."""
     seed: int
-    """Of the samples."""
+    """Seed of the samples."""
     along_run: Errors | None = None
-    """Errors over the states of the run and the accelerations the truth has there."""
+    """Errors over the states of the run and the true accelerations there."""
     mismatch: Mismatch | None = None
-    """δ along the run, and the bound it keeps (`accuracy/mismatch.py`)."""
+    """δ along the run and its bound (`accuracy/mismatch.py`)."""
 
     @property
     def errors(self) -> Errors:
@@ -110,15 +107,25 @@ def compare(
     *,
     friction: JointFriction | None = None,
 ) -> ModelErrors:
-    """How far the model is from the truth on `samples` uniform states of a box, beyond it, and along a run.
+    """Errors of a model relative to the truth on uniformly drawn states of a box, outside the box, and along a run.
 
-    speed: |v_i| up to this [rad/s], one number or one per joint. box: (lower, upper) [rad], each one number or one per
-    joint, for instance where the data of the fit lie; None takes the position limits of the truth's arm, a whole turn
-    where they allow it. run: a closed loop with the truth as its plant; several starts make the bound on δ say
-    something of further ones (`accuracy/mismatch.py`). motions: free ones from random states of the box; 0 saves their time.
-    friction: of that plant; it is no part of M, C, G, but v̇ along the run is wrong without it.
-    Joints that slide are compared in their own units beside those that turn, as M has them.
-    Raises ArgumentError for another number of joints, an empty box, or a model that is not finite at some sample.
+    Args:
+        speed: Largest |v_i| [rad/s, m/s], one number or one per joint.
+        box: (lower, upper) [rad, m], each one number or one per joint, for instance the range of the fitted data. None
+            takes the position limits of the truth's arm, at most one turn.
+        run: Closed loop with the truth as plant, for `along_run` and `mismatch`. Its bound on δ extends to further
+            starts only if the run has many.
+        motions: Number of free motions from random states of the box; 0 skips them.
+        friction: Friction of the plant of `run`, needed for v̇ along it; not part of M, C, G.
+
+    Raises:
+        ArgumentError: If numbers of joints differ, the box is empty, or the model is not finite at some sample.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> model, truth = nbs.AnalyticDynamics(masses=(1.0, 1.1)), nbs.AnalyticDynamics()
+        >>> round(nbs.compare(model, truth, samples=100, motions=0).inverse, 3)
+        0.075
     """
     check_joints(model, truth)
     if samples < 2 or samples != int(samples):
@@ -153,16 +160,16 @@ def compare(
 
 
 def box_of(model: DynamicsProvider, truth: DynamicsProvider, box: Sequence[PerJoint] | None, speed: PerJoint) -> Box:
-    """The box that `compare` looks in for these arguments."""
+    """The box of `compare` for these arguments."""
     if box is None:
         return Box.of_robot(truth.robot or model.robot, truth.nv, speed)
     if len(box) != 2:
-        raise ArgumentError(f"the box has {len(box)} parts, expected two: (lower, upper).")
+        raise ArgumentError(f"the box has {len(box)} parts, expected two; give (lower, upper).")
     return Box.of(box[0], box[1], speed, truth.nv)
 
 
 def _eigenvalues(modelled: np.ndarray, true: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """Least eigenvalue of M̂, and the range of those of M^−½ M̂ M^−½."""
+    """Smallest eigenvalue of M̂, and the range of the eigenvalues of M^−½ M̂ M^−½."""
     modelled = 0.5 * (modelled + np.swapaxes(modelled, -1, -2))
     root = np.linalg.inv(np.linalg.cholesky(true))
     ratios = np.linalg.eigvalsh(root @ modelled @ np.swapaxes(root, -1, -2))
@@ -170,7 +177,7 @@ def _eigenvalues(modelled: np.ndarray, true: np.ndarray) -> tuple[float, tuple[f
 
 
 def best_scale(true: Float[np.ndarray, "samples n"], modelled: Float[np.ndarray, "samples n"]) -> Scale:
-    """The one factor that brings the modelled torques nearest to the true ones [N·m]."""
+    """The common factor of the modelled torques that fits the true torques best in least squares."""
     factor = float(share(np.vdot(true, modelled), np.vdot(modelled, modelled)))
     return Scale(factor, float(share(np.linalg.norm(true - factor * modelled), np.linalg.norm(true))))
 
@@ -178,7 +185,7 @@ def best_scale(true: Float[np.ndarray, "samples n"], modelled: Float[np.ndarray,
 def _growth(
     model: DynamicsProvider, truth: DynamicsProvider, box: Box, rng: np.random.Generator
 ) -> tuple[Growth, Growth]:
-    """Errors by speed and by distance, of the same draws but for what is scaled."""
+    """Errors by speed and by distance, from the same random draws."""
     q, v, a = box.states(rng, _GROWTH_SAMPLES)
     u = rng.uniform(-1.0, 1.0, q.shape)
     surface = u / np.abs(u).max(axis=1, keepdims=True)
@@ -188,7 +195,7 @@ def _growth(
 
 
 def _along(model: DynamicsProvider, truth: DynamicsProvider, run: Run, friction: JointFriction | None) -> Errors:
-    """Errors on at most some thousand states of the run, drawn without return."""
+    """Errors on at most `_RUN_STATES` states of the run, drawn without replacement."""
     states = run.q[:-1], run.v[:-1], accelerations(truth, run, friction)
     q, v, a = (x.reshape(-1, run.nv) for x in states)
     rows = np.random.default_rng(0).permutation(len(q))[:_RUN_STATES]

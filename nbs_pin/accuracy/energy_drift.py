@@ -1,4 +1,4 @@
-"""Free motions of a model and of the truth from the same starts, judged by energy."""
+"""Energy drift of free motions of a model and of the truth from the same initial states."""
 
 from typing import NamedTuple
 
@@ -11,23 +11,23 @@ from nbs_pin.simulation.integrators import rk4
 
 
 class FreeMotion(NamedTuple):
-    """|E − E(0)| over time of motions under no torque, per start a share of its own largest true kinetic energy.
+    """|E − E(0)| along torque-free motions, relative to the largest true kinetic energy of each start.
 
-    (times, starts) each; NaN from where a motion leaves the finite numbers.
+    The arrays have shape (times, starts), with NaN once a motion is no longer finite.
     """
 
     t: Float[np.ndarray, " times"]
     """Time [s]."""
     drift: Float[np.ndarray, "times starts"]
-    """The true energy along the model's motion: does the model make or lose energy?"""
+    """True energy along the model's motion: whether the model gains or loses energy."""
     own: Float[np.ndarray, "times starts"]
-    """The model's own energy ½vᵀM̂v + V̂ along it, constant but for the integrator when Ĉ and Ĝ belong to M̂ and V̂."""
+    """The model's energy ½vᵀM̂v + V̂ along its motion: only integration error if Ĉ and Ĝ are consistent with M̂ and V̂."""
     floor: Float[np.ndarray, "times starts"]
-    """The true energy along the true motion: what the integrator alone does."""
+    """True energy along the true motion: only integration error."""
 
     @property
     def worst(self) -> float:
-        """Largest drift of any start at any time; inf when a motion leaves the finite numbers."""
+        """Largest drift over all starts and times; inf if a motion does not stay finite."""
         return float(self.drift.max()) if np.isfinite(self.drift).all() else np.inf
 
 
@@ -40,9 +40,9 @@ def free_motion(
     duration: float = 1.0,
     step: float = 0.004,
 ) -> FreeMotion:
-    """The motions from these starts for `duration` [s] by RK4 with this step [s], joint stops aside."""
+    """Motions from these initial states over `duration` [s] by RK4 with this step [s], without joint limits."""
     steps = round(duration / step)
-    with np.errstate(all="ignore"):  # of motions that diverge
+    with np.errstate(all="ignore"):  # motions may diverge
         moved, true = (_motion(dynamics, q, v, steps, step) for dynamics in (model, truth))
         scale = kinetic_energy(truth, *true).max(axis=0)
         drift, own, floor = (

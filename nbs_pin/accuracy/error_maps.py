@@ -1,4 +1,4 @@
-"""The errors of a model over two joints of an arm."""
+"""Maps of the errors of a model over the positions of two joints."""
 
 from typing import NamedTuple
 
@@ -11,16 +11,16 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 
 
 class ErrorMap(NamedTuple):
-    """Errors over two joints, all else drawn from the box."""
+    """Errors over the positions of two joints, with the rest of the state drawn from the box."""
 
     joints: tuple[int, int]
-    """Indices of the joints across and up."""
+    """Indices of the joints on the horizontal and vertical axis."""
     x: Float[np.ndarray, " points"]
-    """Configurations of the first [rad]."""
+    """Positions of the first joint [rad]."""
     y: Float[np.ndarray, " points"]
-    """Configurations of the second [rad]."""
+    """Positions of the second joint [rad]."""
     errors: Errors
-    """(points, points) each, row k at y[k]: RMS over the draws, as a share of the RMS size over the whole map."""
+    """(points, points) each, row k at y[k]: RMS over the draws, relative to the RMS size over the whole map."""
 
 
 def error_map(
@@ -33,9 +33,10 @@ def error_map(
     draws: int = 8,
     seed: int = 1,
 ) -> ErrorMap:
-    """The errors on a grid of points × points over two joints, the same few draws of all else in every cell.
+    """Errors on a grid of points × points over two joints, with the same draws of the other states in every cell.
 
-    joints: indices from 0. Raises ArgumentError for joints that the arm does not have, or one joint twice.
+    Raises:
+        ArgumentError: If a joint index, from 0, does not exist or is given twice.
     """
     i, j = joints
     if i == j or not {i, j} <= set(range(truth.nv)):
@@ -51,12 +52,15 @@ def error_map(
 def telling_joints(
     model: DynamicsProvider, truth: DynamicsProvider, box: Box, *, samples: int = 2_000, seed: int = 1
 ) -> tuple[int, int]:
-    """The two joints over which the error of the torque varies most, in order: what an `error_map` should show.
+    """The two joints with which the torque error varies most, in ascending order, for an `error_map`.
 
-    By the variance between the means over eight parts of each joint's range. Raises ArgumentError for a single joint.
+    The criterion is the variance of its means over eight parts of each joint's range.
+
+    Raises:
+        ArgumentError: If the arm has a single joint.
     """
     if truth.nv < 2:
-        raise ArgumentError("an arm of one joint was given, and a map needs two; look at the errors by distance.")
+        raise ArgumentError("the arm has one joint, but an error map needs two; use `ModelErrors.by_distance`.")
     q, v, a = box.states(np.random.default_rng(seed), samples)
     error = np.square(judge(model, truth, q, v, a).each.inverse)
     means = [[part.mean() for part in np.array_split(error[order], 8)] for order in np.argsort(q, axis=0).T]

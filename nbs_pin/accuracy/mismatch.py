@@ -1,8 +1,8 @@
-"""The mismatch δ of a model on the states that a closed loop visits, and a bound that says how sure it is.
+"""The mismatch δ of a model along a closed loop, and a bound of it with a stated confidence.
 
-δ = (M − M̂) v̇ + (C − Ĉ) v + (G − Ĝ) [N·m], the true torque minus the modelled one at the acceleration the arm has:
-M̂v̇ + Ĉv + Ĝ + δ = τ + τ_d (paper, the equation before its Theorem 4). The corrected theorem asks for
-‖δ‖ ≤ a‖q‖ + b‖v‖ + c, and v̇ depends on the law, so the constants hold for a law, not for a model (docs/theory.md §6).
+δ = (M − M̂) v̇ + (C − Ĉ) v + (G − Ĝ) [N·m] is the true torque minus the modelled torque at the true acceleration:
+M̂v̇ + Ĉv + Ĝ + δ = τ + τ_d (paper, the equation before its Theorem 4). The corrected theorem requires
+‖δ‖ ≤ a‖q‖ + b‖v‖ + c. As v̇ depends on the law, the constants hold for one law, not for the model (docs/theory.md §6).
 """
 
 from typing import NamedTuple
@@ -20,16 +20,16 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 
 DOUBT = 1e-6
-"""β: the chance that the starts drawn were so unusual that the bound says more than is true."""
+"""β: the probability that the drawn starts were so unusual that the stated violation is too small."""
 _LEAST_WEIGHT = 0.1
 _UNKNOWNS = 3
 
 
 class Mismatch(NamedTuple):
-    """δ along a run, and ‖δ‖ ≤ a‖q‖ + b‖v‖ + c at every row of every trajectory.
+    """δ along a run, and ‖δ‖ ≤ a‖q‖ + b‖v‖ + c in every row of every trajectory.
 
-    With confidence 1 − `doubt`, a further trajectory drawn as those were (same law, same arm, same reference, starts
-    from the same distribution) breaks the bound at some control instant with a chance of at most `violation`.
+    With confidence 1 − `doubt`, a further trajectory of the same law, arm, reference and distribution of starts
+    violates the bound at some control instant with probability at most `violation`.
     """
 
     a: float
@@ -39,17 +39,17 @@ class Mismatch(NamedTuple):
     c: float
     """[N·m]."""
     violation: float
-    """ε, by the scenario theorem over trajectories, not samples; 1 says nothing, as for a single trajectory."""
+    """ε, by the scenario theorem over trajectories, not samples; 1, which states nothing, for a single trajectory."""
     doubt: float
-    """β."""
+    """β, one minus the confidence."""
     trajectories: int
-    """Independent starts: those with different states in the first row, as copies of one say nothing new."""
+    """Number of independent starts, counted by distinct states in the first row."""
     rms: JointArray
     """Root mean square of δ per joint [N·m]."""
     t: Float[np.ndarray, " rows"]
     """Time [s]."""
     q_norm: Float[np.ndarray, "rows starts"]
-    """‖q‖ at the rows whose torque acted [rad]."""
+    """‖q‖ [rad] in all rows but the last, whose torque was not applied."""
     v_norm: Float[np.ndarray, "rows starts"]
     """‖v‖ [rad/s]."""
     size: Float[np.ndarray, "rows starts"]
@@ -68,22 +68,25 @@ def mismatch(
     friction: JointFriction | None = None,
     doubt: float = DOUBT,
 ) -> Mismatch:
-    """δ on the states of a run of the truth, and the (a, b, c) whose bound is least on average along its reference.
+    """δ along a run with the truth as plant, and the (a, b, c) whose bound is smallest on average along the reference.
 
-    run: axes between time and joint are starts, drawn independently of each other; those with the same first state
-    count once. friction: of the plant.
-    Raises ArgumentError for a run of another number of joints, and a doubt outside (0, 1).
+    Args:
+        run: Axes between time and joint are independently drawn starts; equal first states count once.
+        friction: Friction of the plant.
+
+    Raises:
+        ArgumentError: If the run has another number of joints, δ is not finite, or doubt is outside (0, 1).
     """
     if not 0.0 < doubt < 1.0:
-        raise ArgumentError(f"doubt is {doubt}, expected a chance in (0, 1); 1e-6 is usual.")
+        raise ArgumentError(f"doubt is {doubt}, expected a probability in (0, 1); 1e-6 is usual.")
     a = accelerations(truth, run, friction)
     q, v = run.q[:-1], run.v[:-1]
-    rows = zip(q, v, a, strict=True)  # one instant at a time: networks need memory for every state they see at once
+    rows = zip(q, v, a, strict=True)  # one instant at a time, to limit the memory that networks need
     delta = np.array([inverse_dynamics(truth, *row) - inverse_dynamics(model, *row) for row in rows])
     if not np.isfinite(delta).all():
-        raise ArgumentError("the model or the run is not finite along the run; give a run that did not diverge.")
+        raise ArgumentError("the mismatch is not finite along the run; give a run that did not diverge.")
     norms = [np.linalg.norm(x, axis=-1).reshape(len(q), -1) for x in (q, v, delta)]
-    # Weights that the starts have no part in: the scenario theorem asks for a goal that is fixed before they are drawn.
+    # The scenario theorem needs an objective that is fixed before the starts are drawn, so it uses the reference only.
     weights = [max(float(np.linalg.norm(x, axis=-1).mean()), _LEAST_WEIGHT) for x in (run.q_ref, run.v_ref)]
     constants = _least_bound(norms[0].ravel(), norms[1].ravel(), norms[2].ravel(), weights)
     first = np.concatenate([x[0].reshape(-1, run.nv) for x in (q, v)], axis=1)
@@ -95,7 +98,7 @@ def mismatch(
 def accelerations(
     truth: DynamicsProvider, run: Run, friction: JointFriction | None = None
 ) -> Float[np.ndarray, "rows *batch n"]:
-    """v̇ [rad/s²] of the truth at the rows of a run whose torque acted: all but the last."""
+    """True v̇ [rad/s²] in all rows of a run but the last, whose torque was not applied."""
     if run.nv != truth.nv:
         raise ArgumentError(f"the run has {run.nv} joints and the truth {truth.nv}; give a run of that arm.")
     net = run.tau[:-1] + run.disturbance[:-1]
@@ -105,9 +108,9 @@ def accelerations(
 
 
 def violation_chance(trajectories: int, doubt: float = DOUBT, unknowns: int = _UNKNOWNS) -> float:
-    """The least ε such that Σ_{i<d} (N over i) εⁱ(1 − ε)^{N−i} ≤ β, for d unknowns of a convex program.
+    """The smallest ε with Σ_{i<d} (N choose i) εⁱ(1 − ε)^{N−i} ≤ β, for d unknowns of a convex program.
 
-    374 trajectories give 5 %, 1905 give 1 %, with β = 1e-6 and three unknowns; 1 where there are too few.
+    With β = 1e-6 and three unknowns, 374 trajectories give 5 % and 1905 give 1 %; too few trajectories give 1.
     Source: Campi and Garatti, "The exact feasibility of randomized solutions of uncertain convex programs" (2008).
     """
     if trajectories <= unknowns:
@@ -118,7 +121,7 @@ def violation_chance(trajectories: int, doubt: float = DOUBT, unknowns: int = _U
 def _least_bound(
     q_norm: np.ndarray, v_norm: np.ndarray, size: np.ndarray, weights: list[float]
 ) -> tuple[float, float, float]:
-    """(a, b, c) ≥ 0 of the least w_q a + w_v b + c with a‖q‖ + b‖v‖ + c ≥ ‖δ‖ at every point, by cutting planes."""
+    """(a, b, c) ≥ 0 that minimise w_q a + w_v b + c with a‖q‖ + b‖v‖ + c ≥ ‖δ‖ at every point, by cutting planes."""
     scale = float(size.max())
     if scale == 0.0:
         return 0.0, 0.0, 0.0

@@ -1,7 +1,7 @@
 """Relative errors of a model on states of a box.
 
-Every one is ‖x̂ − x‖_F/‖x‖_F, x stacked over the samples: the root mean square of the samples' own errors, each as a
-share of the RMS size of x.
+A relative error is ‖x̂ − x‖_F/‖x‖_F with x stacked over the samples: the root mean square of the errors of the samples,
+each relative to the RMS size of x.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robots.robot import Robot
 
 ACCELERATION = 5.0
-"""Accelerations of the samples are uniform up to this [rad/s²]."""
+"""Largest acceleration of the samples, which is uniformly distributed [rad/s²]."""
 
 Value: TypeAlias = Float[np.ndarray, "*points"] | float
 """One number, or one per sample or cell."""
@@ -28,31 +28,30 @@ class Errors(NamedTuple):
     """Relative errors of a model: one number each, or an array with one per sample or cell."""
 
     mass_matrix: Value
-    """Of M."""
+    """Error of M."""
     coriolis: Value
-    """Of C(q, v) v."""
+    """Error of C(q, v) v."""
     gravity: Value
-    """Of G."""
+    """Error of G."""
     inverse: Value
-    """Of the torque M v̇ + C v + G for a given acceleration."""
+    """Error of the torque M v̇ + C v + G for a given acceleration."""
     forward: Value
-    """Of the acceleration for a given torque."""
+    """Error of the acceleration for a given torque."""
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """States to compare in: lower ≤ q ≤ upper and |v_i| ≤ speed_i; raises ArgumentError for an empty or infinite box.
-
-    lower, upper: (n,) [rad, m for a prismatic joint]. speed: [rad/s, m/s], one number or one per joint.
-    """
+    """States for a comparison: lower ≤ q ≤ upper and |v_i| ≤ speed_i."""
 
     lower: JointArray
     upper: JointArray
+    """Range of q [rad, m for a prismatic joint]."""
     speed: JointArray
+    """Largest |v_i| [rad/s, m/s]."""
 
     @classmethod
     def of(cls, lower: PerJoint, upper: PerJoint, speed: PerJoint, nv: int) -> "Box":
-        """The box of these numbers for nv joints, each one for all joints or one per joint."""
+        """The box for nv joints, from one number or one per joint; raises ArgumentError if it is empty or infinite."""
         given = {"the lower end": lower, "the upper end": upper, "the speed": speed}
         arrays = {name: floats(f"{name} of the box", value) for name, value in given.items()}
         for name, x in arrays.items():
@@ -68,9 +67,9 @@ class Box:
 
     @classmethod
     def of_robot(cls, robot: Robot | None, nv: int, speed: PerJoint) -> "Box":
-        """The arm's position limits, one turn about their middle for a joint that can turn further or has none.
+        """The box of the robot's position limits, or [−π, π] for all joints without a robot.
 
-        A joint that slides keeps its limits. [−π, π] for all joints where no arm is given.
+        A revolute joint without limits, or with more than one turn between them, gets one turn about their middle.
         """
         if robot is None:
             return cls.of(-np.pi, np.pi, speed, nv)
@@ -82,23 +81,23 @@ class Box:
         return self.at(q), self.speed * v, ACCELERATION * a
 
     def at(self, u: Vectors) -> Vectors:
-        """The configuration [rad] at u, where the box is [−1, 1]ⁿ."""
+        """The configuration [rad] at u, in coordinates where the box is [−1, 1]ⁿ."""
         return 0.5 * (self.lower + self.upper) + 0.5 * (self.upper - self.lower) * u
 
 
 class Judged(NamedTuple):
-    """A model on some states."""
+    """Errors and torques of a model on given states."""
 
     each: Errors
-    """Its errors, (samples,) each."""
+    """Errors of the states, (samples,) each."""
     true: Float[np.ndarray, "samples n"]
-    """The torque for the acceleration there [N·m]."""
+    """True torque for the given acceleration [N·m]."""
     modelled: Float[np.ndarray, "samples n"]
-    """The model's [N·m]."""
+    """Torque of the model for the given acceleration [N·m]."""
 
     @property
     def errors(self) -> Errors:
-        """Over all states, one number each."""
+        """Errors over all states, one number each."""
         return Errors(*(float(np.sqrt(np.mean(np.square(e)))) for e in self.each))
 
 
@@ -109,9 +108,10 @@ def judge(
     v: Float[np.ndarray, "samples n"],
     a: Float[np.ndarray, "samples n"],
 ) -> Judged:
-    """The model on states with acceleration a [rad/s²], forward dynamics under the torque the truth needs for it.
+    """Errors on states with acceleration a [rad/s²], those of forward dynamics under the true torque for a.
 
-    Raises ArgumentError for another number of joints, or a model that is not finite at some state.
+    Raises:
+        ArgumentError: If the numbers of joints differ, or the model is not finite at some state.
     """
     check_joints(model, truth)
     true, modelled = (
@@ -123,15 +123,15 @@ def judge(
         if not np.isfinite(x).all():
             raise ArgumentError(
                 f"the model's {name.replace('_', ' ')} is not finite in {int((~np.isfinite(x)).sum())} of {x.size} "
-                "numbers; fit it again, or take a smaller box."
+                "numbers; fit the model again, or use a smaller box."
             )
     return Judged(Errors(*map(_shares, modelled, true)), true[3], modelled[3])
 
 
 def check_joints(model: DynamicsProvider, truth: DynamicsProvider) -> None:
-    """Raises ArgumentError unless both have the same number of joints."""
+    """Raise ArgumentError unless both models have the same number of joints."""
     if model.nv != truth.nv:
-        raise ArgumentError(f"the model has {model.nv} joints and the truth {truth.nv}; compare two of one arm.")
+        raise ArgumentError(f"the model has {model.nv} joints and the truth {truth.nv}; compare models of one arm.")
 
 
 def share(error: Any, size: Any) -> Any:
@@ -141,6 +141,6 @@ def share(error: Any, size: Any) -> Any:
 
 
 def _shares(modelled: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """‖x̂ − x‖ of each sample as a share of the RMS of ‖x‖."""
+    """‖x̂ − x‖ of each sample relative to the RMS of ‖x‖."""
     size, error = (np.linalg.norm(x.reshape(len(x), -1), axis=1) for x in (true, modelled - true))
     return share(error, np.sqrt(np.mean(size**2)))

@@ -1,1 +1,1 @@
-"""What every room uses: errors, arrays, checks, files and records."""
+"""Errors, arrays, checks, files and records that the whole package uses."""

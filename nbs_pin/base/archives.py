@@ -1,9 +1,9 @@
-"""Named entries in one sealed file: written whole or not at all, read only when every byte is as it was written.
+"""Archives of named entries, written atomically and verified byte by byte when read.
 
-The file is a zip archive in which nothing is compressed, so that any tool can look into it. Its entry `manifest.json`
-says the format and holds the size and the SHA-256 of every other entry; its comment, the last 64 bytes of the file, is
-the SHA-256 of everything before it, which covers what zip and manifest leave unchecked. The seal tells damage and hand
-edits, not who wrote the file.
+The file is an uncompressed zip archive, so any zip tool can open it. The entry `manifest.json` states the format and
+the size and SHA-256 of every other entry. The archive comment, the last 64 bytes of the file, is the SHA-256 of
+everything before it, which also covers the manifest and the zip headers. These checksums detect damage and hand edits;
+they do not authenticate the author.
 """
 
 import hashlib
@@ -21,15 +21,15 @@ from nbs_pin.base.files import write_whole
 from nbs_pin.base.npz import LARGEST
 
 MANIFEST = "manifest.json"
-"""Name of the entry that lists the others."""
-_SEAL = 64
+"""Name of the entry that lists the others with their checksums."""
+_CHECKSUM = 64
 _DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, NotImplementedError, RuntimeError)
 
 
 def write_archive(path: str | Path, file_format: str, entries: Mapping[str, bytes]) -> None:
-    """Write the entries to `path`; whatever interrupts it, the name holds the old file or the new one, never half.
+    """Write the entries to `path` atomically: an interruption leaves either the old file or the new one.
 
-    The same entries give the same bytes.
+    Equal entries give equal bytes.
     """
     manifest = {"format": file_format, "entries": {name: _digest(content) for name, content in entries.items()}}
     body = _zipped({MANIFEST: json.dumps(manifest, indent=1).encode(), **entries})
@@ -37,10 +37,11 @@ def write_archive(path: str | Path, file_format: str, entries: Mapping[str, byte
 
 
 def read_archive(path: str | Path, file_format: str) -> dict[str, bytes]:
-    """The entries of the file that `write_archive` wrote.
+    """The entries of a file written by `write_archive`.
 
-    Raises FileNotFoundError for no file, and FileFormatError for one that is larger than `npz.LARGEST`, of another
-    format, or changed in any byte.
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        FileFormatError: If it is larger than `npz.LARGEST`, has another format, or was changed in any byte.
     """
     size = Path(path).stat().st_size
     if size > LARGEST:
@@ -56,18 +57,22 @@ def read_archive(path: str | Path, file_format: str) -> dict[str, bytes]:
     stated = listed if isinstance(listed, dict) else {}
     for name in sorted(stated.keys() | found.keys()):
         if stated.get(name) != found.get(name):
-            raise FileFormatError(f"{path}: '{name}' is not what was written (SHA-256 or size); take an older copy.")
-    if _hash(content[:-_SEAL]) != content[-_SEAL:]:
-        raise FileFormatError(f"{path}: was changed after it was written (its seal is broken); take an older copy.")
+            raise FileFormatError(f"{path}: '{name}' does not match its recorded SHA-256 or size; take an older copy.")
+    if _hash(content[:-_CHECKSUM]) != content[-_CHECKSUM:]:
+        raise FileFormatError(f"{path}: was changed after it was written (checksum mismatch); take an older copy.")
     return entries
 
 
 def parse_json(path: str | Path, name: str, content: bytes) -> dict[str, Any]:
-    """The JSON object in the entry `name`: no key twice, no number that is not finite; else raises FileFormatError."""
+    """The JSON object in the entry `name`.
+
+    Raises:
+        FileFormatError: If it is not a JSON object, repeats a key or holds a number that is not finite.
+    """
     try:
         value = json.loads(content, object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: '{name}' is no JSON that we write ({error}); write the file again.") from error
+        raise FileFormatError(f"{path}: '{name}' cannot be read as JSON ({error}); write the file again.") from error
     if not isinstance(value, dict):
         raise FileFormatError(
             f"{path}: '{name}' is a {type(value).__name__}, expected an object; write the file again."
@@ -76,15 +81,15 @@ def parse_json(path: str | Path, name: str, content: bytes) -> dict[str, Any]:
 
 
 def _zipped(entries: Mapping[str, bytes]) -> bytes:
-    """The archive up to its comment."""
+    """The bytes of the archive up to its comment."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        archive.comment = bytes(_SEAL)
+        archive.comment = bytes(_CHECKSUM)
         for name, content in entries.items():
-            info = zipfile.ZipInfo(name)  # of 1980, so that equal entries are equal files
+            info = zipfile.ZipInfo(name)  # dated 1980, so that equal entries give equal files
             info.create_system, info.external_attr = 3, 0o644 << 16
             archive.writestr(info, content)
-    return buffer.getvalue()[:-_SEAL]
+    return buffer.getvalue()[:-_CHECKSUM]
 
 
 def _unzipped(path: str | Path, content: bytes, file_format: str) -> dict[str, bytes]:
@@ -93,13 +98,13 @@ def _unzipped(path: str | Path, content: bytes, file_format: str) -> dict[str, b
             infos = archive.infolist()
             stored = all(info.compress_type == zipfile.ZIP_STORED for info in infos)
             if not stored or sum(info.file_size for info in infos) > len(content):
-                raise ValueError("entries that are compressed or larger than the file")
+                raise ValueError("entries are compressed or larger than the file")
             entries = {info.filename: archive.read(info) for info in infos}
             if len(entries) < len(infos):
-                raise ValueError("entries of the same name")
+                raise ValueError("several entries have the same name")
             return entries
     except _DAMAGE as error:
-        fault = str(error) or "cut short"
+        fault = str(error) or "truncated"
         raise FileFormatError(f"{path}: not an intact '{file_format}' file ({fault}); take an older copy.") from error
 
 
@@ -113,7 +118,7 @@ def _hash(content: bytes) -> bytes:
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(dict(pairs)) < len(pairs):
-        raise ValueError(f"a key twice among {', '.join(key for key, _ in pairs)}")
+        raise ValueError(f"repeated key among {', '.join(key for key, _ in pairs)}")
     return dict(pairs)
 
 

@@ -1,4 +1,4 @@
-"""One code for numpy arrays and torch tensors: the array kind in is the array kind out."""
+"""Helpers for code that runs on numpy arrays and on torch tensors and returns the type it was given."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -13,13 +13,13 @@ Array: TypeAlias = Any
 """A `numpy.ndarray` or a `torch.Tensor`; shapes are annotated with jaxtyping around it."""
 
 Vectors: TypeAlias = Float[Array, "*batch n"]
-"""One number per joint, (..., n) over any leading batch axes."""
+"""One number per joint, shape (..., n), with any leading batch axes."""
 Matrices: TypeAlias = Float[Array, "*batch n n"]
-"""A matrix of the joints, (..., n, n)."""
+"""A joint-space matrix, shape (..., n, n)."""
 Scalars: TypeAlias = Float[Array, "*batch"]
-"""One number per state, (...)."""
+"""One number per state, shape (...)."""
 JointArray: TypeAlias = Float[np.ndarray, " n"]
-"""One number per joint, a numpy array (n,)."""
+"""One number per joint, a numpy array of shape (n,)."""
 
 __all__ = [
     "Array",
@@ -42,11 +42,13 @@ def matvec(matrix: Array, vector: Array) -> Array:
 
 
 def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
-    """The given vectors as arrays of one kind and one batch shape (..., nv).
+    """The given vectors as arrays of one type, broadcast to a common shape (..., nv).
 
     Lists and numbers become float64 numpy arrays; tensors stay tensors.
-    Raises ArgumentError when kinds are mixed, a tensor is not float64, a last axis is not nv, or batches do not
-    broadcast.
+
+    Raises:
+        ArgumentError: If numpy and torch are mixed, a tensor is not float64, a last axis is not nv, or the batch shapes
+            do not broadcast.
     """
     given = tuple(vectors.values())
     shape = np.shape(given[0])
@@ -55,11 +57,11 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
         and shape[-1] == nv
         and all(type(x) is np.ndarray and x.shape == shape and x.dtype == float for x in given)
     ):
-        return given  # the common case, without a detour
+        return given  # fast path of the common case
     arrays = [x if is_torch_array(x) else np.asarray(x, dtype=float) for x in vectors.values()]
     if len({is_torch_array(x) for x in arrays}) > 1:
         kinds = ", ".join(f"{k} {type(x).__name__}" for k, x in vectors.items())
-        raise ArgumentError(f"numpy and torch were mixed ({kinds}); give all arguments in one kind.")
+        raise ArgumentError(f"numpy and torch were mixed ({kinds}); give numpy arrays only or tensors only.")
     for name, x in zip(vectors, arrays, strict=True):
         if str(x.dtype) not in ("float64", "torch.float64"):
             raise ArgumentError(f"{name} is a {x.dtype} tensor, expected float64; give {name}.double().")
@@ -75,14 +77,14 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
 
 
 def constant_like(x: Array, constant: np.ndarray) -> Array:
-    """The numpy constant in the kind, precision and place of x."""
+    """The numpy constant with the array type, dtype and device of x."""
     if not is_torch_array(x):
         return constant
     return array_namespace(x).asarray(constant, dtype=x.dtype, device=x.device)
 
 
 def over_rows(function: Callable[..., np.ndarray], *arguments: np.ndarray) -> np.ndarray:
-    """The function of every row of numpy arrays with equal leading axes, stacked with those axes."""
+    """The function applied to every row of numpy arrays with equal leading axes, stacked along those axes."""
     batch = arguments[0].shape[:-1]
     rows = [x.reshape(-1, x.shape[-1]) for x in arguments]
     values = [function(*row) for row in zip(*rows, strict=True)]

@@ -1,4 +1,4 @@
-"""Checks of arguments that several rooms share; each raises ArgumentError saying what was given and expected."""
+"""Argument checks for the whole package; each raises ArgumentError stating what was given and what was expected."""
 
 import math
 from typing import Any, TypeAlias
@@ -12,15 +12,17 @@ PerJoint: TypeAlias = Any
 
 
 def floats(name: str, value: Any) -> np.ndarray:
-    """The numbers as a float array; raises ArgumentError when they are no numbers or rows of unequal length."""
+    """The value as a float array; raises ArgumentError if it is not numeric or its rows differ in length."""
     try:
         return np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{name} is {value!s:.200}, expected numbers in equal rows; correct it.") from error
+        raise ArgumentError(
+            f"{name} is {value!s:.200}, expected numbers in rows of equal length; correct it."
+        ) from error
 
 
 def per_joint(record: Any, *names: str) -> None:
-    """Turn the named fields of a frozen record into float arrays of shape () or (n,), finite, n the same for all."""
+    """Convert the named fields of a frozen record to finite float arrays of shape () or (n,), with one n for all."""
     kind = type(record).__name__
     for name in names:
         value = getattr(record, name)
@@ -31,17 +33,17 @@ def per_joint(record: Any, *names: str) -> None:
     sizes = {name: getattr(record, name).size for name in names}
     if len(set(sizes.values()) - {1}) > 1:
         stated = ", ".join(f"{name} {size}" for name, size in sizes.items())
-        raise ArgumentError(f"{kind} was given {stated} numbers; give equally many, or one for all.")
+        raise ArgumentError(f"{kind} was given {stated} numbers; give single numbers or lists of equal length.")
 
 
 def positive(name: str, value: float, unit: str) -> None:
-    """Check 0 < value < inf."""
+    """Raise ArgumentError unless 0 < value < inf."""
     if not 0.0 < value < math.inf:
         raise ArgumentError(f"{name} is {value} {unit}, expected a finite number > 0; correct it.")
 
 
 def whole(total: float, part: float, total_name: str, part_name: str) -> int:
-    """How many parts make the total [both s], a whole number ≥ 1 to nine digits."""
+    """The number total / part of two times [s]; raises ArgumentError unless it is ≥ 1 and whole to nine digits."""
     positive(total_name, total, "s")
     positive(part_name, part, "s")
     ratio = total / part
@@ -54,5 +56,5 @@ def whole(total: float, part: float, total_name: str, part_name: str) -> int:
 
 
 def all_finite(x: np.ndarray) -> bool:
-    """Whether all numbers are finite; a sum of squares tells it five times as fast, unless it overflows."""
+    """Whether all numbers are finite; the sum of squares is a five times faster test, unless it overflows."""
     return math.isfinite(np.vdot(x, x)) or bool(np.isfinite(x).all())

@@ -1,4 +1,4 @@
-"""What is claimed of a controller or a model, and how it is known."""
+"""Claims about a controller or a model, each labelled by how it is known."""
 
 import math
 from dataclasses import dataclass
@@ -9,20 +9,20 @@ from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 
 
 class Label(StrEnum):
-    """How a claim is known, the strongest first."""
+    """How a claim is known, strongest first."""
 
     PROVED = "PROVED"
-    """By structure, everywhere, or by finitely many evaluations that a theorem extends to everywhere."""
+    """Holds everywhere, by structure or by finitely many evaluations that a theorem extends to all states."""
     VERIFIED = "VERIFIED"
-    """Exhaustively on a box."""
+    """Checked exhaustively on a box."""
     PROBABILISTIC = "PROBABILISTIC"
-    """With a confidence, for what is drawn as the samples were."""
+    """Holds with a stated confidence for draws from the distribution of the samples."""
     EMPIRICAL = "EMPIRICAL"
-    """On samples; others may break it."""
+    """Holds on the samples tested; other samples may violate it."""
 
 
 class Group(StrEnum):
-    """Where a claim stands in a certificate."""
+    """The section of a certificate in which a claim is listed."""
 
     BOUNDS = "bounds"
     MODEL_ERROR = "model error"
@@ -34,32 +34,32 @@ class Group(StrEnum):
 
 
 def weakest(*labels: Label) -> Label:
-    """The label of what follows from claims with these labels; PROVED for none."""
+    """The label of a conclusion from claims with these labels: the weakest, or PROVED if there are none."""
     order = list(Label)
     return max(labels, key=order.index, default=Label.PROVED)
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One number of a certificate, with the way it is known."""
+    """One number of a certificate and how it is known."""
 
     name: str
-    """What it is, in words, with its symbol."""
+    """Name of the quantity, with its symbol."""
     value: float
-    """The number; inf for a bound that is none."""
+    """The number; inf where there is no bound."""
     unit: str
-    """SI, empty for a pure number."""
+    """SI unit, empty for a dimensionless number."""
     label: Label
     because: str
-    """Where it comes from, and what it assumes beyond the assumptions of the certificate."""
+    """Its origin, and its assumptions in addition to those of the certificate."""
     group: Group = Group.STRUCTURE
 
     def __post_init__(self) -> None:
         if math.isnan(self.value):
-            raise ArgumentError(f"the claim '{self.name}' is not a number; give its value, inf for no bound.")
+            raise ArgumentError(f"the value of claim '{self.name}' is not a number; give one, or inf for no bound.")
 
     def plain(self) -> dict[str, Any]:
-        """The claim as JSON can store it, null for infinity."""
+        """The claim as a JSON object, with null for infinity."""
         value = self.value if math.isfinite(self.value) else None
         return {
             "name": self.name,
@@ -72,17 +72,17 @@ class Claim:
 
 
 def refuse(fault: str, remedy: str) -> NoReturn:
-    """Raise CertificateRefused in one sentence."""
+    """Raise CertificateRefused with the fault and its remedy."""
     raise CertificateRefused(f"{fault}; {remedy}.")
 
 
 class Known(NamedTuple):
-    """How something is known."""
+    """A label and its justification."""
 
     label: Label
     because: str
 
 
 def known(why: str, proof: str) -> Known:
-    """PROVED by the structure of known code, or EMPIRICAL because of `why` the code may be another."""
-    return Known(Label.EMPIRICAL, f"{why}: held on samples") if why else Known(Label.PROVED, proof)
+    """PROVED by `proof`, or EMPIRICAL if `why` states a reason that the code may differ from the known code."""
+    return Known(Label.EMPIRICAL, f"{why}: tested on samples") if why else Known(Label.PROVED, proof)

@@ -1,4 +1,4 @@
-"""CSV files: tables of numbers in and out, and which column belongs to which joint."""
+"""CSV files: reading and writing tables of numbers, and matching columns to joints."""
 
 import csv
 import io
@@ -15,14 +15,14 @@ from nbs_pin.base.files import write_whole
 from nbs_pin.base.npz import LARGEST
 
 QUANTITIES = ("tau", "q", "v", "a")
-"""What a log has per joint, each in columns `KIND_JOINT` or `KIND1`, `KIND2`, …."""
+"""Per-joint quantities of a log, in columns named `KIND_JOINT` or `KIND1`, `KIND2`, …."""
 
 
 def read_csv(path: Path) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
-    """The header of a CSV file and its numbers.
+    """The header and the numbers of a CSV file with a column `t`.
 
     Raises:
-        FileFormatError: For a file that is no such table; it names row and column, which count from 1.
+        FileFormatError: If the file is not such a table; names the column and the row, counted from 1.
     """
     if path.stat().st_size > LARGEST // 8:
         raise FileFormatError(f"{path}: more than {LARGEST // 8} bytes, too large for a CSV; store it as npz.")
@@ -45,23 +45,25 @@ def read_csv(path: Path) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
 
 
 def write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> Path:
-    """A table as a file, whole or not at all; numbers in full precision."""
+    """Write a table to a file atomically, with numbers in full precision."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([head, *rows])
     return write_whole(path, text.getvalue().encode())
 
 
 def joint_columns(header: Sequence[str], kind: str) -> dict[str, int]:
-    """The columns of a quantity by the joint's name or number: `q_elbow` or `q2` for the kind `q`."""
+    """Column indices of a quantity by joint name or number: `q_elbow` or `q2` for the kind `q`."""
     found = ((re.fullmatch(rf"{kind}(?:_(.+)|(\d+))", name), k) for k, name in enumerate(header))
     return {match[1] or match[2]: k for match, k in found if match}
 
 
 def joint_order(path: Path, found: Sequence[str], joint_names: Sequence[str] | None) -> list[int]:
-    """Which of the joints found is each joint named; numbers 1 … n stand for the arm's order, None for the file's.
+    """The index in `found` of each joint in `joint_names` (None: the joints of the file in its order).
+
+    Joints that are named 1 to n in the file are taken in the order of their numbers.
 
     Raises:
-        FileFormatError: When they are not the same joints.
+        FileFormatError: If the two do not name the same joints.
     """
     names = list(found if joint_names is None else joint_names)
     numbers = [str(i + 1) for i in range(len(names))]
@@ -71,8 +73,8 @@ def joint_order(path: Path, found: Sequence[str], joint_names: Sequence[str] | N
         unknown = [name for name in found if name not in names]
         more = f"; no joint is named {', '.join(unknown)}" if unknown else ""
         raise FileFormatError(
-            f"{path}: {len(found)} joints ({', '.join(found)}), expected {len(names)} ({', '.join(names)}){more}; rename "
-            "the columns, or number them."
+            f"{path}: {len(found)} joints ({', '.join(found)}), expected {len(names)} ({', '.join(names)}){more}; "
+            "rename the columns or number them."
         )
     return [found.index(name) for name in names]
 
@@ -83,7 +85,7 @@ def _numbers(path: Path, row: int, cells: list[str], header: list[str]) -> list[
     numbers = []
     for name, cell in zip(header, cells, strict=True):
         try:
-            # float() also reads '1_0' and digits of other scripts, which no instrument writes.
+            # float() also accepts '1_0' and non-ASCII digits, which no instrument writes.
             numbers.append(float(cell if cell.isascii() and "_" not in cell else ""))
         except ValueError as error:
             raise FileFormatError(f"{path}: row {row}, column {name}: '{cell}' is not a number; correct it.") from error

@@ -1,11 +1,11 @@
-"""Errors of nbs_pin: each is an `NbsPinError` and also the built-in kind a caller would expect.
+"""Exceptions of nbs_pin: each is an `NbsPinError` and also a subclass of the matching built-in exception.
 
-Every message is one sentence that says what was given, what was expected and what to do next.
+Every message is one sentence that states what was given, what was expected and what to do.
 """
 
 
 class NbsPinError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base class of the errors that this package raises deliberately."""
 
 
 class RobotError(NbsPinError, ValueError):
@@ -13,24 +13,24 @@ class RobotError(NbsPinError, ValueError):
 
 
 class RobotNotFound(RobotError, FileNotFoundError):
-    """A robot name or path that leads nowhere; lists the names that exist."""
+    """A robot name or path that does not exist; lists the known names."""
 
 
 class ArgumentError(NbsPinError, ValueError):
-    """An argument of the wrong shape, kind, range or not finite."""
+    """An argument that is not finite or has the wrong shape, type or range."""
 
 
 class MissingExtra(NbsPinError, ImportError):
-    """An optional dependency is needed; names the extra that installs it."""
+    """An optional dependency is not installed; names the extra that installs it."""
 
 
 class SimulationDiverged(NbsPinError, ArithmeticError):
-    """The plant left the finite numbers or the engine raised a warning; names the time and the cause."""
+    """The state became non-finite or the physics engine raised a warning; names the time and the cause."""
 
 
 class FileFormatError(NbsPinError, ValueError):
-    """A data file (run, reference, checkpoint) that is not what it should be; names file, row or key, and remedy."""
+    """A data file (run, reference, checkpoint) that is damaged or malformed; names file, row or key, and remedy."""
 
 
 class CertificateRefused(NbsPinError, ValueError):
-    """A controller or model of which nothing can be promised; names the part, what is wrong with it and the remedy."""
+    """A controller or model that cannot be certified; names the part, the fault and the remedy."""

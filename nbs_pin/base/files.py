@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Atomic writing of files."""
 
 import os
 import re
@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import BinaryIO
 
 ABANDONED = 600.0
-"""Age [s] from which a draft is that of a writer that was killed: a living one is done long before."""
+"""Age [s] above which a temporary file is taken to be left by a writer that was killed."""
 
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[BinaryIO]:
-    """A file to write to, so that a reader, an error or a crash never meets half of it. Missing folders are made.
+    """A file to write to that replaces `path` atomically at the end. Missing folders are created.
 
-    The bytes go to a temporary file beside `path`, reach the disk, and then take its name. What a writer of `path` left
-    behind when it was killed, more than `ABANDONED` seconds ago, is removed.
+    The bytes go to a temporary file beside `path`, which is flushed to disk and then renamed; after an error it is
+    deleted. Temporary files of `path` that are older than `ABANDONED`, left by writers that were killed, are removed.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -35,7 +35,7 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: str | Path, content: bytes) -> Path:
-    """Writes `content` to `path` as `whole_file` does; returns the path."""
+    """Write `content` to `path` atomically (`whole_file`) and return the path."""
     with whole_file(path) as file:
         file.write(content)
     return Path(path)
@@ -43,7 +43,7 @@ def write_whole(path: str | Path, content: bytes) -> Path:
 
 def _remove_abandoned_drafts(path: Path) -> None:
     name = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.tmp")
-    with suppress(OSError), os.scandir(path.parent) as entries:  # tidying never stops a write
+    with suppress(OSError), os.scandir(path.parent) as entries:  # a failed cleanup must not prevent the write
         for entry in entries:
             old = name.fullmatch(entry.name) and time.time() - entry.stat(follow_symlinks=False).st_mtime > ABANDONED
             if old and entry.is_file(follow_symlinks=False):

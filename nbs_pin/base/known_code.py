@@ -1,7 +1,7 @@
-"""Which classes the proofs and the kernels speak of.
+"""Registry of the classes whose code the proofs and the kernels rely on.
 
-A proof reads the code of a class, and a kernel repeats it. Neither says anything of a subclass, which may have replaced
-a method, nor of an object with a method of its own.
+A proof is about the code of one class, and a kernel reimplements it. Neither applies to a subclass, which may override
+a method, nor to an object with a replaced method.
 """
 
 from collections.abc import Iterable
@@ -19,12 +19,12 @@ def known_code(cls: _Class) -> _Class:
 
 
 def is_known(part: Any) -> bool:
-    """Whether the part's class is one that proofs and kernels know."""
+    """Whether the class of `part` is registered as known code."""
     return type(part) in _KNOWN
 
 
 def foreign_code(part: Any) -> str:
-    """Why the part's code may be another than the known one: its class, a replaced method or a hook; empty if none."""
+    """Why the code of `part` may not be the known one (its class, a replaced method or a hook); empty if it is."""
     kind = type(part)
     if kind not in _KNOWN:
         return f"the code of {kind.__name__} is not known"
@@ -35,5 +35,5 @@ def foreign_code(part: Any) -> str:
 
 
 def first_foreign(parts: Iterable[Any]) -> str:
-    """The first reason that `foreign_code` finds, empty if there is none."""
+    """The first reason that `foreign_code` gives for one of the parts, empty if there is none."""
     return next((why for why in map(foreign_code, parts) if why), "")

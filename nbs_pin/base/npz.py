@@ -1,4 +1,4 @@
-"""Arrays in npz files: written whole or not at all, read without pickle and without believing the headers."""
+"""Arrays in npz files: written atomically, read without pickle and without trusting the headers."""
 
 import zipfile
 import zlib
@@ -11,12 +11,12 @@ from nbs_pin.base.exceptions import FileFormatError
 from nbs_pin.base.files import whole_file
 
 LARGEST = 2**31
-"""Most bytes of arrays that a file may hold, 2 GiB."""
+"""Largest total size of the arrays in a file [bytes], 2 GiB."""
 _KINDS = {"f": "real numbers", "b": "booleans", "U": "text", "i": "integers"}
 
 
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write the arrays to `path`; whatever interrupts it, the name holds the old file or the new one, never half."""
+    """Write the arrays to `path` atomically: an interruption leaves either the old file or the new one."""
     with whole_file(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -24,8 +24,9 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:
     """All arrays of an npz file.
 
-    Raises FileNotFoundError for no file and FileFormatError for one that is damaged, holds Python objects, or
-    declares more than it has or than `LARGEST`.
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        FileFormatError: If it is damaged, holds Python objects, or declares more than it contains or than `LARGEST`.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -40,7 +41,7 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def require(data: Mapping[str, np.ndarray], path: str | Path, kinds: Mapping[str, str]) -> None:
-    """Check that each key exists with numpy's kind letter; raises FileFormatError naming file, key and remedy."""
+    """Raise FileFormatError, naming file and key, unless each key exists with the given numpy `dtype.kind`."""
     for key, kind in kinds.items():
         if key not in data:
             raise FileFormatError(f"{path}: no '{key}' among {', '.join(data) or 'no keys'}; write the file again.")
@@ -49,7 +50,7 @@ def require(data: Mapping[str, np.ndarray], path: str | Path, kinds: Mapping[str
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
-    # A header may claim terabytes, which numpy would allocate before it reads them: compare with the entry's size.
+    # numpy allocates the declared size, perhaps terabytes, before it reads: compare it with the size of the entry.
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

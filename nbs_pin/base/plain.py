@@ -1,4 +1,4 @@
-"""Values as JSON can store them."""
+"""Conversion of values for JSON."""
 
 import math
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def plain(values: Any) -> Any:
-    """Arrays and numbers as JSON can store them, None for what is not finite."""
+    """Arrays and numbers as lists, dictionaries and numbers for JSON, with None for non-finite numbers."""
     if isinstance(values, Mapping):
         return {key: plain(value) for key, value in values.items()}
     if isinstance(values, np.ndarray | np.generic):

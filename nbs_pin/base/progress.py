@@ -1,4 +1,4 @@
-"""A progress bar for long work at a terminal, silence everywhere else."""
+"""Progress display for long work, shown only at a terminal."""
 
 import sys
 import time
@@ -13,9 +13,9 @@ _REFRESH = 0.1
 
 
 def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = True) -> Iterator[T]:
-    """The items one by one, with a progress bar on stderr once the work has taken 2 s and stderr is a terminal.
+    """The items one by one, with a progress bar on stderr after 2 s of work if stderr is a terminal.
 
-    label: what the work is called; a function is asked again whenever the bar is drawn.
+    A function as `label` is called whenever the bar is drawn.
     """
     if not (show and sys.stderr.isatty()):
         yield from items
@@ -36,7 +36,7 @@ def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = Tru
 
 @contextmanager
 def waiting(label: str, show: bool = True) -> Iterator[None]:
-    """A spinner on stderr while work without parts goes on, if stderr is a terminal."""
+    """A spinner on stderr while the body of the `with` statement runs, if stderr is a terminal."""
     if not (show and sys.stderr.isatty()):
         yield
         return

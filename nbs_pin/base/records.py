@@ -1,4 +1,4 @@
-"""Small named records that every room passes around."""
+"""Records that are passed between the parts of the package: reference values and recorded runs."""
 
 import dataclasses
 import json
@@ -14,14 +14,24 @@ from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 
 RUN_FORMAT = "nbs_pin run 1"
-"""What the `format` entry of a run file says."""
+"""Value of the entry `format` in a run file."""
 _PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
 _PER_JOINT = ("effort_limit", "continuous", "joint_names")
 _JSON = ("robot_options", "info")
 
 
 class Reference(NamedTuple):
-    """Desired configuration q [rad], velocity v [rad/s] and acceleration a [rad/s²], shape (..., nv)."""
+    """Desired configuration q [rad], velocity v [rad/s] and acceleration a [rad/s²], shape (..., nv).
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> import numpy as np
+        >>> def accelerate(t):  # one joint, for a time or an array of times
+        ...     t = np.asarray(t, dtype=float)[..., None]
+        ...     return nbs.Reference(q=0.5 * t**2, v=t, a=np.ones_like(t))
+        >>> accelerate(2.0)
+        Reference(q=array([2.]), v=array([2.]), a=array([1.]))
+    """
 
     q: Array
     v: Array
@@ -30,10 +40,10 @@ class Reference(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One recorded simulation: row k of every array belongs to the time t[k], the control instant k.
+    """A recorded simulation; row k of every array belongs to the control instant t[k].
 
-    The torque in row k acts from t[k] to t[k+1]; the last row's torque was computed but not applied.
-    A batch of starts adds axes between time and joint: q has shape (steps + 1, ..., nv).
+    The torque in row k acts from t[k] to t[k+1]; the torque in the last row was computed but not applied.
+    A batch of initial states adds axes between time and joint: q has shape (steps + 1, ..., nv).
     """
 
     t: Float[np.ndarray, " rows"]
@@ -43,9 +53,9 @@ class Run:
     v: Float[np.ndarray, "rows *batch n"]
     """Velocity [rad/s]."""
     tau: Float[np.ndarray, "rows *batch n"]
-    """Torque applied, after the effort limits [N·m]."""
+    """Applied torque, after the effort limits [N·m]."""
     tau_command: Float[np.ndarray, "rows *batch n"]
-    """Torque the controller asked for [N·m]."""
+    """Commanded torque, before the effort limits [N·m]."""
     disturbance: Float[np.ndarray, "rows *batch n"]
     """Disturbance torque τ_d at the control instants [N·m], 0 in the last row."""
     q_ref: Float[np.ndarray, "rows *batch n"]
@@ -55,7 +65,7 @@ class Run:
     a_ref: Float[np.ndarray, "rows *batch n"]
     """Desired acceleration [rad/s²]."""
     effort_limit: JointArray
-    """Largest |τ| per joint [N·m], inf where none."""
+    """Largest |τ| per joint [N·m], inf where there is no limit."""
     continuous: Bool[np.ndarray, " n"]
     """True for joints whose error is wrapped to (−π, π]."""
     joint_names: tuple[str, ...]
@@ -69,7 +79,7 @@ class Run:
     robot_options: dict[str, Any] = field(default_factory=dict)
     """`Robot.options` of that arm."""
     info: dict[str, Any] = field(default_factory=dict)
-    """Free notes (controller, plant, seed, versions), stored as JSON."""
+    """Further metadata (controller, plant, seed, versions), stored as JSON."""
 
     @property
     def nv(self) -> int:
@@ -77,9 +87,10 @@ class Run:
         return int(self.q.shape[-1])
 
     def save(self, path: str | Path) -> None:
-        """Write the run to an npz file; missing folders are made, an older file is replaced whole or left alone.
+        """Write the run to an npz file atomically; missing folders are created.
 
-        Raises ArgumentError when `info` holds something JSON cannot say.
+        Raises:
+            ArgumentError: If `info` or `robot_options` cannot be stored as JSON.
         """
         values = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         texts = {name: _dumped(name, values[name]) for name in _JSON} | {"format": RUN_FORMAT}
@@ -87,11 +98,12 @@ class Run:
 
     @classmethod
     def load(cls, path: str | Path) -> "Run":
-        """The run in the npz file that `save` wrote.
+        """The run in an npz file written by `save`.
 
-        Raises FileFormatError for a damaged file, a missing key, a wrong shape or a number that is not finite.
+        Raises:
+            FileFormatError: If the file is damaged, a key is missing, a shape is wrong or a number is not finite.
         """
-        data = {"robot_options": np.array("{}"), **read_npz(path)}  # which the first runs did not record
+        data = {"robot_options": np.array("{}"), **read_npz(path)}  # absent in the oldest run files
         require(data, path, {"format": "U", "t": "f", **dict.fromkeys(_PER_ROW, "f"), "effort_limit": "f"})
         require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", *_JSON), "U")})
         require(data, path, {"period": "f"})
@@ -116,7 +128,7 @@ def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
     for name, wanted in expected.items():
         if len(shape) < 2 or data[name].shape != wanted:
             raise FileFormatError(
-                f"{path}: '{name}' has shape {data[name].shape}, expected {wanted} beside q of shape {shape}, "
+                f"{path}: '{name}' has shape {data[name].shape}, expected {wanted} for q of shape {shape}, "
                 "(rows, ..., joints); record the run again."
             )
 
@@ -126,7 +138,7 @@ def _check_numbers(path: str | Path, data: dict[str, np.ndarray]) -> None:
     if not (data["effort_limit"] > 0.0).all():
         faults["effort_limit"] = "limits that are not > 0"
     if not 0.0 < data["period"] < np.inf:
-        faults["period"] = "no finite time > 0"
+        faults["period"] = "a value that is not finite and > 0"
     if not (np.diff(data["t"]) > 0.0).all():
         faults.setdefault("t", "times that do not increase")
     for name, fault in faults.items():
@@ -137,7 +149,7 @@ def _dumped(name: str, value: dict[str, Any]) -> str:
     try:
         return json.dumps(value, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"run.{name} cannot be stored as JSON ({error}); keep numbers, text and lists.") from error
+        raise ArgumentError(f"run.{name} cannot be stored as JSON ({error}); use numbers, text and lists.") from error
 
 
 def _parsed(path: str | Path, data: dict[str, np.ndarray], name: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Implementations known by name, imported when they are asked for."""
+"""Implementations registered by name and imported on first use."""
 
 import difflib
 import inspect
@@ -19,11 +19,11 @@ class Entry:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def load(self) -> Any:
-        """The class or function, its module imported."""
+        """Import the module and return the class or function."""
         return resolve_name(self.place)
 
     def make(self, *arguments: Any, **settings: Any) -> Any:
-        """Calls it with the settings of the name and with those given here that it takes."""
+        """Call it with the settings of the entry and those of `settings` that it accepts."""
         function = self.load()
         known = inspect.signature(function).parameters
         taken = {name: value for name, value in settings.items() if name in known}
@@ -31,16 +31,16 @@ class Entry:
 
 
 def entry(kind: str, name: str, table: Mapping[str, Entry], more: str = "") -> Entry:
-    """The entry of that name.
+    """The entry with the given name.
 
     Args:
-        kind: What the table lists, as the error names it.
-        name: The name asked for.
+        kind: What the table lists, for the error message.
+        name: The name to look up.
         table: Entries by name.
-        more: What else the caller accepts, appended to the error.
+        more: Other accepted input, appended to the error message.
 
     Raises:
-        ArgumentError: For a name that is not in the table; it lists the names and the nearest one.
+        ArgumentError: If the name is not in the table; lists the names and suggests the nearest one.
     """
     if name not in table:
         near = difflib.get_close_matches(name, table, n=1)

@@ -1,6 +1,6 @@
-"""How controllers, models and their parts are stored: each class says where its constructor's arguments are found.
+"""Recipes for storing controllers, models and their parts: where each class keeps its constructor arguments.
 
-`storage/descriptions.py` turns an object into settings for JSON and tensors by these recipes, and back.
+`storage/descriptions.py` uses them to convert an object to JSON settings and tensors, and back.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,42 +13,42 @@ from nbs_pin.base.exceptions import ArgumentError
 
 _Class = TypeVar("_Class", bound=type)
 Attributes: TypeAlias = Mapping[str, str] | Sequence[str]
-"""Arguments and the attributes that hold them, or just the arguments whose attributes have their names."""
+"""Constructor arguments and the attributes that hold them, or only the names where both are equal."""
 
 
 class Tensors(dict[str, Any]):
-    """Tensors of a `state_dict` by name; asking for one that is not there raises ArgumentError."""
+    """Tensors of a `state_dict` by name; a missing name raises ArgumentError."""
 
     def __missing__(self, name: str) -> Any:
         raise ArgumentError(f"there is no tensor '{name}'")
 
     def below(self, prefix: str) -> "Tensors":
-        """Those whose names begin with the prefix, named without it."""
+        """The tensors whose names begin with the prefix, under the rest of their names."""
         return Tensors({name.removeprefix(prefix): x for name, x in self.items() if name.startswith(prefix)})
 
     def widths(self, stem: str) -> tuple[int, ...]:
-        """Sizes of the hidden layers; the weights of the layers are named stem0, stem1 and so on."""
+        """Sizes of the hidden layers of a network whose weights are named stem0, stem1 and so on."""
         count = sum(name.startswith(stem) for name in self)
         return tuple(len(self[f"{stem}{i}"]) for i in range(count))[:-1]
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Where the arguments of a constructor come from."""
+    """Where the constructor arguments of a class are found."""
 
     make: Callable[..., Any]
     settings: Mapping[str, str]
-    """Arguments stored as they are, and the attributes that hold them."""
+    """Arguments stored in JSON, and the attributes that hold them."""
     parts: Mapping[str, str]
-    """Arguments that are parts or None, and the attributes that hold them."""
+    """Arguments that are storable objects or None, and the attributes that hold them."""
     arrays: Callable[[Tensors], Mapping[str, Any]]
-    """Arguments that are found among the part's tensors."""
+    """Function from the tensors of the object to further arguments."""
     sequence: Callable[[list[Any]], Any]
-    """What a stored list is handed over as."""
+    """Conversion of a stored list into the argument."""
 
 
 RECIPES: dict[str, Recipe] = {}
-"""Recipes by the name of the class, for the classes whose modules have been imported."""
+"""Recipes by class name, for the classes whose modules have been imported."""
 
 
 def storable(
@@ -57,13 +57,13 @@ def storable(
     arrays: Callable[[Tensors], Mapping[str, Any]] = lambda tensors: {},
     sequence: Callable[[list[Any]], Any] = np.array,
 ) -> Callable[[_Class], _Class]:
-    """Class decorator: objects of exactly this class can be stored in files.
+    """Class decorator: instances of exactly this class can be stored in files.
 
     Args:
-        settings: Arguments of the constructor that JSON can hold: numbers, text, lists, mappings, arrays.
-        parts: Arguments that are storable objects themselves, or None.
-        arrays: Arguments made from the tensors of the object's `state_dict`.
-        sequence: What a stored list is handed to the constructor as.
+        settings: Constructor arguments that JSON can hold: numbers, text, lists, mappings, arrays.
+        parts: Constructor arguments that are storable objects or None.
+        arrays: Function from the tensors of the object's `state_dict` to further constructor arguments.
+        sequence: Conversion of a stored list into the constructor argument.
     """
 
     def register(cls: _Class) -> _Class:

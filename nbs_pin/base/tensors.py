@@ -1,4 +1,4 @@
-"""Checked arguments as float64 tensors of their own."""
+"""Checked arguments as float64 tensors that share no memory with them."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from nbs_pin.base.exceptions import ArgumentError
 
 
 def positive_definite(name: str, matrix: Float[Array, "n n"]) -> Float[torch.Tensor, "n n"]:
-    """The matrix as a float64 tensor; raises ArgumentError unless it is symmetric positive definite."""
+    """The matrix as a float64 tensor; raises ArgumentError unless it is finite and symmetric positive definite."""
     tensor = _copied(matrix)
     square = tensor.ndim == 2 and tensor.shape[0] == tensor.shape[1]
     if not square or not bool(torch.isfinite(tensor).all()) or not torch.equal(tensor, tensor.T):
@@ -23,7 +23,7 @@ def positive_definite(name: str, matrix: Float[Array, "n n"]) -> Float[torch.Ten
 
 
 def positive_scale(name: str, scale: Float[Array, " n"] | None, nv: int) -> Float[torch.Tensor, " n"]:
-    """The scale as a float64 tensor of shape (nv,), ones for None; raises ArgumentError unless all are positive."""
+    """The scale as a float64 tensor of shape (nv,), ones for None; raises ArgumentError unless finite and > 0."""
     tensor = torch.ones(nv, dtype=torch.float64) if scale is None else _copied(scale)
     if tensor.shape != (nv,) or not bool((tensor > 0.0).all() & torch.isfinite(tensor).all()):
         raise ArgumentError(f"{name} is {tensor.tolist()}; give {nv} positive numbers.")
@@ -31,5 +31,5 @@ def positive_scale(name: str, scale: Float[Array, " n"] | None, nv: int) -> Floa
 
 
 def _copied(x: Array) -> torch.Tensor:
-    """A float64 tensor of its own; numpy copies first, because torch warns of arrays that cannot be written."""
+    """A float64 copy; numpy makes the copy of an array, because torch warns about read-only arrays."""
     return x.detach().clone().double() if is_torch_array(x) else torch.from_numpy(np.array(x, dtype=float))

@@ -1,4 +1,4 @@
-"""What decided the numbers: the versions that a stored result remembers."""
+"""Versions that are stored with a result."""
 
 import platform
 from importlib.metadata import version
@@ -7,6 +7,6 @@ import nbs_pin
 
 
 def versions() -> dict[str, str]:
-    """Of Python, this package and the libraries that decide the numbers."""
+    """Versions of Python, this package and the libraries that affect the numbers."""
     libraries = {name: version(name) for name in ("pin", "mujoco", "numpy", "torch")}
     return {"python": platform.python_version(), "nbs_pin": nbs_pin.__version__, **libraries}

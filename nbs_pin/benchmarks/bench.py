@@ -1,10 +1,10 @@
-"""What a control step and a simulated second cost on this machine: the study behind `nbs-pin bench`."""
+"""The cost of a control step and of a simulated second on this machine: the study behind `nbs-pin bench`."""
 
 import gc
 import platform
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,45 +13,51 @@ import numpy as np
 import pinocchio as pin
 import psutil
 import torch
+from torch import nn
 
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
-from nbs_pin.benchmarks.bench_training import training_epochs
 from nbs_pin.benchmarks.serial_chains import serial_chain
 from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping, paper_controller
 from nbs_pin.controllers.registry import LAWS, build_law
+from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.chain import Chain
 from nbs_pin.dynamics.cholesky import CholeskyNetwork
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.disturbances import SquareWave, TorqueNoise
-from nbs_pin.motions.references import Sinusoid
+from nbs_pin.motions.references import DesiredMotion, Sinusoid, paper_reference
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.simulation import metrics
+from nbs_pin.simulation.costs import squared_error
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
+from nbs_pin.simulation.loop import Loop
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
+from nbs_pin.simulation.rollout import Batch, Engine, motions, running_cost
 from nbs_pin.simulation.simulate import simulate, stream
 
 MODELS = ("three_link", "panda")
 """Arms whose models are timed, learned ones beside Pinocchio."""
 CHAINS = (1, 2, 3, 5, 7, 10, 15, 20, 25, 30)
-PERIOD = 0.001
+PERIOD, TRAINING_PERIOD = 0.001, 0.01
+"""Control periods of everything but training, and of training [s]."""
 _CPU_INFO = Path("/proc/cpuinfo")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One measured thing: what, on which arm, with which law or plant, and its figures with the unit in the key."""
+    """One measurement: what, on which arm, with which law or plant, and its figures with the unit in the key."""
 
     what: str
     arm: str
     how: str
-    figures: dict[str, float] = field(default_factory=dict)
+    figures: dict[str, float]
 
     @property
     def key(self) -> str:
-        """What names the row from one bench to the next."""
+        """Name of the row, the same from one bench to the next."""
         return f"{self.what}/{self.arm}/{self.how}"
 
 
@@ -64,9 +70,11 @@ def bench(
 ) -> Iterator[Row]:
     """Rows as they are measured: laws, plants, simulation, models, cost against joints, and training epochs.
 
-    calls: how often a control step is timed. A step is timed alone, with the garbage collector off, on one core.
-    chains: numbers of joints of the generated arms. long: also an hour of motion and a thousand starts, a few minutes.
-    Raises ArgumentError for fewer than 1000 calls.
+    Args:
+        arms: Arms of the laws, plants and simulations.
+        calls: Timed calls of a control step, each alone, with the garbage collector off, on one core; at least 1000.
+        chains: Numbers of joints of the generated arms.
+        long: Also simulate an hour of motion and a thousand starts, a few minutes.
     """
     if calls < 1000:
         raise ArgumentError(f"calls is {calls}, expected at least 1000 for a p99.9.")
@@ -80,8 +88,7 @@ def bench(
         yield from model_rows(load_robot(arm))
     for joints in chains:
         yield control_row(serial_chain(joints), "nbs", max(1000, calls // 4), what="joints")
-    for (arm, size), figures in training_epochs().items():
-        yield Row("training epoch", arm, size, figures)
+    yield from training_rows()
     if long:
         yield endurance_row(load_robot("panda"))
         yield workers_row(load_robot("panda"))
@@ -89,8 +96,8 @@ def bench(
 
 def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step", against_torch: bool = False) -> Row:
     """Percentiles of one compiled control step [µs], its ratio to two RNEA, and eager torch's ratio to it."""
-    plain: Any = build_law(law, robot, period=PERIOD)
-    controller = plain.compile()
+    eager: Any = build_law(law, robot, period=PERIOD)
+    controller = eager.compile()
     states = _states(robot)
     memory = controller.initial_memory(states[0][0])
 
@@ -98,32 +105,22 @@ def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step
         controller.step(memory, q, v, reference, PERIOD)
 
     times = _times(step, [(q, v, Reference(*r)) for q, v, *r in states], calls)
+    p50, p99, p999, longest = np.percentile(times, [50.0, 99.0, 99.9, 100.0]).tolist()
     data = robot.model.createData()
 
     def two_rnea(q: np.ndarray, v: np.ndarray, *_: np.ndarray) -> None:
         pin.rnea(robot.model, data, q, v, v)
         pin.rnea(robot.model, data, q, v, v)
 
-    rnea = np.median(_times(two_rnea, states, calls))
-    figures = {
-        "joints": float(robot.nv),
-        "p50_us": float(np.median(times)),
-        "p99_us": float(np.percentile(times, 99.0)),
-        "p99.9_us": float(np.percentile(times, 99.9)),
-        "max_us": float(times.max()),
-        "two_rnea_us": float(rnea),
-        "over_two_rnea": float(np.median(times) / rnea),
-    }
+    rnea = _median(two_rnea, states, calls)
+    figures = {"joints": float(robot.nv), "p50_us": p50, "p99_us": p99, "p99.9_us": p999, "max_us": longest,
+               "two_rnea_us": rnea, "over_two_rnea": p50 / rnea}  # fmt: skip
     if against_torch:
         tensors = [tuple(torch.as_tensor(x) for x in state) for state in states]
-        with_graph = np.median(_times(plain.torque, tensors, 200))
+        with_graph = _median(eager.torque, tensors, 200)
         with torch.no_grad():
-            eager = np.median(_times(plain.torque, tensors, 200))
-        figures |= {
-            "torch_us": float(eager),
-            "torch_graph_us": float(with_graph),
-            "torch_over_compiled": float(eager / np.median(times)),
-        }
+            without = _median(eager.torque, tensors, 200)
+        figures |= {"torch_us": without, "torch_graph_us": with_graph, "torch_over_compiled": without / p50}
     return Row(what, robot.name, law, figures)
 
 
@@ -136,25 +133,67 @@ def plant_rows(robot: Robot) -> Iterator[Row]:
     }
     q, v, *_ = _states(robot)[0]
     for name, plant in plants.items():
-        times = _times(lambda *_, plant=plant: plant.step(q, 0.1 * v, 0.0 * v, PERIOD), [()], 2000)
-        yield Row("plant step", robot.name, name, {"p50_us": float(np.median(times))})
+        cost = _median(plant.step, [(q, 0.1 * v, 0.0 * v, PERIOD)], 2000)
+        yield Row("plant step", robot.name, name, {"p50_us": cost})
 
 
 def model_rows(robot: Robot, calls: int = 5000) -> Iterator[Row]:
     """The cost of M a_r + C(q, v) v_r + G at one state [µs] for each kind of model; weights do not matter to it."""
-    parents, prismatic = robot.parents, robot.prismatic
-    exact = PinocchioDynamics(robot)
     models = {
-        "pinocchio": exact,
-        "chain": LagrangianDynamics(Chain(parents, prismatic)),
-        "cholesky": LagrangianDynamics(CholeskyNetwork(prismatic.tolist())),
+        "pinocchio": PinocchioDynamics(robot),
+        "chain": LagrangianDynamics(Chain(robot.parents, robot.prismatic)),
+        "cholesky": LagrangianDynamics(CholeskyNetwork(robot.prismatic.tolist())),
     }
     states = [(q, v, v_ref, a_ref) for q, v, _, v_ref, a_ref in _states(robot)]
-    own = np.median(_times(exact.reference_torque, states, calls))
-    for name, model in models.items():
-        times = _times(model.reference_torque, states, calls)
-        figures = {"p50_us": float(np.median(times)), "over_pinocchio": float(np.median(times) / own)}
+    costs = {name: _median(model.reference_torque, states, calls) for name, model in models.items()}
+    for name, cost in costs.items():
+        figures = {"p50_us": cost, "over_pinocchio": cost / costs["pinocchio"]}
         yield Row("model torque", robot.name, name, figures)
+
+
+def training_rows() -> Iterator[Row]:
+    """Median time of a training epoch [ms], and for one start on the paper's set-up the ratio of the torch loop to it.
+
+    two_link: the paper's set-up (explicit Euler, from rest at zero, 100 steps of 10 ms). The torch loop is the same law
+    and plant in eager torch, with closed-form ∇Φ and M, C, G. panda: 200 steps of RK4.
+    """
+    dynamics, robot = AnalyticDynamics(), load_robot("panda")
+    truth, reference = PinocchioDynamics(robot), Sinusoid.for_robot(robot)
+    for starts in (1, 64):
+        q0 = np.random.default_rng(0).uniform(-1.0, 1.0, (starts, 2)) * (starts > 1)
+        batch = _batch(DynamicsPlant(dynamics, "euler"), paper_reference(2), q0, 100, lookahead=0.0)
+        controller = paper_controller(dynamics)
+        figures = {"starts": float(starts), "steps": 100.0, "p50_ms": _epoch(controller, batch, "kernels", 20)}
+        if starts == 1:
+            figures["torch_ms"] = _epoch(controller, batch, "torch", 3)
+            figures["torch_over_kernels"] = figures["torch_ms"] / figures["p50_ms"]
+        yield Row("training epoch", "two_link", f"{starts} × 100", figures)
+    q0 = reference(0.0).q + np.random.default_rng(0).uniform(-0.5, 0.5, (64, robot.nv))
+    batch = _batch(DynamicsPlant(truth), reference, q0, 200, lookahead=None)
+    controller = NeuralBackstepping.for_robot(robot, truth, period=TRAINING_PERIOD)
+    figures = {"starts": 64.0, "steps": 200.0, "p50_ms": _epoch(controller, batch, "kernels", 5)}
+    yield Row("training epoch", "panda", "64 × 200", figures)
+
+
+def _batch(
+    plant: DynamicsPlant, reference: DesiredMotion, q0: np.ndarray, steps: int, lookahead: float | None
+) -> Batch:
+    settings = {"plant_step": TRAINING_PERIOD, "effort_limit": None, "lookahead": lookahead}
+    loop = Loop.of(plant, plant.nv, steps * TRAINING_PERIOD, TRAINING_PERIOD, **settings)
+    return Batch.of(loop, reference, q0)
+
+
+def _epoch(controller: nn.Module, batch: Batch, engine: Engine, repeats: int) -> float:
+    """Median time of forward, backward and update [ms], after one to warm up."""
+    optimiser = torch.optim.Adam(controller.parameters(), lr=1e-6)
+    times = []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        optimiser.zero_grad()
+        running_cost(motions(controller, batch, engine), batch, squared_error).mean().backward()  # type: ignore[arg-type,no-untyped-call]
+        optimiser.step()
+        times.append(1e3 * (time.perf_counter() - begin))
+    return float(np.median(times[1:]))
 
 
 def simulation_row(robot: Robot, duration: float = 5.0) -> Row:
@@ -173,21 +212,18 @@ def simulation_row(robot: Robot, duration: float = 5.0) -> Row:
 
 def endurance_row(robot: Robot, duration: float = 3600.0) -> Row:
     """An hour at 1 kHz under square-wave and noise torques, streamed: time, memory growth, and whether errors grow."""
-    controller = build_law("nbs", robot, period=PERIOD)
+    plant, controller = MujocoPlant(robot, "euler"), build_law("nbs", robot, period=PERIOD)
     square, noise = SquareWave(1.0, 5.0), TorqueNoise(0.1, PERIOD)
-    blocks = stream(
-        MujocoPlant(robot, "euler"),
-        controller,
-        Sinusoid.for_robot(robot),
-        duration,
-        PERIOD,
-        block=10_000,
-        disturbance=lambda t, q, v: square(t, q, v) + noise(t, q, v),
-    )
+
+    def disturbance(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return square(t, q, v) + noise(t, q, v)
+
+    reference = Sinusoid.for_robot(robot)
+    blocks = stream(plant, controller, reference, duration, PERIOD, block=10_000, disturbance=disturbance)
     start, errors, memory = time.perf_counter(), [], []
     for run in blocks:
         errors.append(metrics.rms_error(run) ** 2)
-        memory.append(_memory())
+        memory.append(psutil.Process().memory_info().rss / 2**20)
     sixth = len(errors) // 6
     first, last = (float(np.sqrt(np.mean(part, axis=0)).max()) for part in (errors[:sixth], errors[-sixth:]))
     figures = {
@@ -200,7 +236,7 @@ def endurance_row(robot: Robot, duration: float = 3600.0) -> Row:
 
 
 def workers_row(robot: Robot, starts: int = 1000, duration: float = 1.0) -> Row:
-    """A thousand starts on one core and on two: a process each, without threads of their own."""
+    """A thousand starts in one process and in two, without threads of their own."""
     controller, reference = build_law("nbs", robot, period=PERIOD), Sinusoid.for_robot(robot)
     plant = MujocoPlant(robot, "euler")
     q0 = reference(0.0).q + 0.1 * np.random.default_rng(0).normal(size=(starts, robot.nv))
@@ -219,10 +255,7 @@ def workers_row(robot: Robot, starts: int = 1000, duration: float = 1.0) -> Row:
 
 
 def compare(rows: list[Row], old: dict[str, dict[str, float]]) -> list[tuple[str, str, float, float]]:
-    """(row, figure, old, new) of every figure that both benches have and that moved by more than a tenth.
-
-    old: `rows_of` the other bench's summary.json.
-    """
+    """(row, figure, old, new) of every figure of both benches that moved by more than a tenth; old: from `rows_of`."""
     moved = []
     for row in rows:
         for name, new in row.figures.items():
@@ -233,11 +266,12 @@ def compare(rows: list[Row], old: dict[str, dict[str, float]]) -> list[tuple[str
 
 
 def rows_of(summary: Any) -> dict[str, dict[str, float]]:
-    """The figures of each row of a summary.json, by `Row.key`; raises ArgumentError when it is none."""
+    """The figures of each row of a summary.json, by `Row.key`."""
     try:
-        return {Row(r["what"], r["arm"], r["how"]).key: dict(r["figures"]) for r in summary["rows"]}
+        rows = [Row(r["what"], r["arm"], r["how"], dict(r["figures"])) for r in summary["rows"]]
+        return {row.key: row.figures for row in rows}
     except (TypeError, KeyError, ValueError) as error:
-        raise ArgumentError("the file to compare with is no summary.json of a bench; give one.") from error
+        raise ArgumentError("the file to compare with is not a summary.json of a bench; give one.") from error
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
@@ -273,9 +307,8 @@ def _times(function: Callable[..., Any], arguments: list[Any], calls: int) -> np
     return 1e-3 * times
 
 
-def _memory() -> float:
-    """Resident memory of this process now [MB]."""
-    return psutil.Process().memory_info().rss / 2**20
+def _median(function: Callable[..., Any], arguments: list[Any], calls: int) -> float:
+    return float(np.median(_times(function, arguments, calls)))
 
 
 def _processor() -> str:

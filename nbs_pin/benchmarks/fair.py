@@ -1,8 +1,8 @@
-"""The fair comparison: every law tuned alike on the same motions, and judged on starts that none of them has seen."""
+"""The fair comparison: every law tuned alike on the same motions, and judged on held-out starts."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +11,6 @@ import numpy as np
 from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
-from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import DesiredMotion, Sinusoid
@@ -25,11 +24,11 @@ from nbs_pin.training.evaluation import FRESH_STARTS, compared, fresh_batch, fre
 from nbs_pin.training.train import Training, train
 
 FREQUENCIES = (0.1, 1.0, 3.0)
-"""Of the references [rad/s]."""
+"""ω of the references [rad/s]."""
 LEARNING_RATES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
-"""Every law is tuned shortly with each, and goes on with the one of the lowest held-out cost."""
+"""Every law is tuned briefly with each, then longer with the one of the lowest held-out cost."""
 LEAST_SHARE = 0.1
-"""What tuning leaves at least of NBS's S, Λ and D₀; the gains of the other laws have no floor at all."""
+"""Least share of NBS's S, Λ and D₀ that tuning keeps; the gains of the other laws have no floor."""
 LAWS = {
     "NBS, untrained": "nbs",
     "NBS, trained": "nbs",
@@ -38,7 +37,7 @@ LAWS = {
     "PD+": "pd-plus",
     "PID": "pid",
 }
-"""Rows of the table, and the law of each as `build_controller` names it."""
+"""Rows of the table, and the name of each law for `build_law`."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Setting:
 
     arm: str
     period: float
-    """[s]; one plant step while tuning."""
+    """Control period, and plant step of the tuning [s]."""
     starts: int
     """Training starts per reference."""
     checking: int
@@ -59,20 +58,14 @@ class Setting:
     epochs: int = 60
     """Further epochs with the best of them."""
     duration: float = 1.0
-    """Of a training motion [s]."""
+    """Duration of a training motion [s]."""
     judged: float = 4.0
-    """Duration of the motions the table is made of [s]."""
+    """Duration of the motions of the table [s]."""
 
     @property
     def judged_step(self) -> float:
         """Longest plant step of those motions [s]."""
         return min(self.period, 0.005)
-
-    @property
-    def title(self) -> str:
-        """As the page says it."""
-        limit = "|τ| ≤ 100 N·m" if self.arm == "two_link" else "its own effort limits"
-        return f"{self.arm}, control at {1000 * self.period:g} ms, {limit}"
 
     def robot(self) -> Robot:
         """The arm with its limits."""
@@ -94,39 +87,38 @@ SETTINGS = (
 )
 
 
-@dataclass(frozen=True)
-class Row:
-    """A law on one reference, over held-out starts; figures as `training.evaluation.fresh_figures` has them."""
+class Row(NamedTuple):
+    """A law on one reference, over held-out starts; figures as in `training.evaluation.fresh_figures`."""
 
     arm: str
     period_s: float
     frequency_rad_per_s: float
     law: str
     convergence_time_median_s: float
-    """inf where most starts do not converge."""
+    """inf if most starts do not converge."""
     convergence_time_worst_s: float
     steady_error_rad2: float
-    """Aligned; NaN, as all below, where a motion is not finite."""
+    """Aligned in time; NaN, as all below, if a motion is not finite."""
     peak_torque_Nm: float
     rms_torque_Nm: float
     saturated_fraction: float
     learning_rate: float | None = None
-    """That went on; None for a law that is taken as it was built."""
+    """The best one; None for a law that is not tuned."""
     checking_cost: float | None = None
-    """Mean cost of the checking motions under the law as it was built, of all references."""
+    """Mean cost of the checking motions of all references before tuning."""
     checking_cost_tuned: float | None = None
     """The same after tuning."""
 
 
 class Tuned(NamedTuple):
-    """A law as it was built and as tuning left it."""
+    """A law after tuning."""
 
     law: Any
-    training: Training | None
-    """None for a law that is taken as it was built."""
-    learning_rate: float | None
-    checking_cost: float | None
-    """Of the law as it was built; None likewise."""
+    training: Training | None = None
+    """None for a law that is not tuned, as all below."""
+    learning_rate: float | None = None
+    checking_cost: float | None = None
+    """Before tuning."""
 
 
 def compare_fairly(
@@ -139,7 +131,7 @@ def compare_fairly(
     """A row per setting, reference and law.
 
     Every law but the untrained one is tuned by `train` with the same optimiser, cost, learning rates, epochs, motions
-    and checking motions, from its own `for_robot`; only then it meets the starts of the table.
+    and checking motions, from its own `for_robot`; only then it is judged on `held_out_starts` of every reference.
     """
     rows = []
     tasks = [(setting, name) for setting in settings for name in LAWS]
@@ -147,21 +139,21 @@ def compare_fairly(
     for setting, name in tracked(tasks, lambda: f"fair comparison, {doing[0]}", progress):
         doing[0] = f"{setting.arm} at {1000 * setting.period:g} ms, {name}"
         tuned = tune(setting, name, seed=seed)
-        cost = None if tuned.training is None else _checked(tuned.training)
+        after = None if tuned.training is None else _checked(tuned.training)
         for row in judge(setting, name, tuned.law, count=held_out_starts, seed=seed):
-            before, rate = tuned.checking_cost, tuned.learning_rate
-            rows.append(replace(row, learning_rate=rate, checking_cost=before, checking_cost_tuned=cost))
+            row = row._replace(learning_rate=tuned.learning_rate, checking_cost=tuned.checking_cost)
+            rows.append(row._replace(checking_cost_tuned=after))
     return rows
 
 
 def tune(setting: Setting, name: str, *, seed: int = 0) -> Tuned:
-    """The law of that row, tuned with the setting's budget: a short search over learning rates, then on with the best.
+    """The law of that row, tuned with the setting's budget: a search over learning rates, then longer with the best.
 
-    What going on does not better is left as the search had it.
+    If the longer training does not improve the law, that of the search is kept.
     """
-    law = _built(setting, name, setting.robot(), seed)
+    law = build_law(LAWS[name], setting.robot(), period=setting.period, seed=seed, least_share=LEAST_SHARE)
     if name == "NBS, untrained":
-        return Tuned(law, None, None, None)
+        return Tuned(law)
     searched = {rate: _train(setting, law, rate, setting.search, seed) for rate in LEARNING_RATES}
     rate = min(searched, key=lambda rate: _checked(searched[rate]))
     longer = _train(setting, searched[rate].controller, rate, setting.epochs, seed)
@@ -182,23 +174,19 @@ def judge(setting: Setting, name: str, law: Any, *, count: int, seed: int) -> li
 
 
 def fair_part(folder: Path, seed: int, progress: bool) -> list[Section]:
-    """Runs the comparison, writes `fair.csv` and `fair.png` into the folder, and returns sections for the page."""
+    """Run the comparison, write `fair.csv` and `fair.png` into the folder and return the sections of the page."""
     from nbs_pin.reports.charts import plot_comparison
 
     rows = compare_fairly(seed=seed, progress=progress)
-    write_csv(folder / "fair.csv", list(asdict(rows[0])), [list(asdict(row).values()) for row in rows])
-    plot_comparison([asdict(row) for row in rows], folder / "fair.png")
-    figures = plain([asdict(row) for row in rows])
-    return [Section("The fair comparison", _protocol(rows, seed), {"fair": figures})] + [
-        Section(setting.title, _of_setting([r for r in rows if (r.arm, r.period_s) == (setting.arm, setting.period)]))
-        for setting in SETTINGS
-    ]
-
-
-def _built(setting: Setting, name: str, robot: Robot, seed: int) -> Any:
-    if LAWS[name] == "nbs":
-        return NeuralBackstepping.for_robot(robot, period=setting.period, least_share=LEAST_SHARE, seed=seed)
-    return build_law(LAWS[name], robot, period=setting.period, seed=seed)
+    records = [row._asdict() for row in rows]
+    write_csv(folder / "fair.csv", Row._fields, rows)
+    plot_comparison(records, folder / "fair.png")
+    sections = [Section("The fair comparison", _protocol(rows, seed), {"fair": plain(records)})]
+    for s in SETTINGS:
+        limit = "|τ| ≤ 100 N·m" if s.arm == "two_link" else "its own effort limits"
+        own = [row for row in rows if (row.arm, row.period_s) == (s.arm, s.period)]
+        sections.append(Section(f"{s.arm}, control at {1000 * s.period:g} ms, {limit}", _tables(own)))
+    return sections
 
 
 def _train(setting: Setting, law: Any, rate: float, epochs: int, seed: int) -> Training:
@@ -218,7 +206,7 @@ def _train(setting: Setting, law: Any, rate: float, epochs: int, seed: int) -> T
         learning_rate=rate,
         seed=seed,
     )
-    if training.stopped == "interrupted":  # no law may be judged by less tuning than the others had
+    if training.stopped == "interrupted":  # every law gets the whole budget
         raise KeyboardInterrupt
     return training
 
@@ -228,7 +216,7 @@ def _checked(training: Training) -> float:
 
 
 def _protocol(rows: Sequence[Row], seed: int) -> str:
-    """How the table came about, from the settings themselves."""
+    """The method of the comparison, from its settings."""
     rates, cost = ", ".join(f"{rate:g}" for rate in LEARNING_RATES), TimeOutside(PAPER_THRESHOLD)
     head = ("setting", "epochs of search, each rate", "further epochs", "training starts per reference",
             "checking starts", "start error [rad]", "training motion [s]", "plant step, tuning [ms]", "judging [ms]",
@@ -241,13 +229,13 @@ def _protocol(rows: Sequence[Row], seed: int) -> str:
         )
         for s in SETTINGS
     ]
-    return f"""Each law starts from its own `for_robot` at 8 rad/s and is tuned by the same optimiser (Adam that goes
-back when the cost has risen): a search over {len(LEARNING_RATES)} learning rates ({rates}), then on with
+    return f"""Each law starts from its own `for_robot` at 8 rad/s and is tuned by the same optimiser (Adam that
+reverts when the cost has risen): a search over {len(LEARNING_RATES)} learning rates ({rates}), then longer with
 the best, on the same motions along references of {", ".join(f"{w:g}" for w in FREQUENCIES)} rad/s. Checking starts
 choose the epoch and the learning rate. The cost is ∫ ‖z1‖²/(‖z1‖² + {cost.threshold:g}) + {cost.pull:g}‖z1‖² dt, nearly
 the time spent outside the paper's mark of convergence, with torques cut off at the limits.
 
-The table is made of {FRESH_STARTS} further starts per reference. All starts are at rest, every joint within the start
+The table has {FRESH_STARTS} further starts per reference. All starts are at rest, every joint within the start
 error of the reference. Convergence is the paper's: the time from which ‖z1‖² stays below {PAPER_THRESHOLD:g} rad²,
 counted in control periods. Steady error is the largest ‖z1‖² of the last 30 % of the time over all starts, aligned in
 time. Peak torque is that of one joint, RMS torque that of ‖τ‖ over starts and time; saturated is the share of control
@@ -255,15 +243,15 @@ periods with any joint beyond its limit. One draw of starts, one seed: small lea
 
 {markdown_table(head, cells)}
 
-Every law but the PID has the exact, frictionless model, and all look half a period ahead. {_edges(rows)}
+Every law but the PID has the exact, frictionless model, and all have a look-ahead of half a period. {_edges(rows)}
 
-What is not equal: NBS alone has floors, tuning leaves at least {LEAST_SHARE:.0%} of its S, Λ and D₀, and a rate ω that
-tuning cannot move; the gains of every other law are free. Its networks are those of one seed ({seed}). Laws begin at
-different costs, given below each table. Tuning takes one plant step per control period, judging the steps above. It
-sees motions shorter than those it is judged by, and its cost hardly asks what a law does inside the mark: what chatters
-there, or later, was chosen all the same.
+What is not equal: only NBS has floors, at least {LEAST_SHARE:.0%} of its S, Λ and D₀, and a rate ω that tuning does not
+change; the gains of every other law are free. Its networks are those of one seed ({seed}). The laws start from
+different costs, given below each table. Tuning takes one plant step per control period, judging the steps above. The
+motions of the tuning are shorter than those of the table, and its cost hardly depends on the motion inside the mark:
+chattering there, or later, is not penalised.
 
-A lead of less than one control period is within the resolution of the measure, and is marked so:
+A lead of less than one control period is within the resolution of the measure, and is marked as such:
 
 {_findings(rows)}
 
@@ -272,29 +260,23 @@ A lead of less than one control period is within the resolution of the measure, 
 
 
 def _edges(rows: Sequence[Row]) -> str:
-    """Which laws the search left at an end of the learning rates."""
+    """The laws whose best learning rate is an end of the range."""
     ends = (min(LEARNING_RATES), max(LEARNING_RATES))
     found = dict.fromkeys(f"{r.law} on {r.arm} at {1000 * r.period_s:g} ms" for r in rows if r.learning_rate in ends)
-    return f"Left at an end of the learning rates: {', '.join(found) or 'none'}."
+    return f"Best learning rate at an end of the range: {', '.join(found) or 'none'}."
 
 
 def _findings(rows: Sequence[Row]) -> str:
-    """What the table carries, in sentences made from it."""
-    return "\n".join(
-        f"* {arm}, {1000 * period:g} ms, {frequency:g} rad/s: {_finding(group)}"
-        for (arm, period, frequency), group in _grouped(rows).items()
-    )
-
-
-def _grouped(rows: Sequence[Row]) -> dict[tuple[str, float, float], list[Row]]:
-    groups: dict[tuple[str, float, float], list[Row]] = {}
+    """Sentences on every setting and reference, from the numbers of the table."""
+    groups: dict[str, list[Row]] = {}
     for row in rows:
-        groups.setdefault((row.arm, row.period_s, row.frequency_rad_per_s), []).append(row)
-    return groups
+        where = f"{row.arm}, {1000 * row.period_s:g} ms, {row.frequency_rad_per_s:g} rad/s"
+        groups.setdefault(where, []).append(row)
+    return "\n".join(f"* {where}: {_finding(group)}" for where, group in groups.items())
 
 
 def _finding(group: Sequence[Row]) -> str:
-    """Who converges first in one setting along one reference, by how much, and where trained NBS stands."""
+    """Which law converges first in one setting along one reference, by how much, and the figures of trained NBS."""
     first, *others = sorted(group, key=lambda row: row.convergence_time_median_s)
     best, second = first.convergence_time_median_s, others[0].convergence_time_median_s
     ours = next(row for row in group if row.law == "NBS, trained")
@@ -307,28 +289,15 @@ def _finding(group: Sequence[Row]) -> str:
     if second - best < (1.0 - 1e-9) * first.period_s:
         lead += ", less than one control period apart and so within the resolution of the measure"
     as_built = ours.checking_cost is not None and ours.checking_cost == ours.checking_cost_tuned
-    told = ", as it was built since no tuning bettered it," if as_built else ":"
+    told = ", as it was built since tuning did not improve it," if as_built else ":"
     return (
         f"{lead}. Trained NBS{told} median {_time(ours.convergence_time_median_s)} s, worst start"
         f" {_time(ours.convergence_time_worst_s)} s, steady error {_number(ours.steady_error_rad2, '.1e')} rad²."
     )
 
 
-def _of_setting(rows: Sequence[Row]) -> str:
-    return f"{_tables(rows)}\n\nWhat tuning did to the mean cost of the checking motions [s]:\n\n{_tuning(rows)}"
-
-
-def _tuning(rows: Sequence[Row]) -> str:
-    """Per law, the learning rate and the cost before and after."""
-    tuned = {row.law: row for row in rows if row.checking_cost is not None}
-    cells = [
-        (law, f"{r.learning_rate:g}", f"{r.checking_cost:.4f}", f"{r.checking_cost_tuned:.4f}")
-        for law, r in tuned.items()
-    ]
-    return markdown_table(("law", "learning rate", "before", "after"), cells)
-
-
 def _tables(rows: Sequence[Row]) -> str:
+    """The figures of every law and reference of one setting, and the tuning of every law."""
     head = ("law", "ω [rad/s]", "convergence, median [s]", "worst [s]", "steady error [rad²]", "RMS torque [N·m]",
             "peak torque [N·m]", "saturated")  # fmt: skip
     cells = [
@@ -344,7 +313,12 @@ def _tables(rows: Sequence[Row]) -> str:
         )
         for r in sorted(rows, key=lambda r: r.frequency_rad_per_s)
     ]
-    return markdown_table(head, cells)
+    tuned = {r.law: (r.law, f"{r.learning_rate:g}", f"{r.checking_cost:.4f}", f"{r.checking_cost_tuned:.4f}")
+             for r in rows if r.checking_cost is not None}  # fmt: skip
+    tuning = markdown_table(("law", "learning rate", "before", "after"), list(tuned.values()))
+    return (
+        f"{markdown_table(head, cells)}\n\nMean cost of the checking motions [s] before and after tuning:\n\n{tuning}"
+    )
 
 
 def _time(value: float) -> str:

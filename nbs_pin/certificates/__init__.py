@@ -1,1 +1,1 @@
-"""What a controller promises before it moves, how each promise is known, and attempts to break it."""
+"""Certified bounds of the closed loop and how each is known, worst-case search, monitors and design."""

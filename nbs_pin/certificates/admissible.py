@@ -1,4 +1,4 @@
-"""The disturbances a certificate is about: every τ_d(t) whose torques stay inside a box or a ball."""
+"""Admissible disturbances: every τ_d(t) that stays inside a box or a ball."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,16 @@ _LEAST, _GREATEST = 1e-100, 1e100
 
 @dataclass(frozen=True, eq=False)
 class Admissible:
-    """|τ_d,i| ≤ box_i for every joint or ‖τ_d‖ ≤ radius [N·m], at every instant; nothing else is asked of τ_d(t)."""
+    """The disturbances with |τ_d,i(t)| ≤ box_i for every joint, or with ‖τ_d(t)‖ ≤ radius, varying arbitrarily in t.
+
+    Raises:
+        ArgumentError: If not exactly one of the two is given, or a bound is neither 0 nor between 1e-100 and 1e100.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> print(nbs.Admissible.of([5.0, 2.0], nv=2))
+        |τ_d,i| ≤ (5, 2) N·m
+    """
 
     box: JointArray | None = None
     """Largest |τ_d,i| [N·m]."""
@@ -24,20 +33,24 @@ class Admissible:
 
     def __post_init__(self) -> None:
         given = np.asarray(self.radius if self.box is None else self.box, dtype=float)
-        usable = (given == 0.0) | ((given >= _LEAST) & (given <= _GREATEST))  # whose squares are numbers too
+        usable = (given == 0.0) | ((given >= _LEAST) & (given <= _GREATEST))  # its square is a number > 0
         if (self.box is None) == (self.radius is None) or given.ndim > 1 or not usable.all():
             raise ArgumentError(
-                f"disturbance has the box {self.box} and the radius {self.radius} N·m, expected one of the two, every "
-                f"number 0 or from {_LEAST:g} to {_GREATEST:g}; correct it."
+                f"disturbance has the box {self.box} and the radius {self.radius} N·m, expected one of the two, each "
+                f"bound 0 or from {_LEAST:g} to {_GREATEST:g}; correct it."
             )
 
     @classmethod
     def of(cls, disturbance: "PerJoint | Admissible", nv: int) -> "Admissible":
-        """One bound per joint is a box, a single number a ball; raises ArgumentError unless they are finite and ≥ 0."""
+        """The box of one bound per joint, the ball of a single number [N·m], or the given `Admissible` itself.
+
+        Raises:
+            ArgumentError: If the bounds do not fit `nv` joints, or are not finite and ≥ 0.
+        """
         if isinstance(disturbance, Admissible):
             if disturbance.box is not None and len(disturbance.box) != nv:
                 raise ArgumentError(
-                    f"the disturbance has {len(disturbance.box)} bounds for {nv} joints; give one for each."
+                    f"the disturbance has {len(disturbance.box)} bounds for {nv} joints; give one per joint."
                 )
             return disturbance
         given = floats("disturbance", disturbance)
@@ -48,15 +61,12 @@ class Admissible:
         return cls(radius=float(given)) if given.ndim == 0 else cls(box=given)
 
     def energy(self, metric: Float[np.ndarray, "n n"]) -> float:
-        """At least sup τ_dᵀ A τ_d for the positive definite A, and just that for a diagonal A or a ball.
-
-        Over a box: Σ |A_ij| box_i box_j. Rounded up.
-        """
+        """Upper bound of τ_dᵀAτ_d over the set for A ≻ 0, rounded up; the supremum for a ball or a diagonal A."""
         n = len(metric)
         if self.box is not None:
             value = float(self.box @ np.abs(metric) @ self.box)
         else:
-            # The spectrum from the symmetric eigenvalue solver, with its error n·eps·‖A‖ eight times over.
+            # The symmetric eigenvalue solver is accurate to about n·eps·‖A‖; eight times that is allowed for.
             slack = 8.0 * n * np.finfo(float).eps * float(np.linalg.norm(metric))
             value = (self.radius or 0.0) ** 2 * (float(np.linalg.eigvalsh(metric)[-1]) + slack)
         return value * (1.0 + 1e-12)
@@ -67,13 +77,13 @@ class Admissible:
         return not self.radius if self.box is None else not self.box.any()
 
     def contains(self, tau_d: Vectors) -> bool:
-        """Whether every torque is admissible, to twelve digits."""
+        """Whether every torque is admissible, up to a relative tolerance of 1e-12."""
         if self.box is not None:
             return bool((np.abs(tau_d) <= self.box * (1.0 + 1e-12)).all())
         return bool((np.linalg.norm(tau_d, axis=-1) <= (self.radius or 0.0) * (1.0 + 1e-12)).all())
 
     def towards(self, direction: Vectors) -> Vectors:
-        """The admissible torque of greatest inner product with each direction: a corner of the box, or d·g/‖g‖."""
+        """The admissible torque with the greatest inner product with each direction g: box·sign(g), or radius·g/‖g‖."""
         if self.box is not None:
             return self.box * np.sign(direction)
         size = np.linalg.norm(direction, axis=-1, keepdims=True)

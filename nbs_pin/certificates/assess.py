@@ -1,4 +1,4 @@
-"""A law certified for one task, attacked, and a run held against the certificate."""
+"""Certification of a law for one task, with a search for its worst disturbance and the check of a recorded run."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -26,60 +26,60 @@ from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
 
 TRAJECTORIES = 374
-"""Closed-loop motions that a learned model is judged on (`accuracy/mismatch.py`)."""
+"""Closed-loop trajectories from which the error of a learned model is bounded (`accuracy/mismatch.py`)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Certified:
-    """A certificate and what was held beside it."""
+    """A certificate with the attack, the monitored run and the design that belong to it."""
 
     certificate: Certificate
     loads: tuple[Load, ...]
-    """What of the disturbance was worked out."""
+    """Parts of the disturbance that were computed from loads."""
     attack: Attack | None
-    """The worst motion found; None where nothing disturbs or no motion stayed finite."""
+    """The worst motion found; None without a disturbance, or if a motion diverged."""
     thorough: bool
-    """Whether the adversary climbed, or only waves were tried."""
+    """Whether gradients were followed; otherwise only constants and square waves were tried."""
     diverged: str = ""
-    """Why no motion was found, where one left the finite numbers."""
+    """The error message if a motion diverged, otherwise empty."""
     exceeding: Monitored | None = None
-    """The worst motion held against the certificate, where it or another one exceeded a bound."""
+    """The worst motion checked against the certificate, if any motion exceeded a bound."""
     watched: Monitored | None = None
-    """The run that was given, held against it."""
+    """The given run checked against the certificate."""
     proposal: Proposal | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Where and against what a law is certified."""
+    """The motion, disturbance and true arm that a law is certified for."""
 
     reference: DesiredMotion
     duration: float = 10.0
-    """How much of the reference counts [s]."""
+    """Length of the reference that is used [s]."""
     period: float = 0.001
     """Control period [s]."""
     disturbance: Admissible | None = None
-    """What was given as numbers."""
+    """The disturbance given as numbers; loads are added to it."""
     payload: float | None = None
-    """Mass that the model leaves out [kg]."""
+    """Payload that the model does not include [kg]."""
     link: str | None = None
-    """The link that carries it; None takes `loads.tool_frame`."""
+    """The link that carries the payload; None takes `loads.tool_frame`."""
     friction: tuple[PerJoint, PerJoint] | str | None = None
-    """Viscous and Coulomb coefficients of friction that nothing feeds forward, or "urdf"."""
+    """Viscous and Coulomb coefficients of joint friction that is not fed forward, or "urdf"."""
     gravity_error: float | None = None
-    """‖Δg‖ [m/s²]."""
+    """Largest ‖Δg‖ [m/s²]."""
     margin: float = MARGIN
-    """What loads along the reference are multiplied with."""
+    """Factor on the torques of the loads along the reference."""
     start_error: float = 0.0
-    """Of every joint, in turn up and down, for the overshoot [rad]."""
+    """Initial error of every joint, with alternating sign, for the bound of the overshoot [rad]."""
     truth: Robot | None = None
-    """The true arm, where it is not the one of the model."""
+    """The true arm, if it is not the model's."""
     trajectories: int = TRAJECTORIES
-    """Closed-loop motions that a model that is not exact is judged on."""
+    """Closed-loop trajectories from which the error of an inexact model is bounded."""
     seed: int = 0
 
     def loads(self, robot: Robot) -> tuple[Load, ...]:
-        """The loads worked out for the arm; raises ArgumentError for numbers that do not fit it."""
+        """The loads computed for the arm; raises ArgumentError if they do not fit it."""
         along: dict[str, Any] = {"duration": self.duration, "margin": self.margin}
         found = []
         if self.payload is not None:
@@ -101,9 +101,11 @@ def assess(
     proposal: Proposal | None = None,
     progress: bool = False,
 ) -> Certified:
-    """The certificate, the worst motion that waves (or, thorough, the adversary) find, and a run held against it.
+    """The certificate, the worst motion found (`thorough`: by gradients, too), and the check of a given run.
 
-    Raises CertificateRefused for a controller of which nothing can be promised, ArgumentError for what does not fit.
+    Raises:
+        CertificateRefused: If no bound can be given for the controller.
+        ArgumentError: If task, run and controller do not fit each other.
     """
     robot = arm_of(controller, task)
     loads, admissible = disturbance_of(robot, task)
@@ -132,12 +134,12 @@ def assess(
 
 
 def exceeds(found: Attack, certificate: Certificate) -> bool:
-    """Whether the worst found is beyond a bound, of ‖z1‖ or of a joint."""
+    """Whether the largest errors found exceed a bound, of ‖z1‖ or of a joint."""
     return found.error > certificate.error or bool((found.joint_errors > certificate.joint_errors).any())
 
 
 def design(robot: Robot, task: Task, error: PerJoint, *, period: float | None = None) -> Proposal:
-    """`propose` for the disturbance of the task; period: the only one to take [s], None takes the longest that does."""
+    """`propose` for the disturbance of the task; `period` fixes the control period [s], None takes the longest one."""
     _, admissible = disturbance_of(robot, task)
     periods = PERIODS if period is None else (period,)
     return propose(
@@ -146,17 +148,17 @@ def design(robot: Robot, task: Task, error: PerJoint, *, period: float | None = 
 
 
 def arm_of(controller: LyapunovLaw, task: Task) -> Robot:
-    """The true arm; raises ArgumentError where none is known or its joints are of another number."""
+    """The true arm; raises ArgumentError if none is known or its number of joints differs."""
     robot = controller.dynamics.robot if task.truth is None else task.truth
     if robot is None:
-        raise ArgumentError("the controller's model names no arm; give --against ROBOT, the true one.")
+        raise ArgumentError("the controller's model does not name its arm; give the true one with --against ROBOT.")
     if robot.nv != controller.nv:
         raise ArgumentError(f"the controller has {controller.nv} joints and {robot.name} {robot.nv}; give its own arm.")
     return robot
 
 
 def disturbance_of(robot: Robot, task: Task) -> tuple[tuple[Load, ...], Admissible]:
-    """The loads of the task, and all of its disturbance together; raises ArgumentError where there is none."""
+    """The loads of the task and its total disturbance; raises ArgumentError if it has none."""
     loads = task.loads(robot)
     given = [] if task.disturbance is None else [task.disturbance]
     if not (given or loads):
@@ -167,9 +169,9 @@ def disturbance_of(robot: Robot, task: Task) -> tuple[tuple[Load, ...], Admissib
 def model_error(
     controller: LyapunovLaw, robot: Robot, task: Task, admissible: Admissible, progress: bool = False
 ) -> Mismatch:
-    """δ of the controller's model along its own closed loop on the true arm, from independent starts and disturbances.
+    """δ of the controller's model along closed loops on the true arm, with independent starts and disturbances.
 
-    Starts are at rest within ±0.1 rad of the reference, disturbances are random and admissible, over 2 s.
+    The starts are at rest within ±0.1 rad of the reference; random admissible disturbances act for 2 s.
     """
     truth, period, rng = PinocchioDynamics(robot), max(task.period, 0.002), np.random.default_rng((task.seed, 3))
     steps = round(2.0 / period)
@@ -195,10 +197,7 @@ def model_error(
 
 
 def _attacked(certificate: Certificate, task: Task, thorough: bool, progress: bool) -> tuple[Attack | None, str]:
-    """The worst motion, or why there is none.
-
-    Along the reference, and in other postures too where the disturbance does not depend on it.
-    """
+    """The worst motion found or why one diverged; at rest, too, if the disturbance is not that of the reference."""
     if certificate.admissible.is_zero or certificate.robot is None:
         return None, ""
     controller, robot = certificate.controller, certificate.robot

@@ -1,7 +1,7 @@
-"""What a certificate promises and assumes, and how a motion shows that it did not hold.
+"""Bounds along a motion, and the assumptions of its certificate that the motion violates.
 
-Whatever the cause, a promise can only be broken by torques that are not admissible: with V̇ ≤ −c(V − V∞) for admissible
-ones, V exceeds what was promised by at most the energy that the rest of the torque has brought, less what has decayed.
+Admissible torques give V̇ ≤ −c(V − V∞). Hence only inadmissible torques, whatever their cause, can lift V above its
+bound, and by no more than the energy that they have supplied, less what has decayed since.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,46 +18,46 @@ from nbs_pin.certificates.energy_balance import Balance, LoopSamples, beyond
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 
 WRONG = "the certificate is wrong"
-"""What is said when none of the assumptions accounts for what happened."""
+"""The verdict if no violated assumption accounts for an exceeded bound."""
 ROUNDING, DIFFERENCES = 1e-9, 1e-3
-"""Shares of a promise: the error of V itself, and of energies summed over periods."""
+"""Relative tolerances of a bound: for V itself, and for energies summed over periods."""
 NOTICEABLE = 0.01
-"""Share of what V may be that a held torque may bring before it is reported."""
+"""Share of the bound of V that holding the torque may supply before it is reported."""
 _EPS = float(np.finfo(float).eps)
 _OF_RATE = 0.1
-_OF_BOUND, _OF_TORQUE = 1e-2, 1e-3  # torques below these shares are not told from the error of differences
+_OF_BOUND, _OF_TORQUE = 1e-2, 1e-3  # smaller torques are within the error of finite differences
 
 
 def check_certificate(certificate: Any) -> None:
-    """Raises ArgumentError unless it is a certificate."""
+    """Raises ArgumentError unless it is a `Certificate`."""
     if not isinstance(certificate, Certificate):
-        raise ArgumentError(f"a {type(certificate).__name__} promises nothing; give the certificate that certify made.")
+        raise ArgumentError(f"certificate is a {type(certificate).__name__}; give the certificate that certify made.")
 
 
 def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption, str], *, is_recorded: bool) -> str:
-    """The verdict; at: what broke the promise and when. failed: the assumptions that failed, and when.
+    """The verdict. at: the exceeded bounds and the time. failed: the violated assumptions with their times.
 
-    is_recorded: whether disturbance and model can be told apart.
+    is_recorded: whether the disturbance is recorded, so that it can be distinguished from a model error.
     """
     said = {name: name + when for name, when in failed.items()}
     if not is_recorded and Assumption.MODEL in said and Assumption.DISTURBANCE in said:
         said[Assumption.MODEL] = f"{Assumption.MODEL}, or {said.pop(Assumption.DISTURBANCE)}"
     named = "; ".join(said.values())
     if is_kept:
-        return "promise kept" + (f", though this failed: {named}" if named else "")
+        return "promise kept" + (f", though assumptions failed: {named}" if named else "")
     if not is_wrong:
-        return f"promise broken{at}; of its assumptions this failed: {named}"
-    why = f"this failed and does not account for it: {named}" if named else "none of its assumptions failed"
+        return f"promise broken{at}; assumptions that failed: {named}"
+    why = f"for which the failed assumptions do not account ({named})" if named else "though no assumption failed"
     return f"promise broken{at}, {why}: {WRONG}"
 
 
 def listed(excesses: Sequence[str]) -> str:
-    """What went beyond its bound, in a few words."""
+    """The names of the exceeded bounds, at most three."""
     return ", ".join(excesses[:3]) + (" and others" if len(excesses) > 3 else "")
 
 
 class Promise(NamedTuple):
-    """What a certificate promises of V, ‖z1‖ and each |z1_i|, the quantities (2 + n), from a start."""
+    """A certificate's bounds of V, ‖z1‖ and each |z1_i|, the 2 + n quantities, from a start."""
 
     certificate: Certificate
     initial: float
@@ -65,13 +65,13 @@ class Promise(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the quantities."""
+        """Names of the quantities."""
         return ("V", "‖z1‖", *(f"|z1| of {name}" for name in self.certificate.joint_names))
 
     def bounds(self, t: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "rows quantities"]:
-        """What they were not to exceed, t [s] after the start [J, rad].
+        """The bounds, t [s] after the start [J, rad].
 
-        Bounds of z1 go with √Φ, and Φ ≤ V ≤ its promise: from V(0) > V∞ they fall as the root of that promise does.
+        Bounds of z1 are proportional to √Φ, and Φ ≤ V: from V(0) > V∞ they decay as the root of the bound of V.
         """
         storage, first = self.certificate.storage_bound(t, self.initial), self._largest
         fallen = np.sqrt(storage / first) if first > 0.0 else np.ones(len(t))
@@ -81,7 +81,7 @@ class Promise(NamedTuple):
     def exceeded(
         self, values: Float[np.ndarray, "rows quantities"], bounds: Float[np.ndarray, "rows quantities"]
     ) -> Bool[np.ndarray, "rows quantities"]:
-        """Where a bound is broken by more than rounding."""
+        """Where a bound is exceeded by more than rounding errors."""
         return np.asarray(values > bounds * (1.0 + ROUNDING) + _EPS * (1.0 + self.initial))
 
     def accounted(
@@ -90,10 +90,10 @@ class Promise(NamedTuple):
         energy: Float[np.ndarray, " rows"],
         ratio: Float[np.ndarray, " rows"],
     ) -> Float[np.ndarray, "rows quantities"]:
-        """What they can be at most when torques beyond the admissible ones brought that energy [J].
+        """The largest values that are possible after inadmissible torques have supplied that energy [J].
 
-        ratio: how many times the bound torques have been so far, ≥ 1 and inf where that says nothing. Bounds are
-        proportional to the disturbance, so those of z1 grow no more than `ratio` times; nor do they pass the root of V.
+        ratio: the largest ratio of torque to bound so far, ≥ 1, inf if a bound is 0. The bounds of z1 are proportional
+        to the disturbance, so they grow at most by this factor, and at most as the root of V does.
         """
         storage, top = bounds[:, 0] * (1.0 + DIFFERENCES) + energy, self._largest or 1.0
         size, joints = self.certificate.from_start(top)
@@ -104,7 +104,7 @@ class Promise(NamedTuple):
 
     @property
     def _largest(self) -> float:
-        """What V never exceeds [J]."""
+        """The largest value that V can take [J]."""
         return max(self.initial, self.certificate.storage)
 
 
@@ -116,17 +116,17 @@ def quantities(
 
 
 class Setting(NamedTuple):
-    """What torques are held against."""
+    """The limits that torques are compared with."""
 
     admissible: Admissible
     granted: Float[np.ndarray, " periods"]
-    """What a learned model's error may be [N·m]."""
+    """Allowance for the error of a learned model [N·m]."""
     told: Float[np.ndarray, " periods"]
-    """Torques below this are not told from the error of differences over a period [N·m]."""
+    """Torques below this are within the error of finite differences over a period [N·m]."""
 
     @classmethod
     def of(cls, certificate: Certificate, flow: Balance, at: LoopSamples) -> "Setting":
-        """Of the periods between those instants."""
+        """The limits in the periods between those instants."""
         admissible, mismatch, step = certificate.admissible, certificate.mismatch, np.diff(at.t)
         size = float(np.linalg.norm(admissible.box)) if admissible.box is not None else admissible.radius or 0.0
         q, v = flow.state_norms[:, 0], flow.state_norms[:, 1]
@@ -137,7 +137,7 @@ class Setting(NamedTuple):
         return cls(admissible, granted, _OF_BOUND * size + (_OF_TORQUE + (step * fastest) ** 2) * torque)
 
     def beyond(self, torque: Float[np.ndarray, "periods n"]) -> Float[np.ndarray, " periods"]:
-        """How far each torque is from what is admissible and granted [N·m]."""
+        """Distance of each torque from the admissible set and the allowance [N·m]."""
         return np.asarray(np.linalg.norm(beyond(self.admissible, torque, self.granted), axis=-1))
 
 
@@ -149,12 +149,11 @@ def failures(
     is_broken: bool,
     recorded: Float[np.ndarray, "rows n"] | None,
 ) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
-    """The assumptions that failed by more than can be told from the error of differences, and when.
+    """The assumptions that were violated by more than the error of finite differences, and when.
 
-    jumped: as `jumps` finds it. held: when what the held torque has brought is worth reporting; where a promise
-    `is_broken`, any of it is.
-    recorded: the disturbance [N·m]; where it is None or zero, model and disturbance cannot be told apart, and what is
-    unexplained is said of both.
+    jumped: from `jumps`. held: when the energy supplied by holding the torque is worth reporting; if a bound
+    `is_broken`, any of it is. recorded: the recorded disturbance [N·m]; if it is None or zero, an unexplained torque
+    is attributed to both model and disturbance, which cannot be distinguished.
     """
     told, admissible = setting.told, setting.admissible
     rest = beyond(admissible, flow.unexplained, setting.granted)
@@ -172,10 +171,10 @@ def failures(
 
 
 def excess_of(flow: Balance, setting: Setting) -> tuple[Float[np.ndarray, " periods"], Float[np.ndarray, " periods"]]:
-    """What torques beyond the admissible ones can have done, whatever their cause: power [W], and times the bound.
+    """The most that inadmissible torques can have done, whatever their cause: power [W], and ratio to their bound.
 
-    Torques count as greater than they seem by what cannot be told. V̇ beyond the sum of its terms is the error of taking
-    those in the middle of a period, and counts as power too.
+    Torques are enlarged by the error of finite differences. An excess of V̇ over the sum of its terms, which are
+    evaluated in the middle of a period, counts as power too.
     """
     torque = flow.unexplained + flow.lag + flow.cut
     size = np.linalg.norm(torque, axis=-1)
@@ -192,7 +191,7 @@ def excess_of(flow: Balance, setting: Setting) -> tuple[Float[np.ndarray, " peri
 def summed(
     power: Float[np.ndarray, " periods"], steps: Float[np.ndarray, " periods"], decay: float
 ) -> Float[np.ndarray, " rows"]:
-    """What is left of the energy that a power has brought, and c = `decay` [1/s] took away, at every row [J]."""
+    """The energy that a power has supplied, decaying at the rate c = `decay` [1/s], at every row [J]."""
     energy = np.zeros(len(power) + 1)
     for k, (more, step) in enumerate(zip(power.tolist(), steps.tolist(), strict=True)):
         energy[k + 1] = decayed(float(energy[k]), more, step, decay)
@@ -200,14 +199,14 @@ def summed(
 
 
 def decayed(energy: float, power: float, step: float, decay: float) -> float:
-    """What is left of an energy after a step, with the power that came in; never less than nothing."""
+    """An energy after one step of decay and supplied power, at least 0 [J]."""
     return max(energy * float(np.exp(-decay * step)) + power * step, 0.0)
 
 
 def greatest(
     flow: Balance, admissible: Admissible, recorded: Float[np.ndarray, "rows n"] | None
 ) -> tuple[Assumption, ...]:
-    """Which of the small excesses, none told apart by itself, was the greatest."""
+    """The assumption with the largest excess, if none of the excesses is significant by itself."""
     unexplained = np.linalg.norm(beyond(admissible, flow.unexplained), axis=-1).max()
     if np.linalg.norm(flow.lag, axis=-1).max() >= unexplained:
         return (Assumption.TIME,)
@@ -217,19 +216,19 @@ def greatest(
 
 
 def is_cut(flow: Balance) -> Bool[np.ndarray, " periods"]:
-    """Whether another torque acted than was asked for."""
+    """Whether the applied torque differs from the commanded one."""
     return np.asarray((flow.cut != 0.0).any(axis=-1))
 
 
 JUMPS = (Assumption.WRAP, Assumption.REFERENCE)
-"""Assumptions without which V itself jumps, so that no power accounts for what it does."""
+"""Assumptions whose violation lets V jump, so that no power accounts for its change."""
 
 
 def jumps(controller: LyapunovLaw, at: LoopSamples) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
-    """When an error leapt from one end of its turn to the other, and when the reference is no motion with a velocity.
+    """When the error of a continuous joint wrapped around, and when the reference contradicts its own derivatives.
 
-    Between two instants a smooth reference moves by the mean of its velocities, but for a share of these and of their
-    change; so does its velocity by the mean of its accelerations, which may jump.
+    Between two instants a smooth reference moves by the mean of its velocities, up to a share of these and of their
+    change, and its velocity by the mean of its accelerations, which may jump.
     """
     z1, robot = controller.dynamics.difference(at.q, at.q_ref), controller.dynamics.robot
     wrapped = np.zeros(len(z1) - 1, dtype=bool)

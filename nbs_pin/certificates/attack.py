@@ -1,6 +1,6 @@
-"""An adversary: the worst admissible disturbance it can find for a closed loop, to hold beside what is certified.
+"""Search for the worst admissible disturbance of a closed loop, to compare with the certified bound.
 
-Every motion starts on its reference, z1 = z2 = 0, and the torque is held over each control period. What it finds is a
+Every motion starts on its reference, z1 = z2 = 0, and the torque is held over each control period. The result is a
 lower bound of the worst error, never an upper one.
 """
 
@@ -29,20 +29,20 @@ __all__ = ["Attack", "Peaks", "attack", "random_disturbances", "worst_of"]
 
 @dataclass(frozen=True, eq=False)
 class Attack:
-    """The worst that was found, a lower bound of the worst there is."""
+    """The worst motion that `attack` found; its errors are lower bounds of the worst ones."""
 
     error: float
-    """Largest ‖z1(t)‖ [rad] of all motions tried."""
+    """Largest ‖z1(t)‖ of all motions tried [rad]."""
     joint_errors: JointArray
-    """Largest |z1_i(t)| [rad], each over all motions tried."""
+    """Largest |z1_i(t)| of all motions tried, joint by joint [rad]."""
     disturbance: Float[np.ndarray, "steps n"]
-    """The τ_d [N·m] that reached `error`, held over each period."""
+    """The τ_d that reached `error`, held over each period [N·m]."""
     run: Run
-    """Its motion."""
+    """The motion under `disturbance`."""
     found_by: str
-    """What found it: "constant", "square wave" or "bang-bang ascent" ("steepest ascent" in a ball)."""
+    """Kind of `disturbance`: "constant", "square wave" or "bang-bang ascent" ("steepest ascent" in a ball)."""
     history: Float[np.ndarray, " stages"]
-    """Largest ‖z1‖ [rad] known after the waves and after every round of ascent; it never falls."""
+    """Largest ‖z1‖ found after the initial waves and after every round of ascent, non-decreasing [rad]."""
     duration: float
     """Length of every motion [s]."""
     period: float
@@ -63,22 +63,37 @@ def attack(
     effort_limit: PerJoint = np.inf,
     progress: bool = False,
 ) -> Attack:
-    """The worst ‖z1‖ and |z1_i| that a search over admissible disturbances finds.
+    """Search for the admissible disturbance that causes the largest ‖z1‖, and the largest |z1_i| of every joint.
 
-    Constants and square waves of 1 to 300 rad/s come first. From the worst of them, of every motion and for each joint
-    by itself, the torque climbs the gradient of ‖z1‖² or z1_i² at the end, or at the time of the peak: at every instant
-    it becomes the admissible torque of greatest inner product with the gradient, which in a linear loop is the exact
-    worst case of z1_i after one round; where that overshoots, it does so only at the instants that promise most.
+    It starts with constants and square waves of 1 to 300 rad/s. From the worst of them it follows the gradient of ‖z1‖²
+    or z1_i² at the final time and at the peak, in turn: at every instant the torque becomes the admissible one with the
+    greatest inner product with the gradient, in a linear loop the exact worst case of z1_i after one round. After a
+    step without gain, only the instants with the greatest predicted gain change.
 
-    disturbance: one bound per joint, a bound on ‖τ_d‖ or an `Admissible`. reference: the motion to follow, or several;
-    None takes the arm's own (`Sinusoid.for_robot`) and postures held still. plant_dynamics: the truth, None for what
-    the controller believes; it has the friction that the controller feeds forward.
-    duration [s]: None takes seven times the slowest time constant of the loop linearised at the start, at most 4000
-    periods. period: control period [s]. rounds: of ascent. starts: disturbances that climb, beside one per joint.
-    effort_limit: [N·m], none, as certificates assume. progress: show a progress bar on a terminal.
+    Args:
+        controller: A law with a model.
+        disturbance: One bound per joint on |τ_d,i|, one number that bounds ‖τ_d‖ [N·m], or an `Admissible`.
+        reference: One motion or several. None takes `Sinusoid.for_robot` and postures at rest.
+        plant_dynamics: The true dynamics. None takes the controller's model. Joint friction is the one fed forward.
+        duration: Length of every motion [s]. None takes seven times the slowest time constant of the linearised loop,
+            at most 4000 periods.
+        period: Control period [s].
+        rounds: Rounds of gradient ascent.
+        starts: Disturbances to improve, besides one per joint.
+        seed: Seed of postures and waves.
+        effort_limit: Saturation of the torque [N·m]. Certificates assume none.
+        progress: Show a progress bar.
 
-    Raises ArgumentError for arguments that do not fit, and for a law without a model, as gradients go through one;
-    SimulationDiverged when a motion leaves the finite numbers.
+    Raises:
+        ArgumentError: If an argument does not fit, or the law has no model for the gradients to pass through.
+        SimulationDiverged: If a motion diverges.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> controller = nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link"))
+        >>> found = nbs.attack(controller, [5.0, 5.0], duration=0.1, rounds=0)
+        >>> found.error < nbs.certify(controller, [5.0, 5.0]).error
+        True
     """
     for name, value, least in (("rounds", rounds, 0), ("starts", starts, 1), ("seed", seed, 0)):
         _check_count(name, value, least)
@@ -117,10 +132,7 @@ def worst_of(
     seed: int = 0,
     progress: bool = False,
 ) -> Peaks:
-    """Largest errors under each of the disturbances [N·m], held over each period; several motions take turns.
-
-    Arguments as in `attack`, errors too. Raises ArgumentError for disturbances of another shape or not finite.
-    """
+    """Largest errors under each held disturbance [N·m]; arguments as in `attack`, several motions are used in turn."""
     law_of(controller)
     _check_count("seed", seed, 0)
     disturbances = floats("disturbances", disturbances)
@@ -129,7 +141,7 @@ def worst_of(
             f"the disturbances have shape {disturbances.shape}, expected (count, steps, {controller.nv}); correct them."
         )
     if not np.isfinite(disturbances).all():
-        raise ArgumentError("the disturbances hold numbers that are not finite; correct them.")
+        raise ArgumentError("the disturbances contain numbers that are not finite; correct them.")
     duration = disturbances.shape[1] * period
     ensemble = LoopEnsemble.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
     return ensemble.peaks(np.arange(len(disturbances)) % len(ensemble.scenes), disturbances, progress)
@@ -160,29 +172,29 @@ def _waves(
 
 @dataclass(frozen=True, eq=False)
 class _Ascent:
-    """Disturbances that climb side by side; each keeps the worst it has been."""
+    """Disturbances that are improved side by side; each keeps its best value so far."""
 
     motion: Int[np.ndarray, " count"]
     torque: Float[np.ndarray, "count steps n"]
     """[N·m]"""
     weights: Float[np.ndarray, "count n"]
-    """What each climbs, Σ w_i z1_i²: all joints, or one."""
+    """Weights of the objective Σ w_i z1_i²: all joints, or one."""
     origin: Int[np.ndarray, " count"]
-    """The wave each began as."""
+    """Index of the wave each started from."""
     ascended: Bool[np.ndarray, " count"]
-    """Whether it is another by now."""
+    """Whether it has changed since."""
     share: Float[np.ndarray, " count"]
-    """How much of what the gradient promises the next step takes."""
+    """Share of the predicted gain that the next step takes."""
     peaks: Peaks
-    """Of every torque."""
+    """Largest errors under every torque."""
     joint_errors: JointArray
-    """Largest |z1_i| [rad] of all that was tried."""
+    """Largest |z1_i| of all torques tried [rad]."""
 
     @classmethod
     def of(
         cls, motion: Int[np.ndarray, " waves"], waves: Float[np.ndarray, "waves steps n"], peaks: Peaks, starts: int
     ) -> "_Ascent":
-        """The worst wave of every motion, then the second worst …, and for each joint the one that moves it most."""
+        """The worst wave of every motion, then the second worst …, and for each joint the worst one."""
         order = np.argsort(-peaks.error, kind="stable")
         rank = np.array([int((motion[order[:k]] == motion[order[k]]).sum()) for k in range(len(order))])
         first = order[np.argsort(rank, kind="stable")][:starts]
@@ -200,7 +212,7 @@ class _Ascent:
         )
 
     def ascend(self, ensemble: LoopEnsemble, admissible: Admissible, *, at_end: bool) -> "_Ascent":
-        """One step each; one that gained nothing is undone, and its next step is a quarter as long."""
+        """One step each; a step without gain is undone, and the next one is a quarter as long."""
         gradient = ensemble.torque_gradient(self.motion, self.torque, self.weights, at_end)
         trial = _towards(admissible, self.torque, gradient, self.share)
         found = ensemble.peaks(self.motion, trial)
@@ -225,7 +237,7 @@ def _towards(
     gradient: Float[np.ndarray, "count steps n"],
     share: Float[np.ndarray, " count"],
 ) -> Float[np.ndarray, "count steps n"]:
-    """The torque where it promises least, and the admissible one that the gradient asks for where it promises most."""
+    """The torque, replaced by the admissible one along the gradient at the instants of greatest predicted gain."""
     wanted = np.where(gradient == 0.0, torque, admissible.towards(gradient))
     gain = (gradient * (wanted - torque)).sum(axis=-1)
     order = np.argsort(-gain, axis=1)

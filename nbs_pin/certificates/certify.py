@@ -1,4 +1,4 @@
-"""`certify`: what a law with a storage function promises under disturbances, before the arm moves."""
+"""`certify`: bounds of the tracking error under bounded disturbances, for laws with a storage function."""
 
 import math
 from dataclasses import dataclass, replace
@@ -26,30 +26,17 @@ from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.robots.robot import Robot
 
 _NO_ERROR = ModelError(0.0, 0.0, 0.0, (), ())
-_UNKNOWN_ERROR = ModelError(
-    0.0,
-    0.0,
-    0.0,
-    (
-        Claim(
-            "error of the model",
-            math.inf,
-            "N·m",
-            Label.EMPIRICAL,
-            "taken for 0, and nothing bounds it: give mismatch=compare(…).mismatch, or --against ARM",
-            Group.MODEL_ERROR,
-        ),
-    ),
-    (),
-)
+_UNBOUNDED = "taken as 0, but nothing bounds it: give mismatch=compare(…).mismatch, or --against ARM"
+_UNKNOWN = Claim("error of the model", math.inf, "N·m", Label.EMPIRICAL, _UNBOUNDED, Group.MODEL_ERROR)
+_UNKNOWN_ERROR = ModelError(0.0, 0.0, 0.0, (_UNKNOWN,), ())
 _PRINTED = "printed ‖z1‖"
-_FALSE = "what Theorem 3 of the paper prints: true for constant torques, false for others (docs/theory.md §5)"
-_TRUE = "what Theorem 3 of the paper prints: here no tighter than what is proved"
+_FALSE = "as printed in Theorem 3 of the paper: true for constant torques, false for others (docs/theory.md §5)"
+_TRUE = "as printed in Theorem 3 of the paper: here no tighter than the proved bound"
 
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Bounds of the closed loop of a `LyapunovLaw`, each with the way it is known (docs/certificates.md).
+    """Bounds of the closed loop of a `LyapunovLaw`, each labelled by how it is known (docs/certificates.md).
 
     They hold for every admissible disturbance and every reference, under `assumptions`.
     """
@@ -57,37 +44,37 @@ class Certificate:
     controller: LyapunovLaw
     admissible: Admissible
     rate: float
-    """Without disturbance errors decay at least like e^{−rate·t} and V like e^{−2 rate·t} [1/s]."""
+    """Without disturbance, errors decay at least like e^{−rate·t}, and V like e^{−2 rate·t} [1/s]."""
     level: Level
-    """Under disturbances V(t) ≤ e^{−ct}V(0) + V∞."""
+    """c and V∞ of V(t) ≤ e^{−ct}V(0) + V∞ under disturbances."""
     potential: float
     """Φ∞ [J]: Φ(z1) ≤ max(V(0), Φ∞) at all times, and ≤ Φ∞ in the limit."""
     error: float
-    """Bound of ‖z1‖ [rad], at all times from z1 = z2 = 0, and in the limit from other starts."""
+    """Bound of ‖z1‖ [rad], at all times from z1 = z2 = 0, and in the limit from any other start."""
     joint_errors: JointArray
-    """The same of each |z1_i| [rad]."""
+    """The same for each |z1_i| [rad]."""
     printed_error: float
-    """What the paper's Theorem 3 would print for ‖z1‖ [rad]; false for torques that vary (docs/theory.md §5)."""
+    """Bound of ‖z1‖ by the paper's Theorem 3 as printed [rad]; false for torques that vary (docs/theory.md §5)."""
     label: Label
     """How the bounds are known."""
     lines: tuple[Claim, ...]
-    """Every constant and every bound."""
+    """Every constant and every bound, with its label and reason."""
     conditions: tuple[Condition, ...]
-    """What the theorems ask for, with both sides' numbers."""
+    """The conditions of the theorems, with the numbers of both sides."""
     assumptions: tuple[str, ...]
-    """What the bounds assume beside the conditions, in the words of `Assumption` first."""
+    """What the bounds assume besides the conditions, mostly in the words of `Assumption`."""
     stiffness: Float[np.ndarray, "n n"]
-    """S as it was certified [J/rad²]; training the controller changes its own."""
+    """S at the time of certification [J/rad²]; training the controller changes its own."""
     robot: Robot | None = None
-    """The true arm, None where none is known."""
+    """The true arm; None if none is known."""
     mismatch: Mismatch | None = None
-    """The model's error that the bounds count in."""
+    """The model error that the bounds include."""
     overshoot: tuple[float, JointArray] | None = None
-    """Bounds of ‖z1‖ and each |z1_i| at all times from the start that was given [rad]."""
+    """Bounds of ‖z1‖ and each |z1_i| at all times from the given start [rad]."""
 
     @property
     def void(self) -> tuple[str, ...]:
-        """Conditions that the bounds assume and that do not hold here; `label` is then EMPIRICAL."""
+        """Conditions that the bounds rest on and that do not hold; `label` is then EMPIRICAL."""
         return tuple(condition.name for condition in self.conditions if condition.assumed and not condition.holds)
 
     @property
@@ -98,7 +85,7 @@ class Certificate:
 
     @property
     def joint_units(self) -> tuple[str, ...]:
-        """What the error of each joint is measured in: rad, or m where it slides."""
+        """Unit of the error of each joint: rad, or m for a prismatic joint."""
         return units(self.robot, self.controller.nv)
 
     @property
@@ -107,20 +94,17 @@ class Certificate:
         return self.level.storage
 
     def storage_bound(self, t: Float[np.ndarray, "*rows"], initial: float) -> Float[np.ndarray, "*rows"]:
-        """What V(t) never exceeds from V(0) = `initial` [J]: e^{−ct}V(0) + V∞, nor max(V(0), V∞). t [s]."""
+        """Bound of V(t) from V(0) = `initial` [J]: the lesser of e^{−ct}V(0) + V∞ and max(V(0), V∞), t in [s]."""
         return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
 
     def from_start(self, initial: float) -> tuple[float, JointArray]:
-        """Bounds of ‖z1‖ and of each |z1_i| at all times from V(0) = `initial` [J]: the overshoot [rad].
-
-        Φ never exceeds max(V(0), Φ∞) (docs/certificates.md §3).
-        """
+        """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞)."""
         if initial <= 0.0:
             return self.error, self.joint_errors
         return radians(self.stiffness, max(initial, self.potential))
 
     def summary(self) -> dict[str, Any]:
-        """Everything that a reader is shown, as JSON can store it."""
+        """The certificate as JSON can store it."""
         return {
             "disturbance": str(self.admissible),
             "rate_per_s": self.rate,
@@ -151,15 +135,28 @@ def certify(
     period: float | None = None,
     robot: Robot | None = None,
 ) -> Certificate:
-    """How far the arm can stray from its reference under a bounded disturbance, and why that is so.
+    """Bound the tracking error of the closed loop under a bounded disturbance (docs/certificates.md).
 
-    disturbance: one bound per joint on |τ_d,i|, or one number, the bound on ‖τ_d‖ [N·m]; or an `Admissible`.
-    reference: the motion over `duration` [s], for what depends on it: limits of torque and position, a start, the error
-    of a model. q0, v0: a start [rad], [rad/s] (at rest without v0), for the overshoot from there; needs the reference.
-    mismatch: δ of a learned model along closed loops (`compare(…).mismatch`), for Theorem 4; needs the reference.
-    period: control period [s], held against the rule of sampled control. robot: the true arm; None takes the model's.
-    Raises CertificateRefused when law, model or reference give no ground for a bound, ArgumentError for arguments that
-    do not fit.
+    Args:
+        controller: A law with a storage function (`LyapunovLaw`).
+        disturbance: One bound per joint on |τ_d,i|, one number that bounds ‖τ_d‖ [N·m], or an `Admissible`.
+        reference: The motion, for the arm's limits, a start and a model error. All other bounds hold for any motion.
+        duration: Length of the reference that is used [s].
+        q0: Start from which the overshoot is bounded [rad]. Needs the reference.
+        v0: Velocity at the start [rad/s]. None starts at rest.
+        mismatch: Error δ of a learned model along closed loops (`compare(…).mismatch`). Needs the reference.
+        period: Control period to compare with the rule of sampled control [s].
+        robot: The true arm. None takes the model's.
+
+    Raises:
+        CertificateRefused: If law, model or reference do not admit a bound.
+        ArgumentError: If arguments do not fit each other.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> certificate = nbs.certify(nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link")), [5.0, 5.0])
+        >>> print(f"{certificate.label}: ‖z1‖ ≤ {certificate.error:.2f} rad")
+        PROVED: ‖z1‖ ≤ 0.02 rad
     """
     constants = constants_of(controller)
     law = cast(LyapunovLaw, controller)  # any other was refused
@@ -219,7 +216,7 @@ def _check_arguments(
     if reference is not None and not callable(reference):
         raise ArgumentError(f"reference is {reference!s:.100}, expected a motion such as nbs.Sinusoid; correct it.")
     if reference is None and (mismatch is not None or q0 is not None or v0 is not None):
-        raise ArgumentError("a start and a model's error are held against a motion; give the reference too.")
+        raise ArgumentError("q0, v0 and mismatch refer to a motion; give the reference too.")
     if q0 is None and v0 is not None:
         raise ArgumentError("v0 was given without q0; give both, or q0 alone for a start at rest.")
     if q0 is None:
@@ -248,12 +245,12 @@ def _comparison(constants: Constants, admissible: Admissible, error: ModelError)
 def _why_not(k: ComparisonSystem) -> str:
     if not k.is_dissipative:
         return (
-            f"Theorem 4 asks for 1 − β > α²/4 and the model's error gives 1 − β = {1.0 - k.beta:.3g} and α²/4 = "
+            f"Theorem 4 requires 1 − β > α²/4 and the model's error gives 1 − β = {1.0 - k.beta:.3g} and α²/4 = "
             f"{0.25 * k.alpha**2:.3g}; learn a better model or take a larger D₀."
         )
     return (
-        f"no bound follows from ρ = {k.rho:.3g}, ω = {k.omega:.3g} and κ = {k.kappa:.3g} 1/s: D must outweigh M, which "
-        "an inertial rate ω > 0 does for every arm; take damping='inertial'."
+        f"no bound follows from ρ = {k.rho:.3g}, ω = {k.omega:.3g} and κ = {k.kappa:.3g} 1/s: D must dominate M, "
+        "which an inertial rate ω > 0 ensures for every arm; take damping='inertial'."
     )
 
 
@@ -263,7 +260,7 @@ def _along(
     duration: float,
     start: tuple[JointArray, JointArray] | None,
 ) -> Certificate:
-    """The certificate with the overshoot from a start and what the arm's limits say of it and of the reference."""
+    """The certificate with the overshoot from a start and the conditions that follow from the arm's limits."""
     law, robot, joints = certificate.controller, certificate.robot, certificate.joint_errors
     overshoot, lines = None, certificate.lines
     if start is not None and reference is not None:
@@ -271,7 +268,7 @@ def _along(
         initial = float(law.storage(*start, begin.q[0], begin.v[0]))
         overshoot = certificate.from_start(initial)
         joints = np.maximum(joints, overshoot[1])
-        because = "the storage function there"
+        because = "storage function at the start"
         lines = (*lines, Claim("V(0) of the start", initial, "J", certificate.label, because, Group.BOUNDS))
     conditions = [*certificate.conditions, *_no_wrap(robot, joints, certificate.label)]
     if reference is not None and robot is not None:
@@ -282,7 +279,7 @@ def _along(
 
 
 def _with_bounds(certificate: Certificate, source: str) -> Certificate:
-    """The certificate with a line for each bound."""
+    """The certificate with a claim for each bound."""
     label, here = certificate.label, "docs/certificates.md §2"
     harmless = certificate.printed_error >= certificate.error * (1.0 - 1e-6)
     nothing = "disturbance" if certificate.mismatch is None else "disturbance and constant model error"
@@ -315,8 +312,8 @@ def _assumptions(robot: Robot | None, mismatch: Mismatch | None) -> tuple[str, .
     model = str(Assumption.MODEL)
     if mismatch is not None:
         model = (
-            f"the model errs as on {mismatch.trajectories} closed loops of {mismatch.t[-1]:.3g} s, with a chance of at "
-            f"most {mismatch.violation:.2g} that a further one, drawn alike, does not, at a confidence of "
+            f"the model error is bounded as on {mismatch.trajectories} closed loops of {mismatch.t[-1]:.3g} s, which a "
+            f"further one, drawn alike, exceeds with a chance of at most {mismatch.violation:.2g} at a confidence of "
             f"1 − {mismatch.doubt:g}"
         )
     wraps = [Assumption.WRAP] if robot is not None and robot.continuous.any() else []

@@ -1,4 +1,4 @@
-"""What certificates assume, and the conditions that their theorems ask for."""
+"""Assumptions of certificates, and the conditions of their theorems."""
 
 import math
 from dataclasses import dataclass
@@ -9,21 +9,21 @@ from nbs_pin.base.claims import Label
 
 
 class Assumption(StrEnum):
-    """What bounds assume, in the words that a certificate prints and a monitor names."""
+    """The assumptions of the bounds, in the words that certificates and monitors print."""
 
-    MODEL = "the arm is its model"
-    FRICTION = "joint friction is what is fed forward, or counted as disturbance"
+    MODEL = "the model is exact"
+    FRICTION = "joint friction is fed forward exactly, or counted as disturbance"
     DISTURBANCE = "the disturbance is within its bound"
     REFERENCE = "the reference is twice differentiable"
-    STOPS = "no joint meets its stop"
-    EFFORT = "torques stay inside the effort limits"
+    STOPS = "no joint reaches its stop"
+    EFFORT = "torques stay within the effort limits"
     TIME = "continuous time, no delay"
     WRAP = "errors of continuous joints stay within ±π"
 
 
 @dataclass(frozen=True)
 class Condition:
-    """An inequality that a theorem asks for, with the numbers on both sides: left > right."""
+    """A condition left > right of a theorem, with the numbers on both sides."""
 
     name: str
     left: float
@@ -32,7 +32,7 @@ class Condition:
     label: Label
     because: str
     assumed: bool = True
-    """Whether the bounds are void where it does not hold; False for what is printed for comparison."""
+    """Whether the bounds are void if it fails; False for a condition printed for comparison."""
 
     @property
     def holds(self) -> bool:
@@ -40,7 +40,7 @@ class Condition:
         return self.left > self.right
 
     def plain(self) -> dict[str, Any]:
-        """The condition as JSON can store it, null for infinity."""
+        """The condition as JSON can store it, None for infinity."""
         sides = {key: x if math.isfinite(x) else None for key, x in (("left", self.left), ("right", self.right))}
         return {
             "name": self.name,

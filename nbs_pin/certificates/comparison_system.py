@@ -1,11 +1,11 @@
-"""Two numbers that bound a closed loop: how far Φ and W = ½z2ᵀM z2 can go under every admissible disturbance.
+"""Bounds V∞ of V = Φ + W and Φ∞ of Φ under every admissible disturbance, with W = ½z2ᵀM z2.
 
 Along every motion (docs/certificates.md §2), with y² = z2ᵀD₀z2 and some x, s, σ
 
     Φ̇ = −x² + s,     x² ≥ 2ρΦ,   |s| ≤ xy/√δ,
     Ẇ ≤ −ζs − (1 − β)y² + αxy − 2ωW + σ,     2κW ≤ y² ≤ 2νW,   σ ≤ t y.
 
-What no choice of x, y, s, σ can leave, no motion leaves: neither a level of V = Φ + W, nor a polygon below it.
+A set that no choice of x, y, s, σ can leave is invariant: the set below a level of V, and a polygon inside it.
 """
 
 import math
@@ -19,33 +19,33 @@ _STEEPNESS = np.concatenate([np.linspace(1.0, 4.0, 91)[:-1], np.geomspace(4.0, 1
 _ROWS = 240
 _HALVINGS = 14
 _LEAST_A = 1e-12
-"""Added to a, which can only enlarge the maximum, so that nothing is divided by 0."""
+"""Added to a to avoid a division by 0; this can only enlarge the maximum."""
 _OUTWARD = 1.0 + 1e-9
-"""Each bound is made so much larger, far more than the rounding of the few thousand operations behind it."""
+"""Each bound is enlarged by this factor, far more than the rounding of the few thousand operations behind it."""
 
 
 @dataclass(frozen=True)
 class ComparisonSystem:
-    """The constants of the two inequalities; every one on the safe side."""
+    """The constants of the two inequalities, each rounded to the safe side."""
 
     rho: float
     """ρ = λ_min(2Λ^½SΛ^½) [1/s]."""
     delta: float
     """δ = λ_min(Λ^½D₀Λ^½)."""
     kappa: float
-    """κ = 1/max λ(D₀^-½MD₀^-½) [1/s], 0 where none is known."""
+    """κ = 1/max λ(D₀^-½MD₀^-½) [1/s], 0 if no bound is known."""
     nu: float
-    """ν = 1/min λ(D₀^-½MD₀^-½) [1/s], inf where none is known."""
+    """ν = 1/min λ(D₀^-½MD₀^-½) [1/s], inf if no bound is known."""
     omega: float
     """ω [1/s]."""
     t: float
-    """√Δ, Δ = sup τ_dᵀD₀⁻¹τ_d [W], and what a model's constant error adds."""
+    """√Δ with Δ = sup τ_dᵀD₀⁻¹τ_d [W], plus the constant part of a model error."""
     alpha: float = 0.0
-    """α, of a model's error in proportion to ‖q‖ and ‖v‖."""
+    """α, from a model error in proportion to ‖q‖ and ‖v‖."""
     beta: float = 0.0
-    """β, of a model's error in proportion to ‖v‖."""
+    """β, from a model error in proportion to ‖v‖."""
     coupling: float = 1.0
-    """ζ: how much of s, the power that z2 brings into Φ, the law takes out of W."""
+    """ζ: the share of s, the power that z2 supplies to Φ, that the law takes from W."""
 
     @property
     def cross(self) -> float:
@@ -68,10 +68,10 @@ class Level(NamedTuple):
 
 
 def decay(comparison: ComparisonSystem, share: float = 0.0) -> float:
-    """The largest c found with x² − axy + (1 − β − share)y² + 2ωW ≥ c(Φ + W) [1/s], 0 where there is none.
+    """The largest c found with x² − axy + (1 − β − share)y² + 2ωW ≥ c(Φ + W) [1/s], 0 if there is none.
 
-    a = α + (1 − ζ)/√δ. Two parts, ηx² ≥ 2ηρΦ and r y² + 2ωW ≥ 2(rκ + ω)W, with (1 − η)(1 − β − share − r) ≥ a²/4 and
-    r ≥ 0.
+    Here a = α + (1 − ζ)/√δ. The two parts are ηx² ≥ 2ηρΦ and r y² + 2ωW ≥ 2(rκ + ω)W, where r ≥ 0 and
+    (1 − η)(1 − β − share − r) ≥ a²/4.
     """
     k = comparison
     rest = 1.0 - k.beta - share
@@ -84,7 +84,7 @@ def decay(comparison: ComparisonSystem, share: float = 0.0) -> float:
 
 
 def level(comparison: ComparisonSystem) -> Level:
-    """The least V∞ over all shares θ of y² that pay for the disturbance: ty ≤ θy² + t²/4θ, V∞ = t²/(4θ c(θ))."""
+    """The least V∞ over the shares θ of y² that compensate the disturbance: ty ≤ θy² + t²/4θ, V∞ = t²/(4θ c(θ))."""
     if comparison.t == 0.0:
         c = decay(comparison) / _OUTWARD
         return Level(c, 0.0 if c > 0.0 else np.inf)
@@ -98,10 +98,10 @@ def level(comparison: ComparisonSystem) -> Level:
 
 
 def reach(comparison: ComparisonSystem, storage: float) -> float:
-    """Φ∞ [J]: the least found such that {V ≤ V∞} cut off by a polygon from (Φ∞, 0) upwards is never left.
+    """Φ∞ [J]: the least one found such that {V ≤ V∞}, cut off by a polygon from (Φ∞, 0) upwards, is invariant.
 
-    storage: V∞ of `level`. Every edge descends m times as fast in W as it advances in Φ, and is only taken when
-    Ẇ + mΦ̇ ≤ 0 on all of it, whatever x, y, s, σ do.
+    storage: V∞ of `level`. An edge of steepness m = −dW/dΦ is accepted only if Ẇ + mΦ̇ ≤ 0 on all of it, for every
+    choice of x, y, s, σ.
     """
     if not 0.0 < storage < np.inf:
         return storage
@@ -117,7 +117,7 @@ def reach(comparison: ComparisonSystem, storage: float) -> float:
 
 
 def _closes(k: ComparisonSystem, potential: float, storage: float) -> bool:
-    """Whether steep edges lead from (Φ, 0) up to the line Φ + W = V∞."""
+    """Whether accepted edges lead from (Φ, 0) up to the line Φ + W = V∞."""
     rows = storage * np.linspace(0.0, 1.0, _ROWS + 1) ** 2
     phi = potential
     for low, high in zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True):
@@ -132,10 +132,10 @@ def _closes(k: ComparisonSystem, potential: float, storage: float) -> bool:
 
 
 def _growth(k: ComparisonSystem, end: np.ndarray, low: float, high: float) -> np.ndarray:
-    """At least max Ẇ + mΦ̇ over Φ ≥ end and W from low to high, for every m of `_STEEPNESS`, m ≥ 1.
+    """Upper bound of Ẇ + mΦ̇ over Φ ≥ end and W from low to high, for every m of `_STEEPNESS`, m ≥ 1.
 
     With a = (m − ζ)/√δ + α it is max axy − m x² − (1 − β)y² + ty − 2ωW over x ≥ x₀ and y₀ ≤ y ≤ y₁: for given y the
-    best x is max(x₀, ay/2m), which leaves a quadratic in y on either side of y = 2mx₀/a, greatest at a border or where
+    best x is max(x₀, ay/2m), which leaves a quadratic in y on either side of y = 2mx₀/a, largest at a border or where
     its slope is 0.
     """
     m, g = _STEEPNESS, 1.0 - k.beta

@@ -1,4 +1,4 @@
-"""The constants of the bounds, each moved to the safe side and labelled with the way it is known."""
+"""The constants of the bounds, each rounded to the safe side and labelled by how it is known."""
 
 import math
 from dataclasses import dataclass, replace
@@ -22,20 +22,20 @@ _SAMPLES = 2000
 
 @dataclass(frozen=True, eq=False)
 class Constants:
-    """What docs/certificates.md §1 names, for one controller."""
+    """The constants of docs/certificates.md §1 for one controller."""
 
     rho: float
     """ρ = λ_min(2Λ^½SΛ^½) [1/s]."""
     delta: float
     """δ = λ_min(Λ^½D₀Λ^½)."""
     kappa: float
-    """κ = 1/max_q λ_max(D₀^-½M(q)D₀^-½) [1/s], 0 for none."""
+    """κ = 1/max_q λ_max(D₀^-½M(q)D₀^-½) [1/s], 0 if no bound is known."""
     nu: float
-    """ν = 1/min_q λ_min(D₀^-½M(q)D₀^-½) [1/s], inf for none."""
+    """ν = 1/min_q λ_min(D₀^-½M(q)D₀^-½) [1/s], inf if no bound is known."""
     omega: float
     """ω [1/s]."""
     coupling: float
-    """ζ: 1 for a law that feeds −∇Φ back, 0 for one that does not."""
+    """ζ: 1 for a law that feeds back −∇Φ, 0 for one that does not."""
     largest_rate: float
     """λ_max(Λ) [rad/s per N·m]."""
     least_floor: float
@@ -47,21 +47,18 @@ class Constants:
     metric: Float[np.ndarray, "n n"]
     """D₀⁻¹, for Δ = sup τ_dᵀD₀⁻¹τ_d."""
     label: Label
-    """How all that the bounds use is known."""
+    """The weakest label of all that the bounds rest on."""
     lines: tuple[Claim, ...]
 
 
 def constants_of(law: Controller) -> Constants:
-    """The constants of a controller, after a check of its structure and of its model's.
-
-    Raises CertificateRefused where those give no ground for a proof.
-    """
+    """The constants of a controller; raises CertificateRefused if it or its model does not admit a proof."""
     v = check_structure(law)
     controller = cast(LyapunovLaw, law)  # any other law was refused
     root = np.sqrt(v.rate)
     delta = least_eigenvalue(root[:, None] * v.floor * root)
     largest, least, *plain = _inertia(controller.dynamics, v.floor)
-    # With ωM in the damping no bound of M is needed, so one that is not proved is not used.
+    # With ωM in the damping no bound of M is needed, so an unproved one is not used.
     used = v.inertial_rate == 0.0 or largest.label is Label.PROVED
     claim = Claim("δ = λ_min(Λ^½D₀Λ^½)", delta, "", Label.PROVED, "eigenvalue of the gains", Group.CONSTANTS)
     return Constants(
@@ -104,14 +101,14 @@ def _sampled(mass: Float[np.ndarray, "count n n"], floor: Float[np.ndarray, "n n
 
 
 def configurations(dynamics: DynamicsProvider) -> Float[np.ndarray, "count n"]:
-    """Seeded configurations of the arm, within ±π where the model knows no arm [rad]."""
+    """Seeded random configurations of the arm, or within ±π if the model names no arm [rad]."""
     if dynamics.robot is not None:
         return sample_configurations(dynamics.robot, _SAMPLES)
     return np.random.default_rng(0).uniform(-np.pi, np.pi, (_SAMPLES, dynamics.nv))
 
 
 def above_inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """A⁻¹, so much larger that no rounding makes a quadratic form with it too small; exact for a diagonal A."""
+    """A⁻¹, enlarged so that rounding cannot make a quadratic form with it too small."""
     diagonal = np.diag(matrix)
     if np.array_equal(matrix, np.diag(diagonal)):
         return np.asarray(np.diag((1.0 + 4.0 * np.finfo(float).eps) / diagonal))

@@ -1,11 +1,11 @@
-"""Where V goes: the rate of the storage function over each control period, and the torques behind every term of it.
+"""Energy balance of V: its rate over each control period, its terms, and the torques behind them.
 
-The law is a law of continuous time; what an arm gets differs from it by a torque w,
+The law is designed in continuous time. The torque that acts on the arm differs from it by
 
     w = (M̂v̇ + Ĉv + Ĝ + friction − τ) + (τ_command − law) + (τ − τ_command) = unexplained + held + cut,
 
-and V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ((ωM̂ + D)z2 + f(v) − f(φ)) + z2ᵀw for every model, exact or learned: M̂ in V, M̂ in w. So a
-certificate for w in the admissible set needs no other assumption than that (docs/certificates.md).
+and V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ((ωM̂ + D)z2 + f(v) − f(φ)) + z2ᵀw for every model, exact or learned, with M̂ in V and
+in w. So a certificate needs no other assumption than that w is admissible (docs/certificates.md).
 """
 
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.equations import inverse_dynamics
 
-_BATCH = 4096  # states a network sees at once
+_BATCH = 4096  # states that are evaluated at once
 
 
 class LoopSamples(NamedTuple):
-    """What is known of a loop at control instants, any number of them."""
+    """Samples of a closed loop at any number of control instants."""
 
     t: Float[np.ndarray, "*rows"]
     """Time [s]."""
@@ -39,13 +39,13 @@ class LoopSamples(NamedTuple):
     a_ref: Float[np.ndarray, "*rows n"]
     """Desired acceleration [rad/s²]."""
     tau: Float[np.ndarray, "*rows n"]
-    """Torque applied from then on [N·m]."""
+    """Torque applied from that instant on [N·m]."""
     tau_command: Float[np.ndarray, "*rows n"]
-    """Torque asked for [N·m]."""
+    """Commanded torque [N·m]."""
 
     @classmethod
     def of(cls, run: Run) -> "LoopSamples":
-        """All instants of a run, its starts one after the other: (starts·rows, …)."""
+        """All instants of a run, sorted by start: (starts, rows, …)."""
         starts = int(np.prod(run.q.shape[1:-1], dtype=int))
         named = (run.q, run.v, run.q_ref, run.v_ref, run.a_ref, run.tau, run.tau_command)
         rows = (x.reshape(len(run.t), starts, run.nv).swapaxes(0, 1) for x in named)
@@ -60,21 +60,21 @@ class Balance(NamedTuple):
     """V̇ over control periods and its terms, at the middle of each; `change` is the sum of the five others."""
 
     change: Float[np.ndarray, "*rows"]
-    """V̇ [W] as V itself changed."""
+    """V̇ from the change of V [W]."""
     potential: Float[np.ndarray, "*rows"]
     """−∇ΦᵀΛ∇Φ [W]."""
     damping: Float[np.ndarray, "*rows"]
-    """−z2ᵀ((ωM + D)z2 + f(v) − f(φ)) [W], f the friction that is fed forward."""
+    """−z2ᵀ((ωM + D)z2 + f(v) − f(φ)) [W] with the friction f that is fed forward."""
     disturbance: Float[np.ndarray, "*rows"]
-    """z2ᵀτ_d [W] of all that the model leaves unexplained."""
+    """z2ᵀτ_d [W] with the unexplained torque as τ_d."""
     held: Float[np.ndarray, "*rows"]
-    """z2ᵀ(τ_command − law) [W]: the torque was held, the law moved on."""
+    """z2ᵀ(τ_command − law) [W]: the effect of holding the torque."""
     saturation: Float[np.ndarray, "*rows"]
     """z2ᵀ(τ − τ_command) [W]."""
     z2: Float[np.ndarray, "*rows n"]
     """v − φ [rad/s]."""
     unexplained: Float[np.ndarray, "*rows n"]
-    """M̂v̇ + Ĉv + Ĝ + friction − τ [N·m]: disturbance, and error of the model."""
+    """M̂v̇ + Ĉv + Ĝ + friction − τ [N·m]: disturbance and model error."""
     lag: Float[np.ndarray, "*rows n"]
     """τ_command − law [N·m]."""
     cut: Float[np.ndarray, "*rows n"]
@@ -84,7 +84,7 @@ class Balance(NamedTuple):
 
 
 def storage_of(controller: LyapunovLaw, at: LoopSamples) -> Float[np.ndarray, "*rows"]:
-    """V [J] at the instants."""
+    """V at the instants [J]."""
     return _in_parts(controller.storage, at.q, at.v, at.q_ref, at.v_ref)[0]
 
 
@@ -95,9 +95,9 @@ def balance(
     change: Float[np.ndarray, "*rows"],
     law: MemorylessController | None = None,
 ) -> Balance:
-    """V̇ and its terms between instants and the next, to second order in the time between them.
+    """V̇ and its terms between each instant and the next one, to second order in the time between them.
 
-    change: V after less V before [J]. law: the controller compiled, where speed matters.
+    change: the increase of V [J]. law: the compiled controller, for speed.
     """
     h, asked = (after.t - before.t)[..., None], (controller if law is None else law).torque
     q, v = _middle(before.q, after.q, before.v, after.v, h), 0.5 * (before.v + after.v)
@@ -132,7 +132,7 @@ def balance(
 def beyond(
     admissible: Admissible, torque: Float[np.ndarray, "*rows n"], allowance: Float[np.ndarray, "*rows"] | float = 0.0
 ) -> Float[np.ndarray, "*rows n"]:
-    """What must be taken from each torque to make it admissible [N·m], the norm `allowance` being granted."""
+    """The part of each torque outside the admissible set [N·m], its norm reduced by `allowance`."""
     if admissible.box is not None:
         rest = torque - np.clip(torque, -admissible.box, admissible.box)
     else:
@@ -152,7 +152,7 @@ def _powers(
     v_ref: np.ndarray,
     a_ref: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """The torque of this motion, the two losses of V, z2, and what friction takes beyond f(φ)."""
+    """The torque of this motion, the two losses of V, z2, and the friction torque in excess of f(φ)."""
     e, dynamics, friction = controller.errors(q, v, q_ref, v_ref, a_ref), controller.dynamics, controller.friction
     needed, extra = inverse_dynamics(dynamics, q, v, a), np.zeros_like(q)
     if friction is not None:
@@ -161,12 +161,12 @@ def _powers(
 
 
 def _middle(x0: np.ndarray, x1: np.ndarray, rate0: np.ndarray, rate1: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """The value in the middle of a step h, by Hermite's cubic."""
+    """The value in the middle of a step h, by cubic Hermite interpolation."""
     return np.asarray(0.5 * (x0 + x1) + 0.125 * h * (rate0 - rate1))
 
 
 def _in_parts(function: Callable[..., Any], *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The function of rows (…, n), some thousand at once."""
+    """The function of rows (…, n), evaluated in batches."""
     shape, n = arrays[0].shape[:-1], arrays[0].shape[-1]
     rows = [np.ascontiguousarray(x).reshape(-1, n) for x in arrays]
     found = []

@@ -1,4 +1,4 @@
-"""Many motions of one closed loop, each on its reference at first, under any held disturbances; with gradients."""
+"""Batches of motions of one closed loop under held disturbances, starting on the reference, with gradients."""
 
 import math
 from collections.abc import Sequence
@@ -24,15 +24,15 @@ from nbs_pin.simulation.loop import Loop
 from nbs_pin.simulation.rollout import Batch, Engine, engine_for, motions, recorded
 
 POSTURES = 7
-"""Postures held still, beside the arm's own motion, where no reference is given."""
+"""Number of postures at rest, besides the arm's own motion, if no reference is given."""
 TIME_CONSTANTS, MOST_PERIODS = 7.0, 4000
-"""Default duration: so many of the slowest, but no more periods than these."""
+"""Default duration: so many of the slowest time constants, at most so many periods."""
 _BATCH = 128  # motions in memory at once
 _PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
 
 
 class Peaks(NamedTuple):
-    """Largest errors of motions, a row per motion."""
+    """Largest errors of motions, one row per motion."""
 
     error: Float[np.ndarray, " count"]
     """max_t ‖z1(t)‖ [rad]."""
@@ -42,11 +42,11 @@ class Peaks(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LoopEnsemble:
-    """A closed loop and the motions it can be made to follow; `of` makes it."""
+    """A closed loop and the motions that it follows; built by `of`."""
 
     controller: ModelLaw
     scenes: Batch
-    """One row per motion to follow, undisturbed."""
+    """One row per reference motion, undisturbed."""
     engine: Engine
 
     @classmethod
@@ -60,7 +60,7 @@ class LoopEnsemble:
         effort_limit: PerJoint,
         seed: int,
     ) -> "LoopEnsemble":
-        """The loop with the arguments of `attack`; raises ArgumentError when they do not fit."""
+        """The loop for the arguments of `attack`; raises ArgumentError if they do not fit."""
         law = law_of(controller)
         positive("period", period, "s")
         truth = law.dynamics if plant_dynamics is None else plant_dynamics
@@ -79,14 +79,14 @@ class LoopEnsemble:
         return self.scenes.loop
 
     def batch(self, motion: Int[np.ndarray, " count"], tau_d: Float[np.ndarray, "count steps n"]) -> Batch:
-        """Those motions under those torques."""
+        """The motions of these indices under these torques [N·m]."""
         picked = {name: getattr(self.scenes, name)[motion] for name in ("aims", "desired", "q0", "v0")}
         return replace(self.scenes, **picked, tau_d=np.ascontiguousarray(tau_d))
 
     def peaks(
         self, motion: Int[np.ndarray, " count"], tau_d: Float[np.ndarray, "count steps n"], progress: bool = False
     ) -> Peaks:
-        """Largest errors of those motions under those torques [N·m]."""
+        """Largest errors of the motions of these indices under these torques [N·m]."""
         parts = [slice(k, k + _BATCH) for k in range(0, len(motion), _BATCH)]
         found = []
         with torch.no_grad():
@@ -102,7 +102,7 @@ class LoopEnsemble:
         weights: Float[np.ndarray, "count n"],
         at_end: bool,
     ) -> Float[np.ndarray, "count steps n"]:
-        """The gradient by τ_d of Σ w_i z1_i² at the end, or at the time of its peak."""
+        """The gradient of Σ w_i z1_i² with respect to τ_d, at the final time or at its peak."""
         torque = torch.tensor(tau_d, requires_grad=True)
         z1 = self._errors(self.batch(motion, tau_d), torque)
         goal = (torch.as_tensor(weights)[:, None] * z1**2).sum(-1)
@@ -111,7 +111,7 @@ class LoopEnsemble:
         return np.asarray(gradient.numpy())
 
     def run(self, motion: int, tau_d: Float[np.ndarray, "steps n"], **info: str) -> Run:
-        """One motion under one torque as a run."""
+        """One motion under one torque, as a `Run`."""
         batch = self.batch(np.array([motion]), tau_d[None])
         with torch.no_grad():
             moved = motions(self.controller, batch, self.engine)
@@ -119,7 +119,7 @@ class LoopEnsemble:
         return replace(many, **{name: getattr(many, name)[:, 0] for name in _PER_ROW}, info={**many.info, **info})
 
     def _errors(self, batch: Batch, tau_d: torch.Tensor | None = None) -> torch.Tensor:
-        """z1 (count, rows, n); raises SimulationDiverged when one is not finite."""
+        """z1 (count, rows, n); raises SimulationDiverged if it is not finite."""
         q = motions(self.controller, batch, self.engine, tau_d).q
         robot = batch.loop.plant.robot
         continuous = None if robot is None else robot.continuous
@@ -127,18 +127,18 @@ class LoopEnsemble:
         if not bool(torch.isfinite(z1).all()):
             row = int((~torch.isfinite(z1).all(-1)).any(0).to(torch.uint8).argmax())
             raise SimulationDiverged(
-                f"the closed loop left the finite numbers at t = {row * batch.loop.period:g} s under an admissible"
+                f"the closed loop diverged at t = {row * batch.loop.period:g} s under an admissible"
                 f" disturbance; take a shorter control period than {batch.loop.period:g} s."
             )
         return z1
 
 
 def law_of(controller: Any) -> ModelLaw:
-    """The controller, once it is sure to be a law with a model; raises ArgumentError else."""
+    """The controller, if it is a law with a model; raises ArgumentError otherwise."""
     if not isinstance(controller, ModelLaw):
         raise ArgumentError(
-            f"a {type(controller).__name__} is no law with a model, which gradients of a motion go through; give a "
-            "NeuralBackstepping, ComputedTorque or SlotineLi, and of a compiled law what it was compiled from."
+            f"a {type(controller).__name__} is not a law with a model, which gradients of a motion need; give a "
+            "NeuralBackstepping, ComputedTorque or SlotineLi, or the controller that a compiled law was made from."
         )
     return controller
 
@@ -146,14 +146,11 @@ def law_of(controller: Any) -> ModelLaw:
 def motions_of(
     dynamics: DynamicsProvider, reference: DesiredMotion | Sequence[DesiredMotion] | None, seed: int
 ) -> list[DesiredMotion]:
-    """The motions given, or without any, the arm's own (`Sinusoid.for_robot`) and postures held still.
-
-    Raises ArgumentError for an empty list, and for what is no motion.
-    """
+    """The given motions, or `Sinusoid.for_robot` and postures at rest; raises ArgumentError if one is not a motion."""
     if reference is not None:
         followed = list(reference) if isinstance(reference, Sequence) else [reference]
         if not followed:
-            raise ArgumentError("reference is an empty list, expected at least one motion; leave it out for the arm's.")
+            raise ArgumentError("reference is an empty list, expected at least one motion; omit it for the arm's own.")
         for motion in followed:
             _check_motion(motion)
         return followed
@@ -167,15 +164,15 @@ def _check_motion(motion: Any) -> None:
     sampled = motion(np.zeros(1)) if callable(motion) else None
     if not isinstance(sampled, tuple) or len(sampled) != len(Reference._fields):
         raise ArgumentError(
-            f"the reference {motion!s:.80} is no motion, expected a function of time that gives a Reference (q, v, a); "
-            "take Hold, Sinusoid or one from a file."
+            f"the reference {motion!s:.80} is not a motion, expected a function of time that returns a Reference "
+            "(q, v, a); take Hold, Sinusoid or one from a file."
         )
 
 
 def slowest_rate(controller: ModelLaw, reference: DesiredMotion) -> float:
-    """The least |Re λ| [1/s] of the undisturbed loop, linearised at the start of the reference held still.
+    """The least |Re λ| [1/s] of the undisturbed loop, linearised at rest at the start of the reference.
 
-    With z1, z2: ż1 = z2 − Λ∇²Φ(0)z1 and M ż2 = −∇²Φ(0)z1 − (ωM + D(0))z2; a law without a storage function has 1.
+    In z1, z2 it is ż1 = z2 − Λ∇²Φ(0)z1, M ż2 = −∇²Φ(0)z1 − (ωM + D(0))z2. A law without a storage function gets 1.
     """
     if not isinstance(controller, LyapunovLaw):
         return 1.0

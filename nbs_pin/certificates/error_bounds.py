@@ -1,4 +1,4 @@
-"""From energies to radians: bounds of ‖z1‖ and of each |z1_i|."""
+"""Bounds of ‖z1‖ and of each |z1_i| from bounds of the energies V and Φ."""
 
 import math
 
@@ -17,10 +17,10 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 def errors(
     controller: LyapunovLaw, constants: Constants, comparison: ComparisonSystem, storage: float, potential: float
 ) -> tuple[float, JointArray, str]:
-    """Bounds of ‖z1‖ and each |z1_i| [rad], and where they come from."""
+    """Bounds of ‖z1‖ and each |z1_i| [rad], and their source."""
     size, joints = radians(constants.stiffness, potential)
     exact = math.inf
-    # Friction fed forward leaves a term that is not linear, a model's error another.
+    # Friction that is fed forward and a model error each leave a nonlinear term.
     if controller.nv == 1 and controller.friction is None and comparison.alpha == comparison.beta == 0.0:
         exact = _of_one_joint(controller, constants, comparison, storage, size)
     if exact < size:
@@ -31,7 +31,7 @@ def errors(
 def _of_one_joint(
     controller: LyapunovLaw, constants: Constants, comparison: ComparisonSystem, storage: float, size: float
 ) -> float:
-    """The bound of |z1| that linear theory gives, inf where it does not apply; `size` [rad] is one already."""
+    """The bound of |z1| from linear theory [rad], inf if it does not apply; `size` is a bound already known [rad]."""
     if type(controller.dynamics) is not PinocchioDynamics:
         return math.inf
     loop = one_joint.Loop(
@@ -47,8 +47,8 @@ def _of_one_joint(
 
 
 def radians(stiffness: Float[np.ndarray, "n n"], potential: float) -> tuple[float, JointArray]:
-    """√(Φ/λ_min(S)) and √(Φ (S⁻¹)_ii), which bound ‖z1‖ and |z1_i| where Φ ≥ z1ᵀSz1 is at most `potential`."""
+    """√(Φ/λ_min(S)) and √(Φ (S⁻¹)_ii), the bounds of ‖z1‖ and |z1_i| for z1ᵀSz1 ≤ Φ ≤ `potential` [J]."""
     joints = np.sqrt(potential * np.diag(above_inverse(stiffness)))
-    # The joints together are never further than the ellipsoid is long, nor than the corner of their own bounds.
+    # ‖z1‖ exceeds neither the longest semi-axis of the ellipsoid nor the corner of the box of the |z1_i|.
     total = min(math.sqrt(potential / least_eigenvalue(stiffness)), float(np.linalg.norm(joints)))
     return total, np.minimum(joints, total)

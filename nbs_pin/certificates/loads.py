@@ -1,8 +1,8 @@
-"""Loads that the model leaves out, as disturbances: a payload, joint friction, gravity that is not what it seems.
+"""Loads that the model does not include, as disturbances: a payload, joint friction, an error of gravity.
 
-Each is a box |τ_d,i| ≤ b_i along a reference: the greatest torque that the load takes on the reference itself, times a
-margin for what the arm does beside it. That is EMPIRICAL: the margin is a choice. Wrong gravity, whose torque depends
-on the posture alone, has a bound everywhere as well, by lever arms, which is PROVED.
+Each is a box |τ_d,i| ≤ b_i along a reference: the peak torque of the load on the reference itself, times a margin for
+deviations from it. It is EMPIRICAL, as the margin is a choice. The torque of a gravity error depends on q alone and is
+also bounded for every q by lever arms, which is PROVED.
 """
 
 from typing import NamedTuple
@@ -22,20 +22,20 @@ from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.robots.robot import Robot
 
 MARGIN = 1.5
-"""How many times the torque on the reference the arm may need beside it, unless said otherwise."""
+"""Default factor on the peak torque along the reference, for deviations from it."""
 _SAMPLES = 2001
 _OUTWARD = 1.0 + 1e-9
-"""Each bound is made so much larger, far more than the rounding of the operations behind it."""
+"""Each bound is enlarged by this factor, far more than the rounding of the operations behind it."""
 _ROUNDING = 1e-12
 
 
 class Load(NamedTuple):
-    """A disturbance, and how it is known to be one."""
+    """A disturbance and how its bound is known."""
 
     admissible: Admissible
     """|τ_d,i| ≤ box_i [N·m]."""
     claim: Claim
-    """The largest of the bounds, with label and reason."""
+    """The largest of the joint bounds, with label and reason."""
 
 
 def payload(
@@ -48,11 +48,13 @@ def payload(
     duration: float = 10.0,
     margin: float = MARGIN,
 ) -> Load:
-    """The torque of a point mass [kg] that the model knows nothing of: its weight and its inertia along the reference.
+    """The torque of a point mass [kg] that the model does not include, by its weight and inertia along the reference.
 
-    frame: the link that carries it, None takes `tool_frame`. position: of the mass in that frame [m], None its origin.
-    duration: how much of the reference counts [s]. margin: times the peak of |ΔM a + ΔC v + ΔG|.
-    Raises ArgumentError for numbers out of range and a link that does not exist.
+    `frame` is the link that carries it (None: `tool_frame`), `position` its position in that frame [m] (None: the
+    origin). The bound is `margin` times the peak of |ΔM a + ΔC v + ΔG| over `duration` [s].
+
+    Raises:
+        ArgumentError: If a number is out of range or the link does not exist.
     """
     positive("the payload", mass, "kg")
     joint, at = _place(robot, frame, position)
@@ -73,21 +75,23 @@ def friction(
     duration: float = 10.0,
     margin: float = MARGIN,
 ) -> Load:
-    """Joint friction b·v + c·sign(v) that the law does not feed forward: c_i everywhere, b_i|v_i| along the reference.
+    """Joint friction b·v + c·sign(v) that is not fed forward: c_i everywhere, b_i|v_i| along the reference.
 
-    viscous [N·m·s/rad], coulomb [N·m]: one for all joints or one per joint; None takes the URDF's. The speed counts
-    with the margin. PROVED where there is only Coulomb friction.
-    Raises ArgumentError when there is no friction at all, and when viscous friction has no reference to take speeds of.
+    `viscous` is b [N·m·s/rad], `coulomb` is c [N·m], each one number or one per joint (None: the URDF's). The margin
+    scales the speeds. The bound is PROVED for Coulomb friction alone.
+
+    Raises:
+        ArgumentError: If there is no friction, or viscous friction without a reference.
     """
     b = _one_each("viscous", robot.damping if viscous is None else viscous, robot.nv)
     c = _one_each("coulomb", robot.friction if coulomb is None else coulomb, robot.nv)
-    JointFriction(b, c)  # which refuses what is no friction
+    JointFriction(b, c)  # raises for invalid coefficients
     if not (b.any() or c.any()):
         raise ArgumentError(f"{robot.name} states no joint friction; give viscous and coulomb coefficients.")
     if not b.any():
-        return _load("joint friction", c.copy(), Label.PROVED, "Coulomb friction is never more than its coefficient")
+        return _load("joint friction", c.copy(), Label.PROVED, "Coulomb friction never exceeds its coefficient")
     if reference is None:
-        raise ArgumentError("viscous friction grows with speed; give the reference whose speeds count.")
+        raise ArgumentError("viscous friction grows with speed; give the reference that sets the speeds.")
     peak = np.abs(sampled(robot, reference, duration).v).max(axis=0)
     return _along("joint friction", b * peak, margin, duration, constant=c)
 
@@ -102,12 +106,14 @@ def gravity_error(
 ) -> Load:
     """Gravity that differs from the model's by a vector of at most `error` [m/s²], in any direction.
 
-    A base tilted by α is 2‖g‖ sin(α/2). Torques of gravity are linear in g, so the worst direction is exact. Without a
-    reference the bound holds in every posture (PROVED, by lever arms); with one it is that of its postures, times the
-    margin. Raises ArgumentError for numbers out of range and a sliding joint without end.
+    For a base tilted by α it is 2‖g‖ sin(α/2). Torques of gravity are linear in g, so the worst direction is exact.
+    Without a reference the bound holds for every q (PROVED, by lever arms), else along it, times the margin.
+
+    Raises:
+        ArgumentError: If a number is out of range or a prismatic joint has no position limits.
     """
     positive("the gravity error", error, "m/s²")
-    what = f"gravity wrong by {error:g} m/s²"
+    what = f"a gravity error of {error:g} m/s²"
     bodies = [(j, inertia.mass, inertia.lever) for j, inertia in enumerate(robot.model.inertias) if j > 0]
     everywhere = error * sum((mass * _levers(robot, j, at) for j, mass, at in bodies), np.zeros(robot.nv)) * _OUTWARD
     if reference is None:
@@ -122,10 +128,7 @@ def gravity_error(
 
 
 def total(*loads: "Load | Admissible") -> Admissible:
-    """All of them at once: boxes add; a ball ‖τ_d‖ ≤ r counts as the box |τ_d,i| ≤ r beside boxes, balls add to a ball.
-
-    Raises ArgumentError for none, and for boxes of different numbers of joints.
-    """
+    """The sum of disturbances, a ball of balls or else a box; raises ArgumentError unless their joints are the same."""
     parts = [load.admissible if isinstance(load, Load) else load for load in loads]
     boxes = [part.box for part in parts if part.box is not None]
     radius = sum(part.radius for part in parts if part.radius is not None)
@@ -135,7 +138,7 @@ def total(*loads: "Load | Admissible") -> Admissible:
 
 
 def tool_frame(robot: Robot) -> str:
-    """The link farthest from the last joint among those it carries: where a tool or a payload usually is."""
+    """The link fixed to the last joint that is farthest from it, where a tool or payload usually is."""
     frames = [f for f in robot.model.frames if f.type == pin.FrameType.BODY and f.parentJoint == robot.nv]
     return str(max(frames, key=lambda f: float(np.linalg.norm(f.placement.translation))).name)
 
@@ -153,10 +156,10 @@ def _place(robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | N
 
 
 def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> JointArray:
-    """Per joint the greatest |torque| that a unit force at a point of body `joint` can have, in any posture [m].
+    """Per joint, the largest |torque| that a unit force at a point of body `joint` can cause for any q [m].
 
-    A joint that turns: the distance of the point from its axis, at most the sum of the link lengths between them; one
-    that slides: 1. Joints that do not carry the point: 0.
+    Revolute joint: the distance of the point from the axis, at most the sum of the link lengths between them. Prismatic
+    joint: 1. Joints that do not carry the point: 0.
     """
     model, levers = robot.model, np.zeros(robot.nv)
     motions, point, beyond = model.createData().joints, at, 0.0
@@ -164,7 +167,7 @@ def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> JointArray:
         slides = robot.joints[joint - 1].prismatic
         axis = np.array(motions[joint].S)[:3] if slides else np.array(motions[joint].S)[3:]
         length = float(np.linalg.norm(point))
-        # A point on the axis has a lever of rounding errors.
+        # The lever arm of a point on the axis consists of rounding errors.
         levers[joint - 1] = 1.0 if slides else np.linalg.norm(np.cross(axis, point)) + beyond + _ROUNDING * length
         travel = max(abs(robot.lower[joint - 1]), abs(robot.upper[joint - 1])) if slides else 0.0
         if not np.isfinite(travel):
@@ -175,7 +178,7 @@ def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> JointArray:
 
 
 def sampled(robot: Robot, reference: DesiredMotion, duration: float) -> Reference:
-    """The reference at evenly spaced times over `duration` [s]; raises ArgumentError for one that does not fit."""
+    """The reference at evenly spaced times over `duration` [s]; raises ArgumentError if it does not fit the arm."""
     positive("duration", duration, "s")
     desired = Reference(*(np.asarray(x, dtype=float) for x in reference(np.linspace(0.0, duration, _SAMPLES))))
     if any(x.shape != (_SAMPLES, robot.nv) or not np.isfinite(x).all() for x in desired):
@@ -199,13 +202,13 @@ def _along(
         raise ArgumentError(f"margin is {margin}, expected a finite number of at least 1; 1.5 is usual.")
     because = (
         f"{margin:g} × the peak over {_SAMPLES} instants of {duration:g} s of the reference; "
-        "the arm beside its reference may need more"
+        "deviations from it may need more"
     )
     return _load(what, np.minimum(margin * peak + constant, most), Label.EMPIRICAL, because)
 
 
 def _load(what: str, box: JointArray, label: Label, because: str) -> Load:
-    largest = Claim(f"{what}, the largest |τ_d,i|", float(box.max()), "N·m", label, because, Group.LOADS)
+    largest = Claim(f"{what}, largest |τ_d,i|", float(box.max()), "N·m", label, because, Group.LOADS)
     return Load(Admissible.of(box, len(box)), largest)
 
 
@@ -217,5 +220,5 @@ def _one_each(name: str, value: PerJoint, nv: int) -> JointArray:
 
 
 def label_of(*loads: Load) -> Label:
-    """The weakest of their labels; PROVED for none."""
+    """The weakest label of the loads; PROVED without loads."""
     return weakest(*(load.claim.label for load in loads))

@@ -1,4 +1,4 @@
-"""What a certificate in continuous time leaves out: the hold, delay, and limits of the motors."""
+"""Conditions that a certificate in continuous time does not include: sampling, delay, torque and position limits."""
 
 import numpy as np
 from jaxtyping import Float
@@ -15,13 +15,13 @@ from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.robots.robot import Robot
 
 _INSTANTS = 2001
-_RULE = "a rule that told calm from chatter in 52 runs of a panda (docs/theory.md §5), over sampled configurations"
+_RULE = "a rule that separated calm from chatter in 52 runs of a panda (docs/theory.md §5), at sampled configurations"
 
 
 def sampled_control(controller: LyapunovLaw, period: float | None) -> tuple[tuple[Claim, ...], tuple[Condition, ...]]:
-    """The longest hold and delay of the two rules of sampled control [s], and the period held against the first.
+    """The longest hold and delay by the two rules of sampled control [s], and the period compared with the first.
 
-    h < 2/(λ_max(M⁻¹D) + λ_max(Λ∇²Φ(0))) and delay < (π/2)/λ_max(M⁻¹D), D at z2 = 0, its inertial part ωM with it.
+    h < 2/(λ_max(M⁻¹D) + λ_max(Λ∇²Φ(0))) and delay < (π/2)/λ_max(M⁻¹D), with D(0) including its inertial part ωM.
     """
     zero = np.zeros(controller.nv)
     damping = controller.damping_matrix(zero)
@@ -44,9 +44,9 @@ def sampled_control(controller: LyapunovLaw, period: float | None) -> tuple[tupl
 def effort_margin(
     robot: Robot, dynamics: DynamicsProvider, admissible: Admissible, reference: DesiredMotion, duration: float
 ) -> tuple[Condition, ...]:
-    """Whether every joint's effort limit exceeds what reference and disturbance ask of it together [N·m].
+    """Whether every effort limit exceeds the torque of the reference plus the disturbance [N·m].
 
-    One condition, of the joint with the least left: what feedback asks for beyond that depends on the motion.
+    The condition is that of the joint with the least margin. Feedback adds a torque that depends on the motion.
     """
     if not np.isfinite(robot.effort_limit).any():
         return ()
@@ -63,9 +63,9 @@ def effort_margin(
 def position_margin(
     robot: Robot, errors: JointArray, reference: DesiredMotion, duration: float
 ) -> tuple[Condition, ...]:
-    """Whether the reference with the errors around it stays inside the position limits, for the joint with least room.
+    """Whether the reference with its errors stays inside the position limits, for the joint with the least margin.
 
-    Raises CertificateRefused where the reference alone leaves them: the box is too small for it.
+    Raises CertificateRefused if the reference alone leaves them.
     """
     positions = np.asarray(reference(np.linspace(0.0, duration, _INSTANTS)).q)
     check_box(positions, robot.lower, robot.upper)
@@ -79,7 +79,7 @@ def position_margin(
 
 
 def units(robot: Robot | None, nv: int = 0) -> tuple[str, ...]:
-    """What each joint's position is measured in."""
+    """Unit of each joint's position."""
     return ("rad",) * nv if robot is None else tuple("m" if joint.prismatic else "rad" for joint in robot.joints)
 
 
@@ -91,20 +91,20 @@ def check_box(
     error: JointArray | float = 0.0,
     box: str = "the joint limits",
 ) -> Claim:
-    """How far the reference with its tube stays inside a box [rad, m]: the least distance to a side, over the rows.
+    """The least distance of the reference with its error to a side of a box [rad, m], over the given rows.
 
-    positions: of the reference. low, high: sides of the box, ∓inf where it has none. error: |z1_i| around the
-    reference. box: what the box is, in words. EMPIRICAL, as nothing is said between the rows.
-    Raises CertificateRefused where the reference or its tube leaves the box, or a number is NaN.
+    positions: of the reference. low, high: sides of the box, ∓inf for none. error: bound of |z1_i|. box: its name in
+    messages. The claim is EMPIRICAL, as nothing is checked between the rows.
+    Raises CertificateRefused if the reference with its error leaves the box, or a number is NaN.
     """
     inside = np.minimum(positions - low, high - positions) - error
     if not positions.size or np.isnan(inside).any():
-        refuse(f"the reference or {box} has no rows or numbers that are none", "give finite positions and sides")
+        refuse(f"the reference or {box} is empty or contains NaN", "give finite positions and sides")
     margin, joint = float(inside.min()), int(inside.min(axis=0).argmin())
     if margin < 0.0:
         refuse(
-            f"{box} is too small for the reference: with its error it leaves it at joint {joint + 1} by {-margin:.3g}",
+            f"the reference with its error leaves {box} at joint {joint + 1} by {-margin:.3g}",
             "give a larger box or a smaller motion",
         )
-    because = f"least over {len(positions)} instants and all joints; nothing is said between the instants"
+    because = f"least over {len(positions)} instants and all joints; nothing is checked between the instants"
     return Claim(f"reference inside {box}, least margin", margin, "rad", Label.EMPIRICAL, because)

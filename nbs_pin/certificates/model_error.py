@@ -1,4 +1,4 @@
-"""What the error of a learned model adds to the inequalities: the corrected Theorem 4 (docs/certificates.md §5)."""
+"""Terms that the error of a learned model adds to the inequalities: Theorem 4 corrected (docs/certificates.md §5)."""
 
 import math
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class ModelError(NamedTuple):
 
 
 def model_error(constants: Constants, mismatch: Mismatch, reference: DesiredMotion, duration: float) -> ModelError:
-    """The terms of a bound of δ along a reference.
+    """The terms that follow from a bound of δ along a reference.
 
     ‖q‖ ≤ ‖q_d‖ + ‖z1‖ and ‖v‖ ≤ ‖v_d‖ + ‖z2‖ + ‖Λ∇Φ‖, where, with l = √λ_max(Λ) and d = λ_min(D₀),
     ‖z1‖ ≤ lx/ρ, ‖Λ∇Φ‖ ≤ lx and ‖z2‖ ≤ y/√d.
@@ -43,7 +43,7 @@ def model_error(constants: Constants, mismatch: Mismatch, reference: DesiredMoti
         Claim("c", c, "N·m", fit.label, fit.because, Group.MODEL_ERROR),
         Claim("k = max c + a‖q_d‖ + b‖v_d‖", k, "N·m", fit.label, along, Group.MODEL_ERROR),
     )
-    printed = "the paper's sufficient condition, for comparison; it is not what the bounds rest on"
+    printed = "the paper's sufficient condition, for comparison; the bounds do not rest on it"
     needed = b + 0.5 * b * b + 0.5 * a + 1.0
     conditions = (
         Condition("Theorem 4: 1 − β > α²/4", 1.0 - beta, 0.25 * alpha**2, "", fit.label, "docs/certificates.md §5"),
@@ -54,11 +54,11 @@ def model_error(constants: Constants, mismatch: Mismatch, reference: DesiredMoti
 
 
 def check_fit(mismatch: Mismatch) -> Claim:
-    """The chance ε that a further trajectory breaks ‖δ‖ ≤ a‖q‖ + b‖v‖ + c, computed again from its trajectories.
+    """The chance ε that a further trajectory breaks ‖δ‖ ≤ a‖q‖ + b‖v‖ + c, recomputed from the trajectories.
 
-    PROBABILISTIC with its β and N; EMPIRICAL where ε ≥ ½, as with few trajectories: then the bound describes its data
-    and nothing else. Copies of a trajectory are counted once. Raises CertificateRefused for constants that are negative
-    or not finite, or that its own data exceed.
+    PROBABILISTIC with its β and N; EMPIRICAL if ε ≥ ½, as with few trajectories: the bound then describes its own data
+    only. Copies of a trajectory count once.
+    Raises CertificateRefused if a constant is negative or not finite, or the data exceed the bound.
     """
     m = mismatch
     constants = np.array([m.a, m.b, m.c])
@@ -74,5 +74,5 @@ def check_fit(mismatch: Mismatch) -> Claim:
     name = "‖δ‖ ≤ a‖q‖ + b‖v‖ + c, chance that a trajectory breaks it"
     if chance < 0.5:
         return Claim(name, chance, "", Label.PROBABILISTIC, f"scenario theorem over {said}")
-    because = f"{said}: too few, so the bound describes its own data alone; 374 trajectories give 5 %"
+    because = f"{said}: too few, so the bound describes its own data only; 374 trajectories give 5 %"
     return Claim(name, chance, "", Label.EMPIRICAL, because)

@@ -1,4 +1,4 @@
-"""What is known of a model without trusting whoever built it: M̂ ≻ 0, Ṁ − 2C skew, and the arm that it is of."""
+"""Structure of a model, checked without trusting its constructor: M̂ ≻ 0, Ṁ − 2C skew, and the arm it belongs to."""
 
 from collections.abc import Callable
 from typing import Any
@@ -21,18 +21,18 @@ _SAMPLES = 24
 
 
 def check_model(provider: DynamicsProvider, robot: Robot | None = None) -> ModelClaims:
-    """How it is known that M̂(q) ≻ 0 and that Ṁ − 2C is skew, from the numbers and the code the model now has.
+    """How it is known that M̂(q) ≻ 0 and that Ṁ − 2C is skew, from the model's present numbers and code.
 
-    A model whose code is known states it itself (`DynamicsProvider.structure_claims`); of others, or with a method
-    replaced, it is EMPIRICAL, on sampled states.
+    A model whose code is known states it (`DynamicsProvider.structure_claims`); for others, or with a method replaced,
+    it is EMPIRICAL, on sampled states.
 
     Args:
         provider: The model.
-        robot: The arm the model should be of.
+        robot: The arm that the model should belong to.
 
     Raises:
-        CertificateRefused: For a model of another arm, numbers that are not finite, an M̂ without its εI or with a
-            negative eigenvalue, and a C that is not the Christoffel one (docs/theory.md §1, §6).
+        CertificateRefused: If the model is of another arm, has numbers that are not finite, an M̂ without its εI or with
+            a negative eigenvalue, or a C that is not the Christoffel one (docs/theory.md §1, §6).
     """
     if not isinstance(provider, DynamicsProvider):
         refuse(f"the model is a {type(provider).__name__}", "give a DynamicsProvider, such as PinocchioDynamics(robot)")
@@ -46,7 +46,7 @@ def check_model(provider: DynamicsProvider, robot: Robot | None = None) -> Model
 
 
 def check_finite(name: str, part: Any) -> None:
-    """Raises CertificateRefused for a parameter or fixed number that is not finite."""
+    """Raises CertificateRefused if a parameter or buffer is not finite."""
     if not isinstance(part, nn.Module):
         return
     for key, x in (*part.named_parameters(), *part.named_buffers()):
@@ -56,9 +56,9 @@ def check_finite(name: str, part: Any) -> None:
 
 
 def is_exact(dynamics: DynamicsProvider, robot: Robot | None) -> bool:
-    """Whether a model is the arm: Pinocchio's of it, or a closed form that agrees with that to rounding.
+    """Whether a model is exact: Pinocchio's of the arm, or a closed form that agrees with it up to rounding.
 
-    Where no arm is known a closed form counts as exact: the certificate is then about the arm that it describes.
+    Without an arm a closed form counts as exact; the certificate is then about the arm that it describes.
     """
     if type(dynamics) is PinocchioDynamics:
         return robot is None or dynamics.robot.sha256 == robot.sha256
@@ -66,7 +66,7 @@ def is_exact(dynamics: DynamicsProvider, robot: Robot | None) -> bool:
         return False
     if robot is None:
         return True
-    # Both are linear in ten inertial parameters per body, so generic states tell any difference.
+    # Both are linear in ten inertial parameters per body, so generic states reveal any difference.
     q, v, v_r, a_r = sample_states(dynamics, 50), *np.random.default_rng(1).standard_normal((3, 50, dynamics.nv))
     truth = PinocchioDynamics(robot).reference_torque(q[0], v, v_r, a_r)
     return bool(
@@ -75,14 +75,14 @@ def is_exact(dynamics: DynamicsProvider, robot: Robot | None) -> bool:
 
 
 def sample_states(provider: DynamicsProvider, count: int, seed: int = 0) -> list[Float[np.ndarray, "count n"]]:
-    """Seeded q within the arm's limits, a full turn where there are none, and three vectors of order one."""
+    """Seeded q within the arm's limits (a full turn without limits), and three standard normal vectors."""
     rng, n = np.random.default_rng(seed), provider.nv
     low, high = (-np.pi, np.pi) if provider.robot is None else provider.robot.sampling_range
     return [rng.uniform(low, high, (count, n)), *rng.normal(size=(3, count, n))]
 
 
 def _check_arm(provider: DynamicsProvider, robot: Robot | None) -> None:
-    """Raises CertificateRefused for a model of another arm than the one given, or than the one it names."""
+    """Raises CertificateRefused if the model is not of the given arm, or not of the arm that it names."""
     own = provider.robot
     if own is not None and own.nv != provider.nv:
         refuse(f"the model has {provider.nv} joints and its arm {own.name} {own.nv}", "give the model of that arm")
@@ -98,7 +98,7 @@ def _check_arm(provider: DynamicsProvider, robot: Robot | None) -> None:
 
 
 def _sampled_claims(provider: DynamicsProvider, why: str) -> ModelClaims:
-    """M̂ ≻ 0 and Ṁ = C + Cᵀ on sampled states; raises CertificateRefused where one of them does not hold."""
+    """M̂ ≻ 0 and Ṁ = C + Cᵀ on sampled states; raises CertificateRefused if one of them fails."""
     q, v, _, _ = sample_states(provider, 4 * _SAMPLES)
     mass = _finite(provider.mass_matrix, q)
     size = np.abs(mass).max(axis=(-2, -1))
@@ -115,7 +115,7 @@ def _sampled_claims(provider: DynamicsProvider, why: str) -> ModelClaims:
     if off.max() > 1e-4:
         at = np.round(q[int(off.argmax())], 3).tolist()
         refuse(f"Ṁ − 2C is not skew at q = {at}", "give the Christoffel C of M̂")
-    said = f"{why or 'a body alone resists its joint with nothing'}: held at {len(q)} sampled states"
+    said = f"{why or 'a body alone has no inertia about its own joint'}: checked at {len(q)} sampled states"
     return ModelClaims(
         Claim(POSITIVE, float(least.min()), "kg·m²", Label.EMPIRICAL, said),
         Claim(SKEW, float(off.max()), "", Label.EMPIRICAL, said),
@@ -123,9 +123,9 @@ def _sampled_claims(provider: DynamicsProvider, why: str) -> ModelClaims:
 
 
 def _check_routes(provider: DynamicsProvider, skew: Claim) -> None:
-    """Raises CertificateRefused unless reference_torque is M a + C w + G, whichever code it runs."""
+    """Raises CertificateRefused unless reference_torque equals M a + C w + G, whatever code it runs."""
     if not np.isfinite(skew.value):
-        return  # not quadratic: its exact torque is another
+        return  # the energy is not quadratic in v, so its exact torque differs
     q, v, w, a = sample_states(provider, _SAMPLES, seed=1)
     parts = [
         matvec(_finite(provider.mass_matrix, q), a),

@@ -1,4 +1,4 @@
-"""A certificate held against what happens: V beside its promise along a run, and which assumption failed."""
+"""Check of a run against a certificate: V beside its bound, and the assumptions that failed."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,39 +31,39 @@ from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, s
 
 @dataclass(frozen=True, eq=False)
 class Monitored:
-    """V along one motion, what was promised of it, where it went, and which assumptions held."""
+    """V and the errors along one motion, their certified bounds, the terms of V̇, and the assumptions that failed."""
 
     t: Float[np.ndarray, " rows"]
     """Time [s]."""
     storage: Float[np.ndarray, " rows"]
     """V [J]."""
     promise: Float[np.ndarray, " rows"]
-    """What V was not to exceed [J], from V(0)."""
+    """Bound of V, from V(0) [J]."""
     error: Float[np.ndarray, " rows"]
     """‖z1‖ [rad]."""
     error_bound: Float[np.ndarray, " rows"]
-    """What ‖z1‖ was not to exceed [rad], from V(0); from V(0) > V∞ it falls as the promise does."""
+    """Bound of ‖z1‖, from V(0) [rad]; from V(0) > V∞ it decays with the bound of V."""
     joint_errors: Float[np.ndarray, "rows n"]
     """|z1_i| [rad]."""
     joint_bounds: Float[np.ndarray, "rows n"]
-    """What each was not to exceed [rad]."""
+    """Bound of each |z1_i| [rad]."""
     joint_names: tuple[str, ...]
     balance: Balance
-    """V̇ and its terms between one row and the next, (rows − 1, …)."""
+    """V̇ and its terms between consecutive rows, (rows − 1, …)."""
     saturated: Bool[np.ndarray, " periods"]
-    """Whether the torque was cut between one row and the next."""
+    """Whether the torque was saturated between consecutive rows."""
     excesses: dict[str, Bool[np.ndarray, " rows"]]
-    """What went beyond its bound, "V", "‖z1‖" or "|z1| of" a joint by name, and when."""
+    """The exceeded bounds by name, "V", "‖z1‖" or "|z1| of JOINT", and when."""
     failures: dict[Assumption, Bool[np.ndarray, " periods"]]
-    """The assumptions that failed, in the words of the certificate, and when."""
+    """The assumptions that failed, and when."""
     is_recorded: bool
-    """Whether the run has a disturbance on record; without one, MODEL and DISTURBANCE cannot be told apart."""
+    """Whether the run records a disturbance; without one, MODEL and DISTURBANCE cannot be distinguished."""
     is_wrong: bool
-    """Whether a promise was broken that the failed assumptions do not account for."""
+    """Whether a bound was exceeded by more than the failed assumptions account for."""
 
     @cached_property
     def exceeded(self) -> Bool[np.ndarray, " rows"]:
-        """Where V, ‖z1‖ or some |z1_i| is beyond what was promised."""
+        """Where V, ‖z1‖ or some |z1_i| exceeds its bound."""
         return np.logical_or.reduce(list(self.excesses.values()), axis=0) | np.zeros(len(self.t), dtype=bool)
 
     @property
@@ -73,28 +73,41 @@ class Monitored:
 
     @property
     def is_kept(self) -> bool:
-        """Whether V, ‖z1‖ and every |z1_i| stayed within the promise."""
+        """Whether V, ‖z1‖ and every |z1_i| stayed within their bounds."""
         return not self.excesses
 
     @property
     def verdict(self) -> str:
-        """One sentence: whether the promise was kept, and if not, by what, and which assumption failed or that none."""
+        """One sentence: whether the bounds were kept, and which assumptions failed."""
         failed = {name: f" (t = {self.t[:-1][when][0]:.4g} s)" for name, when in self.failures.items()}
         at = "" if self.is_kept else f" at t = {self.t[self.exceeded][0]:.4g} s by {listed(tuple(self.excesses))}"
         return sentence(at, self.is_kept, self.is_wrong, failed, is_recorded=self.is_recorded)
 
 
 def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
-    """Holds a certificate against a run of its controller, simulated or logged.
+    """Check a run, simulated or logged, against a certificate of its controller.
 
-    What the model leaves unexplained comes from differences of v, so noise in a log counts as disturbance. A promise is
-    broken in earnest (`is_wrong`) when V or an error exceeds it by more than the energy that torques beyond the
-    admissible ones, of whatever cause, can have brought since the start. V and the model may be learned: M̂ is in both,
-    and the error that the certificate counts is granted. That torques are held is reported once it has brought more
-    than 1 % of what V may be, or a promise is broken.
+    The torque that the model does not explain is found from differences of v, so noise in a log counts as disturbance.
+    The certificate is called wrong (`is_wrong`) if V or an error exceeds its bound by more than the energy supplied by
+    inadmissible torques, whatever their cause, accounts for. A certified model error is allowed for. The hold of the
+    torque is reported if it has supplied more than 1 % of the bound of V, or if a bound is exceeded.
 
-    start: which start of a batched run. Raises ArgumentError for a run of another arm, or of less than two rows, and
-    for what is no certificate.
+    Args:
+        run: A run of the certified controller.
+        certificate: From `certify`.
+        start: Which start of a batched run.
+
+    Raises:
+        ArgumentError: If the run is of another arm or has less than two rows, or an argument has the wrong type.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> controller = nbs.NeuralBackstepping.for_robot(robot)
+        >>> plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot))
+        >>> run = nbs.simulate(plant, controller, nbs.Sinusoid.for_robot(robot), 0.2, 0.001)
+        >>> nbs.monitor(run, nbs.certify(controller, [5.0, 5.0])).verdict
+        'promise kept'
     """
     check_certificate(certificate)
     _check_run(run, certificate, start)
@@ -134,7 +147,7 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
 
 def _check_run(run: Run, certificate: Certificate, start: int) -> None:
     if not isinstance(run, Run):
-        raise ArgumentError(f"a {type(run).__name__} is no run; give what simulate returned or Run.load read.")
+        raise ArgumentError(f"a {type(run).__name__} is not a Run; give what simulate returned or Run.load read.")
     robot, nv = certificate.robot, certificate.controller.nv
     if robot is not None and run.robot_sha256 not in ("", robot.sha256):
         raise ArgumentError(
@@ -144,6 +157,6 @@ def _check_run(run: Run, certificate: Certificate, start: int) -> None:
     starts = int(np.prod(run.q.shape[1:-1], dtype=int))
     if run.nv != nv or len(run.t) < 2 or not 0 <= start < starts:
         raise ArgumentError(
-            f"the run has {run.nv} joints, {len(run.t)} rows and {starts} starts, expected {nv} joints, two rows at "
-            f"least and the start {start}; give a run of the certificate's controller."
+            f"the run has {run.nv} joints, {len(run.t)} rows and {starts} starts, expected {nv} joints, at least "
+            f"two rows and the start {start}; give a run of the certificate's controller."
         )

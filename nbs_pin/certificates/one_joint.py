@@ -1,8 +1,8 @@
-"""The worst error of an arm with one joint, whose inertia is constant: exact for a quadratic Φ and a constant D.
+"""Bound of the error of an arm with one joint, whose inertia is constant: exact for quadratic Φ and constant D.
 
 With ∇Φ(z1) = kz1 + n, |n| ≤ h|z1|, and D(z2)z2 = dz2 + ε, |ε| ≤ e|z2|, the loop is a linear system under τ_d, n, ε.
 The largest response of a linear system to |u| ≤ 1 is the L1 norm of its impulse response, here in closed form, and the
-small-gain theorem adds the three (docs/certificates.md §4).
+small-gain theorem combines the three (docs/certificates.md §4).
 """
 
 import math
@@ -17,7 +17,7 @@ _ROUNDS = 12
 
 
 class Loop(NamedTuple):
-    """ż1 = z2 − λ(kz1 + n), Mż2 = −ζ(kz1 + n) − (Mω + d)z2 − e + τ_d."""
+    """ż1 = z2 − λ(kz1 + n), Mż2 = −ζ(kz1 + n) − (Mω + d)z2 − ε + τ_d."""
 
     inertia: float
     """M [kg·m²]."""
@@ -34,18 +34,18 @@ class Loop(NamedTuple):
 
 
 class Worst(NamedTuple):
-    """From z1 = z2 = 0 at all times, in the limit from anywhere; inf where the small-gain theorem does not apply."""
+    """Bounds at all times from z1 = z2 = 0, and in the limit from any start; inf if the small-gain theorem fails."""
 
     z1: float
-    """At least |z1| [rad]."""
+    """Bound of |z1| [rad]."""
     z2: float
-    """At least |z2| [rad/s]."""
+    """Bound of |z2| [rad/s]."""
 
 
 def worst_of(loop: Loop, disturbance: float, curvature: Interval, extra_damping: Interval) -> Worst:
-    """The worst under |τ_d| ≤ `disturbance` [N·m].
+    """The bounds under |τ_d| ≤ `disturbance` [N·m].
 
-    curvature: of ψ'' [N·m/rad]. extra_damping: of D − D₀ [N·m·s/rad], both wherever the loop goes.
+    curvature: range of ψ'' [N·m/rad]. extra_damping: range of D − D₀ [N·m·s/rad], both on the states that are reached.
     """
     if not (np.isfinite(curvature.high) and np.isfinite(extra_damping.high)):
         return Worst(np.inf, np.inf)
@@ -65,9 +65,9 @@ def worst_of(loop: Loop, disturbance: float, curvature: Interval, extra_damping:
 
 
 def worst_error(loop: Loop, disturbance: float, law: LyapunovLaw, within: Worst) -> float:
-    """At least sup |z1| [rad] from z1 = z2 = 0 and limsup |z1| from anywhere, under |τ_d| ≤ `disturbance` [N·m].
+    """Bound of sup |z1| from z1 = z2 = 0 and of limsup |z1| from any start [rad], under |τ_d| ≤ `disturbance` [N·m].
 
-    within: bounds of |z1| and |z2| known already. ψ'' and T² are bounded there, which bounds z1 and z2 anew, and so on.
+    within: known bounds of |z1| and |z2|. The ranges of ψ'' and T² within them give smaller bounds, and so on.
     """
     for _ in range(_ROUNDS):
         found = worst_of(loop, disturbance, law.extra_stiffness(within.z1), law.extra_damping(within.z2))

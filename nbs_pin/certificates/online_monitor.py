@@ -1,4 +1,4 @@
-"""A certificate held against a loop while it runs."""
+"""Check of a closed loop against a certificate while it runs."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,53 +32,53 @@ from nbs_pin.controllers.controller import MemorylessController
 
 
 class WatchMemory(NamedTuple):
-    """What a `Watch` remembers from one instant to the next."""
+    """Memory of a `Watch` between instants."""
 
     began: float
     """Time of the first instant [s]."""
     initial: float
-    """V at that time [J]."""
+    """V at the first instant [J]."""
     last: LoopSamples
-    """The instant before."""
+    """The previous instant."""
     storage: float
-    """V then [J]."""
+    """V at the previous instant [J]."""
     excess: float
-    """Energy that torques beyond the admissible ones can have brought and that has not decayed [J]."""
+    """Energy that inadmissible torques can have supplied and that has not decayed [J]."""
     held: float
-    """Energy that holding the torque has brought and that has not decayed [J]."""
+    """Energy that holding the torque has supplied and that has not decayed [J]."""
     ratio: float
-    """How many times the bound torques have been so far, at least 1."""
+    """Largest ratio of torque to bound so far, at least 1."""
     broken: tuple[Assumption, ...]
     """Assumptions that have failed so far."""
 
 
 class Watched(NamedTuple):
-    """What a `Watch` says at one instant."""
+    """Result of a `Watch` at one instant."""
 
     storage: float
     """V [J]."""
     promise: float
-    """What V is not to exceed [J]."""
+    """Bound of V [J]."""
     error: float
     """‖z1‖ [rad]."""
     error_bound: float
-    """What ‖z1‖ is not to exceed [rad]."""
+    """Bound of ‖z1‖ [rad]."""
     joint_errors: JointArray
     """|z1_i| [rad]."""
     joint_bounds: JointArray
-    """What each is not to exceed [rad]."""
+    """Bound of each |z1_i| [rad]."""
     excesses: tuple[str, ...]
-    """What is beyond its bound now: "V", "‖z1‖" or "|z1| of" a joint by name."""
+    """The bounds exceeded now: "V", "‖z1‖" or "|z1| of JOINT"."""
     broken: tuple[Assumption, ...]
     """Assumptions that have failed so far."""
     balance: Balance | None
     """V̇ and its terms over the last period; None at the first instant."""
     verdict: str
-    """One sentence."""
+    """One sentence, as in `Monitored`."""
 
     @property
     def is_kept(self) -> bool:
-        """Whether V, ‖z1‖ and every |z1_i| are within the promise, now."""
+        """Whether V, ‖z1‖ and every |z1_i| are within their bounds now."""
         return not self.excesses
 
 
@@ -89,15 +89,25 @@ class _Seen(NamedTuple):
     bounds: Float[np.ndarray, " quantities"]
     over: Bool[np.ndarray, " quantities"]
     is_unaccounted: bool
-    """Whether one is beyond what torques that are not admissible can have done."""
+    """Whether one exceeds what inadmissible torques can have done."""
 
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """A certificate held against a loop while it runs, one instant after the other; its memory is the caller's.
+    """Check of a closed loop against a certificate while it runs, one control instant after the other.
 
-    Of a live arm no disturbance is on record: all that is unexplained is said of model and disturbance both.
-    Raises ArgumentError for what is no certificate.
+    The caller keeps the memory. As a live arm records no disturbance, an unexplained torque is attributed to both model
+    and disturbance. Raises ArgumentError unless `certificate` is a `Certificate`.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> controller, aim = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)(0.0)
+        >>> watch = nbs.Watch(nbs.certify(controller, [5.0, 5.0]))
+        >>> tau = controller.torque(aim.q, aim.v, *aim)
+        >>> seen, memory = watch.step(None, 0.0, aim.q, aim.v, aim, tau, tau)
+        >>> seen.verdict
+        'promise kept'
     """
 
     certificate: Certificate
@@ -119,9 +129,9 @@ class Watch:
         tau: JointArray,
         tau_command: JointArray,
     ) -> tuple[Watched, WatchMemory]:
-        """What is to be said at time t [s], and what to remember; memory is None at first, tau acts from t on [N·m].
+        """The result at time t [s], and the memory for the next step; `memory` is None at first.
 
-        Raises ArgumentError for an instant that is not after the last one.
+        The torque `tau` acts from t on [N·m]. Raises ArgumentError unless t is after the previous instant.
         """
         now = LoopSamples(np.array(t), q, v, reference.q, reference.v, reference.a, tau, tau_command)
         storage = float(storage_of(self.certificate.controller, now))
@@ -130,7 +140,9 @@ class Watch:
             return self._said(memory, None, self._seen(memory)), memory
         step = t - float(memory.last.t)
         if not step > 0.0:
-            raise ArgumentError(f"the instant t = {t} s is not after the last, {memory.last.t} s; give them in order.")
+            raise ArgumentError(
+                f"the instant t = {t} s is not after the last one, {memory.last.t} s; give them in order."
+            )
         both = LoopSamples(*(np.stack([a, b]) for a, b in zip(memory.last, now, strict=True)))
         change = np.array([storage - memory.storage])
         flow = balance(self.certificate.controller, both.rows(slice(1)), both.rows(slice(1, None)), change, self._law)
@@ -148,7 +160,7 @@ class Watch:
         return self._said(memory, flow, seen), memory
 
     def _seen(self, memory: WatchMemory) -> _Seen:
-        """The memory's last instant beside what was promised of it."""
+        """The last instant of the memory, with its bounds."""
         dynamics, now, promise = self.certificate.controller.dynamics, memory.last, self._promise(memory)
         values = quantities(np.array([memory.storage]), dynamics.difference(now.q, now.q_ref)[None])
         bounds = promise.bounds(np.array([float(now.t) - memory.began]))
@@ -159,7 +171,7 @@ class Watch:
     def _broken(
         self, memory: WatchMemory, flow: Balance, setting: Setting, both: LoopSamples, seen: _Seen
     ) -> tuple[Assumption, ...]:
-        """The assumptions that have failed, those of the last period among them."""
+        """The assumptions that have failed, including the last period."""
         controller = self.certificate.controller
         held = np.array([memory.held > NOTICEABLE * seen.bounds[0]])
         failed = failures(flow, setting, jumps(controller, both), held, bool(seen.over.any()), None)

@@ -1,8 +1,8 @@
-"""Gains and a control period chosen from the bound: a given error for a given disturbance, certified.
+"""Design of gains and control period that certify a wanted error under a given disturbance.
 
-For the inertia-shaped law with K = s²K̂, D₀ = sD̂₀ and ω = sω̂ every constant of the proof scales with the speed s: V∞
-and Φ∞ fall with s⁻², the errors √(2Φ∞/K_i) with s⁻⁴ under the root, which is s⁻². So one bound per shape (K̂, D̂₀, ω̂)
-gives the slowest loop of that shape that certifies the wanted error (docs/certificates.md §8).
+For the inertia-shaped law with K = s²K̂, D₀ = sD̂₀ and ω = sω̂, every constant of the proof scales with the speed s: V∞
+and Φ∞ scale with s⁻², hence the errors √(2Φ∞/K_i) with s⁻². So one bound per shape (K̂, D̂₀, ω̂) gives the slowest loop
+of that shape that certifies the wanted error (docs/certificates.md §8).
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,37 +26,37 @@ from nbs_pin.motions.references import DesiredMotion, Sinusoid
 from nbs_pin.robots.robot import Robot
 
 PERIODS = (0.01, 0.005, 0.002, 0.001, 0.0005, 0.00025)
-"""Control periods to choose from unless told otherwise, the longest first [s]."""
+"""Default control periods to choose from, the longest first [s]."""
 STIFF, FAST = 0.4, 0.25
-"""Largest √(K_i/M_e,i)·h and ωh: what sampled loops without delay stay calm at (docs/theory.md §2, measured)."""
+"""Largest √(K_i/M_e,i)·h and ωh at which sampled loops without delay stay calm (measured, docs/theory.md §2)."""
 _ALIKE = (0.0, 0.5, 1.0)
-"""Exponents of M_e in K̂: 0 makes the stiffness of all joints what their errors ask for, 1 their frequencies alike."""
+"""Exponents of M_e in K̂: 0 shapes the stiffness by the wanted errors, 1 gives all joints the same frequency."""
 _SLOWNESS = (1.0, 1.6, 2.5, 4.0)
 """√(K/M_e) of the lightest joint in units of ω."""
 _DAMPING = (0.5, 0.7, 1.0)
 """ζ of D₀ = 2ζ√(K M_e)."""
 _SPARE = 1.0 - 1e-6
-"""The design aims at so much of the wanted error, so that the rounding of its certificate fits in."""
+"""Share of the wanted error that the design aims at, to leave room for the rounding of its certificate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """An inertia-shaped law whose certificate keeps the wanted error."""
+    """An inertia-shaped law that certifies the wanted error."""
 
     gains: Gains
-    """ω, K = 2S, D₀; Λ = ωK⁻¹ is their `rate`."""
+    """ω, K = 2S and D₀; their `rate` is Λ = ωK⁻¹."""
     period: float
     """The longest control period found for it [s]."""
     controller: NeuralBackstepping
-    """The law with these gains and fresh networks; the bound holds for every weight of theirs."""
+    """The law with these gains and untrained networks; the bound holds for all their weights."""
     error: float
-    """Bound of ‖z1‖ [rad]; `certify` gives this or less."""
+    """Bound of ‖z1‖ [rad]; `certify` gives at most this."""
     joint_errors: JointArray
     """Bound of every |z1_i| [rad]."""
     torque: JointArray
-    """|τ_ref| + disturbance + K_i·(bound of |z1_i|), the stiffness at its bound, per joint [N·m]."""
+    """|τ_ref| + disturbance + K_i·(bound of |z1_i|), per joint [N·m]."""
     share: float
-    """The largest share of an effort limit in `torque`; 0 without limits."""
+    """Largest ratio of `torque` to the effort limit; 0 without limits."""
     stiff: float
     """Largest √(K_i/M_e,i)·h, at most `STIFF`."""
     fast: float
@@ -74,17 +74,30 @@ def propose(
     dynamics: DynamicsProvider | None = None,
     seed: int = 0,
 ) -> Proposal:
-    """S, Λ, D₀ and the control period that certify the wanted error inside the arm's torque limits.
+    """Choose S, Λ, D₀ and the control period to certify a wanted error within the arm's effort limits.
 
-    The longest period wins, then the gentlest law: the least answer (K_i + ωD₀,i + ω²M_ii)·|z1_i| to its error bounds.
-    The limits must leave room for reference, disturbance and the stiffness at its bound, which is a margin and no
-    proof that no joint saturates. That torque is the same for every wanted error: a stiffer law has a smaller one.
+    The longest feasible period is taken, then the law with the least torque (K_i + ωD₀,i + ω²M_ii)·|z1_i| at its error
+    bounds. The limits must exceed the torque of reference, disturbance and stiffness, K_i·|z1_i|, at the bounds. This
+    is a margin, not a proof that no joint saturates, and the same for every wanted error: stiffer laws err less.
 
-    disturbance: as in `certify`. error: of ‖z1‖, or one per joint on |z1_i| [rad]. reference: whose torque over
-    `duration` [s] the limits must allow as well; None takes `Sinusoid.for_robot`. periods: to choose from [s].
-    dynamics: the exact model of the arm; None takes Pinocchio's. seed: of the networks.
-    Raises ArgumentError that says what forbids it, the torque limit of a joint or the control periods, and for
-    arguments that are none.
+    Args:
+        robot: The arm.
+        disturbance: As in `certify`.
+        error: Wanted bound of ‖z1‖, or of |z1_i| per joint [rad].
+        reference: The motion whose torque the limits must allow as well. None takes `Sinusoid.for_robot`.
+        duration: Length of the reference that is used [s].
+        periods: Control periods to choose from [s].
+        dynamics: The exact model of the arm. None takes Pinocchio's.
+        seed: Seed of the network weights.
+
+    Raises:
+        ArgumentError: If no design is feasible (the message names the limiting joint or period) or an argument invalid.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> design = nbs.propose(nbs.load_robot("two_link"), [5.0, 5.0], 0.05)
+        >>> design.period, design.error <= 0.05
+        (0.01, True)
     """
     _check_kinds(robot, reference, dynamics)
     admissible = Admissible.of(disturbance, robot.nv)
@@ -104,7 +117,7 @@ def propose(
 
 @dataclass(frozen=True, eq=False)
 class _Arm:
-    """What a design needs to know of the arm, (n,) each."""
+    """Data of the arm that a design needs, (n,) each."""
 
     effective: np.ndarray
     """M_e [kg·m²]."""
@@ -136,7 +149,7 @@ class _Arm:
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """Gains that certify the error, at the least speed of their shape."""
+    """Gains that certify the error at the least speed of their shape."""
 
     gains: Gains
     potential: float
@@ -156,7 +169,7 @@ class _Candidate:
         return arm.reference_torque + arm.disturbance + self.gains.stiffness * self.joint_errors
 
     def answer(self, arm: _Arm, robot: Robot) -> float:
-        """The largest torque of the law at rest at its error bounds, as a share of the limits where all have one."""
+        """Largest torque of the law at rest at its error bounds, as a share of the limits if every joint has one."""
         omega, limits = self.gains.bandwidth, robot.effort_limit
         total = self.gains.stiffness + omega * self.gains.damping + omega**2 * arm.largest
         return float((total * self.joint_errors / (limits if np.isfinite(limits).all() else 1.0)).max())
@@ -166,7 +179,7 @@ class _Candidate:
 
 
 def _shapes(arm: _Arm, wanted: np.ndarray) -> Iterator[Gains]:
-    """Gains up to their speed: ω̂ = 1."""
+    """Shapes of gains, with ω̂ = 1."""
     need = 1.0 / wanted**2
     for exponent, slowness, damping in product(_ALIKE, _SLOWNESS, _DAMPING):
         stiffness = need ** (1.0 - exponent) * arm.effective**exponent
@@ -175,7 +188,7 @@ def _shapes(arm: _Arm, wanted: np.ndarray) -> Iterator[Gains]:
 
 
 def _scaled(shape: Gains, admissible: Admissible, wanted: np.ndarray) -> "_Candidate | None":
-    """The shape at the least speed that certifies the error; None for no disturbance at all."""
+    """The shape at the least speed that certifies the error; None without a disturbance."""
     unit = _potential(shape, admissible)
     errors = np.sqrt(2.0 * unit / shape.stiffness)
     missing = float((errors / wanted).max())
@@ -211,11 +224,10 @@ def _proposal(
 
 
 def _check_kinds(robot: Any, reference: Any, dynamics: Any) -> None:
-    """Raises ArgumentError for what is no arm, no motion, no model, or a model of another number of joints."""
+    """Raises ArgumentError unless they are an arm, a motion and a model of its joints."""
     if not isinstance(robot, Robot):
         raise ArgumentError(
-            f"a design is made for an arm and was given {_shown(robot)}; give load_robot(…), or of a controller its "
-            "dynamics.robot."
+            f"robot is {_shown(robot)}, expected an arm; give load_robot(…), or the dynamics.robot of a controller."
         )
     if reference is not None and not callable(reference):
         raise ArgumentError(f"the reference is {_shown(reference)}, expected a motion like Sinusoid.for_robot(robot).")
@@ -227,7 +239,7 @@ def _check_kinds(robot: Any, reference: Any, dynamics: Any) -> None:
 
 
 def _shown(value: Any) -> str:
-    """A value in a sentence: itself where it is short, else its kind."""
+    """A value for a message: itself if it is short, else its type."""
     return f"'{value}'" if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
 
 
@@ -252,7 +264,7 @@ def _wanted(error: PerJoint, nv: int) -> np.ndarray:
 
 
 def _check_limits(robot: Robot, arm: _Arm) -> None:
-    """Raises ArgumentError where a joint cannot even hold reference and disturbance."""
+    """Raises ArgumentError if a joint cannot even supply the torque of reference and disturbance."""
     spare = robot.effort_limit - arm.reference_torque - arm.disturbance
     i = int(np.argmin(spare))
     if spare[i] <= 0.0:
@@ -264,9 +276,9 @@ def _check_limits(robot: Robot, arm: _Arm) -> None:
 
 
 def _forbidden(robot: Robot, arm: _Arm, candidates: "list[_Candidate]", period: float, admissible: Admissible) -> str:
-    """Why no candidate will do, in one sentence."""
+    """Why no candidate is feasible, in one sentence."""
     if not candidates:
-        return f"{admissible} asks for no gains at all; give a disturbance above 0."
+        return f"{admissible} does not determine the gains; give a disturbance above 0."
     light = [c for c in candidates if c.share(arm, robot) <= 1.0]
     if not light:
         best = min(candidates, key=lambda c: c.share(arm, robot))
@@ -280,6 +292,6 @@ def _forbidden(robot: Robot, arm: _Arm, candidates: "list[_Candidate]", period: 
     need = min(STIFF / best.stiff(arm, 1.0), FAST / best.gains.bandwidth)
     return (
         f"a control period of {1e3 * period:g} ms forbids it: √(K/M)·h would be {best.stiff(arm, period):.2g} and ωh"
-        f" {best.gains.bandwidth * period:.2g}, where sampled loops stay calm to {STIFF:g} and {FAST:g}; take a period"
-        f" of at most {1e3 * need:.2g} ms, or want a larger error."
+        f" {best.gains.bandwidth * period:.2g}, while sampled loops stay calm up to {STIFF:g} and {FAST:g}; take a"
+        f" period of at most {1e3 * need:.2g} ms, or want a larger error."
     )

@@ -1,4 +1,4 @@
-"""What makes a controller stable, read from the numbers and the code it now has, whoever built or edited it."""
+"""Stability structure of a controller, read from its present numbers and code, however it was built or edited."""
 
 from typing import Any
 
@@ -17,17 +17,17 @@ _TOLERANCE = 1e-6
 
 
 def check_structure(controller: Any, robot: Robot | None = None) -> Lyapunov:
-    """The constants of a `LyapunovLaw` and the claims they rest on: of its parts, of the law itself and of its model.
+    """The constants of a `LyapunovLaw` and the claims they rest on: of its parts, the law itself and its model.
 
-    Constructors are not trusted: effective weights, gains and constants are read as they now stand. What is known code
-    is PROVED by structure; a part of another class, or with a method replaced, is EMPIRICAL, on sampled states.
+    Constructors are not trusted: present weights, gains and constants are read. Known code is PROVED by structure; a
+    part of another class, or with a method replaced, is EMPIRICAL, on sampled states.
 
     Args:
         controller: The law.
-        robot: The arm the controller is meant for, if its belief shall be held to it.
+        robot: The arm that the controller's model should belong to, if it is to be checked.
 
     Raises:
-        CertificateRefused: In one sentence, where the proof of docs/theory.md §5 has no ground.
+        CertificateRefused: If the proof of docs/theory.md §5 does not apply.
     """
     if not isinstance(controller, LyapunovLaw):
         refuse(
@@ -43,7 +43,7 @@ def check_structure(controller: Any, robot: Robot | None = None) -> Lyapunov:
 
 
 def _law_claim(controller: LyapunovLaw, model: ModelClaims) -> Claim:
-    """How V̇ of the undisturbed loop is known; raises CertificateRefused where V falls more slowly than it says."""
+    """How V̇ of the undisturbed loop is known; raises CertificateRefused if V falls more slowly than claimed."""
     falsify_law(controller)
     why = foreign_code(controller)
     why = why or ("" if model.positive.label is Label.PROVED else model.positive.because)
@@ -58,9 +58,9 @@ def _law_claim(controller: LyapunovLaw, model: ModelClaims) -> Claim:
 
 
 def falsify_law(controller: LyapunovLaw) -> None:
-    """Raises CertificateRefused with a state at which V falls more slowly than its `losses`, undisturbed.
+    """Raises CertificateRefused with a state at which the undisturbed V falls more slowly than its `losses`.
 
-    V̇ = ∇Φᵀ(v − v_d) + z2ᵀ(τ − f(v) − (M a_r + C φ + G)), from the ingredients and not from the law's own signals.
+    V̇ = ∇Φᵀ(v − v_d) + z2ᵀ(τ − f(v) − (M a_r + C φ + G)), from the model terms, not from the law's own signals.
     """
     model = controller.dynamics
     q, z, v, v_ref = sample_states(model, _STATES, seed=2)

@@ -1,6 +1,7 @@
-"""Admissible disturbances as signals in time: what an adversary begins with, and random ones."""
+"""Admissible disturbances as signals in time: the initial ones of `attack`, and random ones."""
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -8,8 +9,10 @@ from jaxtyping import Float
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
 
+Instants: TypeAlias = Float[np.ndarray, " steps"]
+Torques: TypeAlias = Float[np.ndarray, "steps n"]
 SLOWEST, FASTEST = 1.0, 300.0
-"""Rates of waves [rad/s]."""
+"""Range of angular frequencies [rad/s]."""
 
 
 def random_disturbances(
@@ -23,74 +26,60 @@ def random_disturbances(
 ) -> Float[np.ndarray, "count steps n"]:
     """`count` admissible τ_d(t) [N·m], held over each period [s], of every kind of `KINDS` in turn.
 
-    Rates, phases and shares among the joints are random. Square waves, constants, steps and random switching are on
-    the boundary of what is admissible all the time, sines, sums of sines and filtered noise touch it.
-    nv: number of joints, for a bound on ‖τ_d‖. Raises ArgumentError when it is missing.
+    Rates, phases and shares of the joints are random. Square waves, constants, steps and random switching stay on the
+    boundary of the admissible set; sines, sums of sines and filtered noise touch it.
+    nv: number of joints, for a bound on ‖τ_d‖; raises ArgumentError if it is missing then.
     """
     n = nv if admissible.box is None else len(admissible.box)
     if n is None:
-        raise ArgumentError("a bound on ‖τ_d‖ does not tell the number of joints; give nv.")
+        raise ArgumentError("a bound on ‖τ_d‖ does not give the number of joints; give nv.")
     t = period * np.arange(steps)
     kinds = list(KINDS.values())
     return np.array([kinds[k % len(kinds)](admissible, t, n, generator) for k in range(count)]).reshape(count, steps, n)
 
 
-def constant(
-    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "steps n"]:
+def constant(admissible: Admissible, t: Instants, n: int, rng: np.random.Generator) -> Torques:
     """A corner of the box, or a random direction of the ball."""
-    return np.tile(_boundary(admissible, _direction(n, rng)), (len(t), 1))
+    return np.tile(admissible.towards(_direction(n, rng)), (len(t), 1))
 
 
-def square(
-    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "steps n"]:
-    """Square waves of all joints at a rate and phase of their own."""
-    return _boundary(admissible, _direction(n, rng) * _signs(np.sin(_angles(t, n, rng))))
+def square(admissible: Admissible, t: Instants, n: int, rng: np.random.Generator) -> Torques:
+    """A square wave per joint, each with its own rate and phase."""
+    return admissible.towards(_direction(n, rng) * _signs(np.sin(_angles(t, n, rng))))
 
 
 def in_step(
-    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator, rate: float | None = None
-) -> Float[np.ndarray, "steps n"]:
-    """A square wave of one rate [rad/s] on all joints, with or against each other."""
+    admissible: Admissible, t: Instants, n: int, rng: np.random.Generator, rate: float | None = None
+) -> Torques:
+    """A square wave of one rate [rad/s] on all joints, in phase or antiphase."""
     rate = float(_rates(1, rng)[0]) if rate is None else rate
     wave = _signs(np.sin(rate * t[:, None] + rng.uniform(0.0, 2.0 * np.pi)))
-    return _boundary(admissible, _direction(n, rng) * wave)
+    return admissible.towards(_direction(n, rng) * wave)
 
 
-def _step(
-    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "steps n"]:
+def _step(admissible: Admissible, t: Instants, n: int, rng: np.random.Generator) -> Torques:
     after = t[:, None] >= rng.uniform(0.0, t[-1] if t[-1] > 0.0 else 1.0, n)
-    return _boundary(admissible, np.where(after, _direction(n, rng), _direction(n, rng)))
+    return admissible.towards(np.where(after, _direction(n, rng), _direction(n, rng)))
 
 
-def _switching(
-    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "steps n"]:
-    """Signs that change at random instants, as often as a wave of a random rate would."""
+def _switching(admissible: Admissible, t: Instants, n: int, rng: np.random.Generator) -> Torques:
+    """Signs that change at random instants, on average as often as a wave of a random rate."""
     h = t[1] - t[0] if len(t) > 1 else 0.0
     changes = rng.random((len(t), n)) < _rates(n, rng) * h / np.pi
-    return _boundary(admissible, _direction(n, rng) * (1.0 - 2.0 * (np.cumsum(changes, axis=0) % 2)))
+    return admissible.towards(_direction(n, rng) * (1.0 - 2.0 * (np.cumsum(changes, axis=0) % 2)))
 
 
-def _sine(
-    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "steps n"]:
+def _sine(admissible: Admissible, t: Instants, n: int, rng: np.random.Generator) -> Torques:
     return _touching(admissible, np.abs(_direction(n, rng)) * np.sin(_angles(t, n, rng)))
 
 
-def _multisine(
-    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "steps n"]:
+def _multisine(admissible: Admissible, t: Instants, n: int, rng: np.random.Generator) -> Torques:
     waves = [rng.uniform(0.2, 1.0, n) * np.sin(_angles(t, n, rng)) for _ in range(5)]
     return _touching(admissible, np.sum(waves, axis=0))
 
 
-def _noise(
-    admissible: Admissible, t: Float[np.ndarray, " steps"], n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "steps n"]:
-    """White noise through a low pass of first order."""
+def _noise(admissible: Admissible, t: Instants, n: int, rng: np.random.Generator) -> Torques:
+    """White noise through a first-order low-pass filter."""
     h = t[1] - t[0] if len(t) > 1 else 1.0
     keep, white = np.exp(-_rates(n, rng) * h), rng.standard_normal((len(t), n))
     filtered = np.zeros((len(t), n))
@@ -121,16 +110,12 @@ def _angles(t: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _direction(n: int, rng: np.random.Generator) -> np.ndarray:
-    """No component is zero; in a ball, some joints may have most of it."""
+    """A random direction without zero components; in a ball, a few joints may dominate it."""
     return rng.choice([-1.0, 1.0], n) * rng.uniform(0.05, 1.0, n) ** 2
 
 
 def _signs(x: np.ndarray) -> np.ndarray:
     return np.where(x >= 0.0, 1.0, -1.0)
-
-
-def _boundary(admissible: Admissible, direction: np.ndarray) -> np.ndarray:
-    return admissible.towards(direction)
 
 
 def _touching(admissible: Admissible, signal: np.ndarray) -> np.ndarray:

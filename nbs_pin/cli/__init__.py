@@ -1,4 +1,4 @@
-"""The command line `nbs-pin`: a module per command, whose heavy imports wait until it runs."""
+"""The command line `nbs-pin`: one module per command, whose heavy imports wait until it runs."""
 
 import contextlib
 import difflib
@@ -42,26 +42,26 @@ COMMANDS: dict[str, type] = {
     "bench": Bench,
     "robots": Robots,
 }
-"""The options of every command by its name; `nbs_pin.commands` has a module of that name, whose `run` does the work."""
+"""The options class of every command. The module of the same name in `nbs_pin.commands` does the work in `run`."""
 BAD_INPUT, INTERRUPTED = 2, 130
 _DESCRIPTION = (
-    "Tracking control for any URDF arm. `nbs-pin COMMAND --help` shows the options of a command; "
-    "`nbs-pin --version` the version. Exit codes: 0 done, 2 bad input, 130 interrupted."
+    "Tracking control for any URDF arm. `nbs-pin COMMAND --help` lists the options of a command, "
+    "`nbs-pin --version` prints the version. Exit codes: 0 success, 2 bad input, 130 interrupted."
 )
 
 
 class Output(Console):
-    """Standard output, whose reader may leave early."""
+    """Standard output, whose reader may close it early."""
 
     def on_broken_pipe(self) -> None:
-        """Let `main` end quietly; rich would end with exit code 1."""
+        """Let `main` end quietly; rich would exit with code 1."""
         raise BrokenPipeError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs `nbs-pin` with these arguments, or the shell's; returns the exit code.
+    """Run `nbs-pin` with these arguments, or the shell's, and return the exit code.
 
-    0 done, 2 bad input with one sentence on stderr, 130 interrupted by Ctrl-C, 143 by SIGTERM.
+    It is 0 for success, 2 for bad input (one sentence on stderr), 130 after Ctrl-C, 143 after SIGTERM.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return _run(arguments, notes, stops)
         except BaseException as error:
-            # A signal that meets the import of an extension comes out as its ImportError: ask the signal first.
+            # A signal during the import of an extension surfaces as an ImportError, so signals are checked first.
             if stops or isinstance(error, KeyboardInterrupt):
                 notes.print("nbs-pin: interrupted.")
                 return stops[0] if stops else INTERRUPTED
@@ -80,16 +80,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _failed(error: BaseException, notes: Console) -> int:
-    """The exit code for an error that the user can mend, after one sentence; raises any other again."""
+    """Print one sentence for an error that the user can correct and return the exit code; re-raise any other."""
     if isinstance(error, NbsPinError):
         notes.print(f"nbs-pin: error: {_one_line(str(error))}")
     elif isinstance(error, BrokenPipeError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # whoever read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has closed the pipe
         return 0
     elif isinstance(error, OSError):
         where = f"'{error.filename}': " if error.filename is not None else ""
         reason = (error.strerror or str(error)).lower()
-        notes.print(f"nbs-pin: error: {where}{reason}; check the path, its permissions and the space left.")
+        notes.print(f"nbs-pin: error: {where}{reason}; check the path, its permissions and the free space.")
     else:
         raise error
     return BAD_INPUT
@@ -111,7 +111,7 @@ def _run(arguments: list[str], notes: Console, stops: list[int]) -> int:
 
 
 def parse(arguments: list[str]) -> Any:
-    """The command with its options, None when help was asked for; raises OptionError for words that make no command."""
+    """The options of the command, None if help was printed; raises OptionError for anything else."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         raise OptionError(f"no command '{arguments[0]}'; {_near(arguments[0], COMMANDS)}give {', '.join(COMMANDS)}.")
     complaint = io.StringIO()
@@ -131,7 +131,7 @@ def parse(arguments: list[str]) -> Any:
         raise OptionError(f"{_first_paragraph(complaint.getvalue())}; see nbs-pin --help.") from None
     if unknown:
         flags = [f"--{name.replace('_', '-')}" for name in vars(command)]
-        what = "has no option" if unknown[0].startswith("-") else "cannot use the word"
+        what = "has no option" if unknown[0].startswith("-") else "takes no argument"
         remedy = f"{_near(unknown[0], flags)}see nbs-pin {arguments[0]} --help."
         raise OptionError(f"nbs-pin {arguments[0]} {what} '{unknown[0]}'; {remedy}")
     return command
@@ -147,7 +147,7 @@ def _near(word: str, words: Iterable[str]) -> str:
 
 
 def _first_paragraph(box: str) -> str:
-    """What tyro's box says before its first rule, as one line."""
+    """The text in tyro's error box before its first rule, as one line."""
     inside = [line.strip("│ ") for line in box.splitlines() if not line.startswith(("╭", "╰"))]
     rules = [k for k, line in enumerate(inside) if line.startswith("─")]
     return _one_line(" ".join(inside[: rules[0] if rules else None])).rstrip(".")
@@ -159,9 +159,9 @@ def _one_line(text: str) -> str:
 
 @contextlib.contextmanager
 def _stops() -> Iterator[list[int]]:
-    """The exit codes of the signals that came: Ctrl-C and SIGTERM end the program like an exception, drafts removed.
+    """The exit codes of received signals; Ctrl-C and SIGTERM raise KeyboardInterrupt, so that drafts are removed.
 
-    Only the main thread may ask for signals; elsewhere the list stays empty.
+    Only the main thread can handle signals; in others the list stays empty.
     """
     stops: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -182,7 +182,7 @@ def _stops() -> Iterator[list[int]]:
 
 @contextlib.contextmanager
 def _warnings_to(notes: Console) -> Iterator[None]:
-    """Warnings as one line each, without those that speak to the authors of a library."""
+    """Print warnings as one line each, without deprecations, which address the authors of a library."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         warnings.showwarning = lambda message, *_, **__: notes.print(f"nbs-pin: warning: {_one_line(str(message))}")

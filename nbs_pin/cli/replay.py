@@ -1,4 +1,4 @@
-"""`nbs-pin replay`: a recorded run as a page that plays in the browser."""
+"""`nbs-pin replay`: a recorded run as a page for the browser."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,20 +11,20 @@ from nbs_pin.cli.values import default, integer
 
 @dataclass(frozen=True)
 class Replay:
-    """Turn a recorded run into one page that plays in any browser without a network.
+    """Write a recorded run as one page that plays in any browser without a network.
 
     Example: nbs-pin replay out/track-panda/run.npz --open
     """
 
     run_file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """A run.npz, or the folder that holds one."""
+    """A run.npz, or the folder that contains one."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("replay.html beside the run")] = None
     """The page to write."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the one the run names")] = None
-    """The arm that ran, when its file has moved."""
+    """The arm that ran, if its file has moved."""
     start: Annotated[int, integer("--start", most=10**6)] = 0
     """Which start of a batched run to show."""
     open: bool = False
     """Open the page in the browser."""
     force: bool = False
-    """Replace the file that --out names."""
+    """Overwrite the file that --out names."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Robots:
-    """List the arms known by name, and what else is accepted.
+    """List the arms known by name, and the files that are accepted.
 
     Example: nbs-pin robots
     """

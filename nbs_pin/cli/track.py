@@ -1,4 +1,4 @@
-"""`nbs-pin track`: an arm follows a motion; run, summary, picture and replay land in a folder."""
+"""`nbs-pin track`: simulate an arm that follows a motion; write run, summary, figure and replay."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from nbs_pin.simulation.registry import INTEGRATORS, PLANTS
 
 @dataclass(frozen=True)
 class Track:
-    """Let an arm follow a motion, and write run.npz, summary.json, tracking.png and replay.html.
+    """Simulate an arm that follows a motion, and write run.npz, summary.json, tracking.png and replay.html.
 
     Example: nbs-pin track panda --start-error 0.3 --disturbance square:5@8 --out out/panda
     """
@@ -22,12 +22,12 @@ class Track:
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
     """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
     plant: Annotated[str, choice("--plant", PLANTS)] = "mujoco"
-    """What simulates the arm."""
+    """Simulator of the arm."""
     controller: Annotated[str, choice("--controller", LAWS, SAVED)] = "nbs"
-    """The law by name, or a controller saved by nbs-pin train, with its own gains. nbs-paper is the paper's own on
-    two_link, its networks with this arm's gains elsewhere."""
+    """A law by name, or a .nbs file with a controller and its gains.
+    nbs-paper: the paper's controller on two_link, its networks with gains for the arm on any other."""
     reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
-    """What to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints."""
+    """Motion to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints."""
     frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0
     """Frequency of the sinusoid [rad/s]."""
     duration: Annotated[
@@ -37,36 +37,36 @@ class Track:
     period: Annotated[float, number("--period", least=1e-5, most=0.1, unit="s")] = 0.001
     """Control period [s]."""
     bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
-    """Rate at which errors decay [rad/s]; the paper's own law on two_link has none."""
+    """Rate at which errors decay [rad/s]; unused by nbs-paper on two_link and by .nbs files."""
     start_error: Annotated[float, number("--start-error", least=0.0, most=math.pi, unit="rad")] = 0.0
-    """Added to every joint with alternating sign, the arm then starting at rest [rad]; 0 starts on the motion."""
+    """Initial error of every joint, with alternating sign, at rest [rad]; 0 starts on the motion."""
     start: Annotated[str | None, configuration("--start"), default("on the motion")] = None
-    """Where the arm starts at rest [rad], one number per joint: --start=-0.1,0.2."""
+    """Configuration to start from at rest [rad], one number per joint: --start=-0.1,0.2."""
     disturbance: Annotated[str, disturbance_text()] = "none"
     """Torque on every joint [N·m]: none, constant:5, square:5@8, sine:5@8 (@ rad/s) or noise:0.5 (standard deviation).
-    A comma list gives one per joint: constant:5,5,3."""
+    A comma-separated list has one per joint: constant:5,5,3."""
     joint_friction: Literal["drop", "keep"] = "drop"
-    """Joint friction of the URDF: left out, or acting and fed forward by every law with a model."""
+    """Joint friction of the URDF: not simulated, or simulated and fed forward by every law with a model."""
     effort_limit: Annotated[
         float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), default("the arm's")
     ] = None
-    """Largest torque of every joint [N·m]."""
+    """Effort limit of every joint [N·m]."""
     no_effort_limit: bool = False
-    """Let torques grow without limit."""
+    """Do not limit the torques."""
     integrator: Annotated[str | None, choice("--integrator", INTEGRATORS), default("the plant's usual one")] = None
-    """How the plant is integrated. mujoco: rk4, euler (semi-implicit), implicitfast; pinocchio: rk4, euler (explicit),
-    semi_implicit_euler."""
+    """Integrator of the plant. mujoco: rk4, euler (semi-implicit), implicitfast.
+    pinocchio: rk4, euler (explicit), semi_implicit_euler."""
     plant_step: Annotated[
         float | None, number("--plant-step", least=1e-6, most=0.1, unit="s"), default("at most 0.001")
     ] = None
-    """Step of the plant, of which a period is a whole number [s]."""
+    """Step of the plant, a whole fraction of the period [s]."""
     lookahead: Annotated[
         float | None, number("--lookahead", least=0.0, most=0.1, unit="s"), default("half a period")
     ] = None
     """How far ahead of the measured state the law is evaluated [s]; 0 is the plain sampled law."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
-    """Of network weights and noise."""
+    """Seed of network weights and noise."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), default("out/track-ROBOT")] = None
     """Folder for the results."""
     force: bool = False
-    """Replace the results of another run in that folder."""
+    """Overwrite the results of another run in that folder."""

@@ -1,4 +1,4 @@
-"""`nbs-pin train`: a controller learns through the closed loop, and says what it gained on starts it never saw."""
+"""`nbs-pin train`: train a controller through the closed loop, and compare before and after on fresh starts."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from nbs_pin.controllers.registry import LAWS
 class Train:
     """Train a controller through the closed loop, and write controller.nbs, summary.json and learning.png.
 
-    Ctrl-C stops early and keeps the best epoch; --resume goes on from there. Track with the result:
+    Ctrl-C stops early and keeps the best epoch; --resume continues from there. Track with the result:
     nbs-pin track panda --controller out/train-panda/controller.nbs
 
     Example: nbs-pin train panda --epochs 200 --out out/panda
@@ -24,46 +24,46 @@ class Train:
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
     """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
     controller: Annotated[str, choice("--controller", LAWS, SAVED)] = "nbs"
-    """The law to begin with, by name, or a saved controller to train on."""
+    """The law to start from, by name, or a .nbs file with a controller."""
     frequencies: Annotated[str, positive_list("--frequencies", most=1000.0, unit="rad/s")] = "0.5,1,2"
-    """Sinusoids to follow, fitted to the arm: their frequencies [rad/s], split by commas."""
+    """Frequencies of the sinusoids to follow [rad/s], separated by commas."""
     starts: Annotated[int, integer("--starts", least=1, most=100_000)] = 32
-    """Starts to train from, shared out over the frequencies; a quarter as many are held out to choose the epoch."""
+    """Training starts, divided among the frequencies; a quarter as many are held out to select the epoch."""
     start_error: Annotated[float, number("--start-error", above=0.0, most=math.pi, unit="rad")] = 0.3
-    """Starts are at rest, each joint within this of the motion's start [rad]."""
+    """Largest initial error of every joint, at rest [rad]."""
     duration: Annotated[float, number("--duration", above=0.0, most=1000.0, unit="s")] = 1.0
-    """Length of the motions trained on, a whole number of periods [s]."""
+    """Length of the training motions, a whole number of periods [s]."""
     period: Annotated[float, number("--period", least=1e-4, most=0.1, unit="s")] = 0.005
     """Control period [s]."""
     epochs: Annotated[int, integer("--epochs", least=1, most=1_000_000)] = 80
-    """Steps of the optimiser."""
+    """Number of optimiser steps."""
     cost: Literal["torque-aware", "squared-error", "time-outside"] = "torque-aware"
-    """What is made small: error, its rate and torque beyond the limits; the error alone, as in the paper; or the time
-    spent 0.1 rad and more away."""
+    """Cost to minimise. torque-aware: error, its rate, and torque above the limits. squared-error: as in the paper.
+    time-outside: time spent 0.1 rad or more away from the reference."""
     optimiser: Literal["adam-backtracking", "adam", "lbfgs"] = "adam-backtracking"
-    """How: Adam that retreats with half the step when the cost rises, Adam with its step halved after every fifth of
-    the epochs as in the paper, or L-BFGS with line search."""
+    """adam-backtracking: Adam that steps back and halves its step when the cost rises.
+    adam: with the step halved after every fifth of the epochs, as in the paper. lbfgs: with line search."""
     learning_rate: Annotated[
         float | None, number("--learning-rate", above=0.0, most=100.0, unit=""), default("0.01, lbfgs 1")
     ] = None
-    """Step of the optimiser."""
+    """Step size of the optimiser."""
     patience: Annotated[int | None, integer("--patience", least=1, most=1_000_000), default("all epochs")] = None
-    """Stop after so many epochs without a lower held-out cost."""
+    """Stop after this many epochs without a lower held-out cost."""
     fixed_gains: bool = False
-    """Train the networks alone and leave every gain as it is."""
+    """Train the networks only and keep every gain."""
     bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
     """Rate at which errors decay before training [rad/s]."""
     effort_limit: Annotated[
         float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), default("the arm's")
     ] = None
-    """Largest torque of every joint [N·m]."""
+    """Effort limit of every joint [N·m]."""
     no_effort_limit: bool = False
-    """Let torques grow without limit."""
+    """Do not limit the torques."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
-    """Of network weights and starts."""
+    """Seed of network weights and starts."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), default("out/train-ROBOT")] = None
     """Folder for the results."""
     resume: bool = False
-    """Go on with the training in that folder, as if it had never stopped."""
+    """Continue the training in that folder as if it had not been stopped."""
     force: bool = False
-    """Replace the results of another training in that folder."""
+    """Overwrite the results of another training in that folder."""

@@ -1,4 +1,4 @@
-"""Values of options, read strictly: a number that cannot be meant is refused in one sentence that names the flag."""
+"""Values of options, parsed strictly: an invalid value is refused in one sentence that names the flag."""
 
 import difflib
 import math
@@ -15,18 +15,18 @@ from nbs_pin.base.exceptions import NbsPinError
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INTEGER = re.compile(r"[0-9]+")
 SAVED = ".nbs"
-"""How the name of a saved controller ends."""
+"""File extension of saved controllers and models."""
 DisturbanceKind: TypeAlias = Literal["constant", "square", "sine", "noise"]
 
 
 class OptionError(NbsPinError):
-    """An option of the command line that cannot be meant; not a ValueError, which tyro would reword."""
+    """An invalid option of the command line; not a ValueError, which tyro would reword."""
 
 
 def number(
     flag: str, *, above: float = -math.inf, least: float = -math.inf, most: float, unit: str
 ) -> PrimitiveConstructorSpec[float]:
-    """A number in (above, most] or [least, most] for tyro; raises OptionError for any other text."""
+    """A tyro parser of a number in (above, most] or [least, most]; raises OptionError for any other text."""
     low = f"above {above:g}" if above > -math.inf else f"of at least {least:g}"
 
     def parse(words: list[str]) -> float:
@@ -39,18 +39,20 @@ def number(
 
 
 def configuration(flag: str) -> PrimitiveConstructorSpec[str]:
-    """The text of numbers split by commas for tyro, read by `plain_numbers`; raises OptionError for any other."""
+    """A tyro parser of comma-separated numbers, kept as text for `plain_numbers`; raises OptionError for any other."""
 
     def parse(words: list[str]) -> str:
         if plain_numbers(words[0]) is None:
-            raise OptionError(f"{flag} is '{words[0]}'; give one number per joint, split by commas: {flag}=0.1,-0.2.")
+            raise OptionError(
+                f"{flag} is '{words[0]}'; give one number per joint, separated by commas: {flag}=0.1,-0.2."
+            )
         return words[0]
 
     return _spec("Q1,Q2,…", parse, str)
 
 
 def positive_list(flag: str, most: float, unit: str) -> PrimitiveConstructorSpec[str]:
-    """The text of numbers in (0, most] split by commas for tyro, read by `plain_numbers`; raises OptionError else."""
+    """A tyro parser of comma-separated numbers in (0, most], kept as text for `plain_numbers`; raises OptionError."""
 
     def parse(words: list[str]) -> str:
         values = plain_numbers(words[0])
@@ -64,7 +66,7 @@ def positive_list(flag: str, most: float, unit: str) -> PrimitiveConstructorSpec
 
 
 def choice(flag: str, known: Collection[str], ending: str = "") -> PrimitiveConstructorSpec[str]:
-    """One of the names, or with an ending a path that ends so, for tyro; raises OptionError for any other text."""
+    """A tyro parser of one of the names, or of a path with the ending; raises OptionError for any other text."""
     file = f" or a {ending} file" if ending else ""
 
     def parse(words: list[str]) -> str:
@@ -78,17 +80,17 @@ def choice(flag: str, known: Collection[str], ending: str = "") -> PrimitiveCons
 
 
 def default(hint: str) -> Any:
-    """What --help says of an option whose default is worked out later."""
+    """The text of --help for an option whose default is computed later."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {hint})")
 
 
 def text(metavar: str, parse: Callable[[list[str]], str]) -> PrimitiveConstructorSpec[str]:
-    """A text that `parse` has checked, for tyro."""
+    """A tyro parser of a text that `parse` checks."""
     return _spec(metavar, parse, str)
 
 
 def integer(flag: str, most: int, least: int = 0) -> PrimitiveConstructorSpec[int]:
-    """A whole number in [least, most] for tyro; raises OptionError for any other text."""
+    """A tyro parser of a whole number in [least, most]; raises OptionError for any other text."""
 
     def parse(words: list[str]) -> int:
         if not _INTEGER.fullmatch(words[0]) or not least <= int(words[0][:20]) <= most:
@@ -99,20 +101,20 @@ def integer(flag: str, most: int, least: int = 0) -> PrimitiveConstructorSpec[in
 
 
 def plain_number(text: str) -> float | None:
-    """The finite number that plain ASCII digits spell, else None: float() would also read nan, 1_0 and ٣."""
+    """The finite number in plain ASCII digits, else None; float() would also accept nan, 1_0 and ٣."""
     value = float(text) if _NUMBER.fullmatch(text) else math.nan
     return value if math.isfinite(value) else None
 
 
 def plain_numbers(text: str) -> list[float] | None:
-    """The plain numbers that a comma list spells, else None."""
+    """The numbers of a comma-separated list, or None if one is not a plain number."""
     values = [plain_number(word) for word in text.split(",")]
     return None if None in values else [value for value in values if value is not None]
 
 
 @dataclass(frozen=True)
 class DisturbanceText:
-    """A disturbance as typed: `none`, or KIND:SIZE[,SIZE…][@FREQUENCY], sizes in [N·m], frequency in [rad/s]."""
+    """A disturbance as typed: `none` or KIND:SIZE[,SIZE…][@FREQUENCY], sizes in [N·m], frequency in [rad/s]."""
 
     text: str
     kind: DisturbanceKind | Literal["none"]
@@ -120,12 +122,12 @@ class DisturbanceText:
     frequency: float = 0.0
 
     def build(self, nv: int, period: float, seed: int) -> Callable[..., Any] | None:
-        """The torque on `nv` joints; noise changes every `period` [s]. Raises OptionError for another number."""
+        """The torque on `nv` joints, noise held for `period` [s]; raises OptionError if the number of sizes differs."""
         from nbs_pin.motions.disturbances import ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise
 
         if len(self.sizes) not in (0, 1, nv):
             raise OptionError(
-                f"--disturbance '{self.text}' has {len(self.sizes)} torques for {nv} joints; give one, or one for each."
+                f"--disturbance '{self.text}' has {len(self.sizes)} torques for {nv} joints; give one or one per joint."
             )
         size = self.sizes[0] if len(self.sizes) == 1 else list(self.sizes)
         match self.kind:
@@ -142,12 +144,12 @@ class DisturbanceText:
 
 
 def disturbance_text() -> PrimitiveConstructorSpec[str]:
-    """The text of a disturbance for tyro; raises OptionError for one that `parse_disturbance` cannot read."""
+    """A tyro parser of the text of a disturbance; raises OptionError if `parse_disturbance` cannot read it."""
     return _spec("TORQUE", lambda words: parse_disturbance(words[0]).text, str)
 
 
 def parse_disturbance(text: str) -> DisturbanceText:
-    """`none`, `constant:5`, `constant:5,5,3`, `square:5@8`, `sine:5@8` or `noise:0.5`; raises OptionError."""
+    """Parse `none`, `constant:5`, `constant:5,5,3`, `square:5@8`, `sine:5@8` or `noise:0.5`; raises OptionError."""
     if text == "none":
         return DisturbanceText(text, "none")
     parts = re.fullmatch(r"(?:(constant|noise):([^@]+)|(square|sine):([^@]+)@(.+))", text)
@@ -160,7 +162,7 @@ def parse_disturbance(text: str) -> DisturbanceText:
             return DisturbanceText(text, kind, tuple(sizes), frequency)  # type: ignore[arg-type]
     raise OptionError(
         f"--disturbance is '{text}'; give none, constant:5, square:5@8, sine:5@8 or noise:0.5 "
-        "(N·m on every joint or a comma list, one per joint; @ frequency above 0 rad/s)."
+        "(N·m, one for all joints or one per joint, separated by commas; @ frequency above 0 rad/s)."
     )
 
 

@@ -1,1 +1,1 @@
-"""What each command of the shell does: one module per command, of the same name."""
+"""The work of the shell commands: one module per command, of the same name."""

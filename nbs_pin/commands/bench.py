@@ -1,4 +1,4 @@
-"""`nbs-pin bench`: what the laws and plants cost on this machine."""
+"""`nbs-pin bench`: run times of laws and plants on this machine."""
 
 import json
 from pathlib import Path
@@ -39,10 +39,10 @@ _COLUMNS = {
 
 
 def run(options: Bench, console: Console, notes: Console) -> None:
-    """Measures, writes and prints; raises NbsPinError or OSError."""
+    """Measure, write and print; raises NbsPinError or OSError."""
     known = None if options.compare is None else bench.rows_of(_read(options.compare))
     rows = []
-    with notes.status("measuring; leave the machine alone") as status:
+    with notes.status("measuring; leave the machine idle otherwise") as status:
         for row in bench.bench(options.arms, calls=options.calls, long=options.long):
             rows.append(row)
             status.update(f"measured {row.key}")
@@ -64,7 +64,9 @@ def _read(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise OptionError(f"--compare '{path}' is no JSON ({error}); give the summary.json of another bench.") from None
+        raise OptionError(
+            f"--compare '{path}' is not JSON ({error}); give the summary.json of another bench."
+        ) from None
 
 
 def _shown(what: str, columns: dict[str, str], rows: list[bench.Row]) -> Table:
@@ -77,8 +79,8 @@ def _shown(what: str, columns: dict[str, str], rows: list[bench.Row]) -> Table:
 
 def _moved(moved: list[tuple[str, str, float, float]]) -> Table | str:
     if not moved:
-        return "nothing moved by more than a tenth"
-    shown = table("moved by more than a tenth", "figure", "before", "now", "now / before", first="row")
+        return "no figure changed by more than 10 %"
+    shown = table("changed by more than 10 %", "figure", "before", "now", "now / before", first="row")
     for key, name, before, now in moved:
         shown.add_row(key, name, f"{before:.4g}", f"{now:.4g}", f"{now / before:.2f}" if before else "")
     return shown

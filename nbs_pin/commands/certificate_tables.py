@@ -1,4 +1,4 @@
-"""A certificate as tables for people."""
+"""A certificate as tables on the console."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ from rich.table import Table
 from rich.text import Text
 
 _ERRORS = ("rad", "m", "rad, m")
-"""Units of the bounds that are errors, which have a table of their own."""
+"""Units of the error bounds, which have a table of their own."""
 _ORDER = ("bounds", "sampled control", "model error", "inertia", "constants", "structure")
-"""Groups of claims, what a reader asks first at the top."""
+"""Groups of claims, in the order in which they are printed."""
 
 _GAINS = (
     ("K", "N·m/rad", "N/m"),
@@ -18,11 +18,11 @@ _GAINS = (
     ("D₀", "N·m·s/rad", "N·s/m"),
     ("torque", "N·m", "N"),
 )
-"""What a design gives each joint, with the units of joints that turn and of joints that slide."""
+"""Columns of a design per joint, with the units for revolute and for prismatic joints."""
 
 
 def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Errors first, then what they rest on; `figures` as `commands.certify.figures` gives them."""
+    """Print the error bounds first, then what they rest on; `figures` from `commands.certify.figures`."""
     certificate = figures["certificate"]
     console.print(Text(f"{title}: {certificate['disturbance']}", style="bold"), soft_wrap=True)
     if figures["design"] is not None:
@@ -59,7 +59,7 @@ def _claims(title: str, lines: list[dict[str, Any]]) -> Table:
 
 
 def _conditions(conditions: list[dict[str, Any]]) -> Table:
-    """Each with its reason below it; what the bounds do not rest on cannot fail."""
+    """The conditions, each with its reason below it."""
     table = _table("conditions", "", "left", "right", "holds", "known")
     for line in conditions:
         holds = "yes" if line["holds"] else Text("NO", style="bold red")
@@ -69,7 +69,7 @@ def _conditions(conditions: list[dict[str, Any]]) -> Table:
 
 
 def _errors(bounds: list[dict[str, Any]], figures: dict[str, Any]) -> Table:
-    """Every bound of an error, beside the worst that was found of it; the reason below the last it is the reason of."""
+    """Every error bound beside the largest error found; bounds with a common reason have it below the last one."""
     certificate, found = figures["certificate"], figures["attack"]
     worst = {} if found is None else _worst(certificate["joints"], found)
     searched = [] if found is None else ["worst\nfound", "bound ÷\nfound"]
@@ -83,13 +83,13 @@ def _errors(bounds: list[dict[str, Any]], figures: dict[str, Any]) -> Table:
 
 
 def _worst(joints: list[str], found: dict[str, Any]) -> dict[str, float]:
-    """The worst found of each error, by the name of its bound."""
+    """The largest errors found, by the names of their bounds."""
     of_joints = zip(joints, found["joint_errors_rad"], strict=True)
     return {"‖z1‖": found["error_rad"]} | {f"|z1| of {joint}": error for joint, error in of_joints}
 
 
 def _beside(bound: float | None, worst: float | None) -> list[Text]:
-    """What was found, and how much larger the bound is; red where it is smaller."""
+    """The error found and the ratio of the bound to it, red if the bound is smaller."""
     if worst is None or bound is None:
         return [Text(""), Text("")]
     ratio = f"{bound / worst:.2f}" if worst > 0.0 else ""
@@ -121,9 +121,9 @@ def _closing(figures: dict[str, Any]) -> list[str]:
         search = how if found["thorough"] else f"{how}; waves alone, --attack searches further"
         lines.append(f"worst found by {search}")
         if found["exceeds"]:
-            lines.append(f"WORSE THAN ITS BOUND; that motion held against the certificate: {found['verdict']}")
+            lines.append(f"BOUND EXCEEDED; the check of this motion against the certificate: {found['verdict']}")
     if figures["attack_diverged"] is not None:
-        lines.append(f"no worst motion to hold beside the bounds: {figures['attack_diverged']}")
+        lines.append(f"no worst motion to compare with the bounds: {figures['attack_diverged']}")
     if watched is not None:
         lines.append(f"the run: {watched['verdict']}")
     if figures["loads"]:
@@ -132,10 +132,10 @@ def _closing(figures: dict[str, Any]) -> list[str]:
 
 
 def standing(certificate: dict[str, Any]) -> str:
-    """How the bounds are known and what they assume; or which conditions fail, so that they are not promised."""
+    """How the bounds are known and what they assume, or the conditions that fail, so that the bounds are void."""
     if certificate["void"]:
         failed = "; ".join(certificate["void"])
-        return f"{certificate['label']}: the bounds are not promised, as this does not hold here: {failed}"
+        return f"{certificate['label']}: the bounds are void, as these conditions fail: {failed}"
     return f"{certificate['label']}, assuming: {'; '.join(certificate['assumptions'])}"
 
 

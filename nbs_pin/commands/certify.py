@@ -1,4 +1,4 @@
-"""`nbs-pin certify`: what a controller promises before the arm moves, and the worst that an adversary finds."""
+"""`nbs-pin certify`: bounds of the tracking error before the arm moves, and the worst motion that a search finds."""
 
 import dataclasses
 from pathlib import Path
@@ -26,15 +26,15 @@ from nbs_pin.robots.robot import load_robot
 from nbs_pin.storage.checkpoints import load, save
 
 FILES = ("certificate.png", "run.npz", SUMMARY)
-"""What `write_results` always writes, the summary last."""
+"""Files of `write_results`, the summary last; run.npz only if a worst motion was found."""
 MONITOR, DESIGNED = "monitor.png", "controller.nbs"
-"""What it writes beside them when a run was watched or a law designed."""
+"""Further files, for a monitored run and for a design."""
 
 
 def run(options: Certify, console: Console, notes: Console) -> None:
-    """Certifies, writes and prints; raises NbsPinError and OSError."""
+    """Certify, write and print; raises NbsPinError or OSError."""
     if options.wanted is not None and options.controller.endswith(SAVED):
-        raise OptionError(f"--wanted designs a controller for an arm, and '{options.controller}' is one; give an arm.")
+        raise OptionError(f"--wanted designs a controller, and '{options.controller}' is one; give an arm.")
     with notes.status(f"loading {options.controller}"):
         controller = _controller(options)
         task = _task(options, controller)
@@ -51,15 +51,15 @@ def run(options: Certify, console: Console, notes: Console) -> None:
         result = assess(controller, task, thorough=options.attack, run=watched, proposal=proposal, progress=True)
         with notes.status(f"drawing the picture into {folder}"):
             found, written = write_results(result, results)
-    law = Path(options.controller).name if options.controller.endswith(SAVED) else "a law made for it"
+    law = Path(options.controller).name if options.controller.endswith(SAVED) else "a law built for it"
     print_certificate(console, f"{robot.name}, {law}", found)
     results.show(console, written)
 
 
 def _controller(options: Certify) -> LyapunovLaw:
-    """The controller that a .nbs file holds, or the one that the law's `for_robot` makes for an arm.
+    """The controller in a .nbs file, or the law built for an arm.
 
-    Raises CertificateRefused for a law without a storage function, errors of `load` and `load_robot` else.
+    Raises CertificateRefused if it has no Lyapunov function.
     """
     settings = {"bandwidth": options.bandwidth, "period": options.period or 0.001, "seed": options.seed}
     name = options.controller
@@ -67,13 +67,13 @@ def _controller(options: Certify) -> LyapunovLaw:
     if not isinstance(law, LyapunovLaw):
         what = f"{name} holds a {type(law).__name__}" if name.endswith(SAVED) else f"--law {options.law}"
         raise CertificateRefused(
-            f"{what}, of which no Lyapunov function is known here; give a law that has one, such as nbs or slotine-li."
+            f"{what}, of which no Lyapunov function is known; give a law that has one, such as nbs or slotine-li."
         )
     return law
 
 
 def _task(options: Certify, controller: LyapunovLaw) -> Task:
-    """Where and against what to certify; raises OptionError for options that do not fit each other."""
+    """The task that the options describe; raises OptionError if they do not fit each other."""
     _check_options(options)
     period = options.period or 0.001
     truth = None if options.against is None else load_robot(options.against)
@@ -81,8 +81,8 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
     robot = arm_of(controller, blank)
     if options.trajectories is not None and is_exact(controller.dynamics, robot):
         raise OptionError(
-            f"--trajectories is about a model that is not exact, and this one is that of {robot.name} itself; "
-            "leave it out, or give the true arm with --against."
+            f"--trajectories applies to a model that is not exact, and this one is exact for {robot.name}; "
+            "omit it, or give the true arm with --against."
         )
     motion, duration = motion_of(options.reference, robot, frequency=options.frequency, period=period)
     coefficients = None if options.friction in (None, "urdf") else plain_numbers(str(options.friction)) or []
@@ -105,18 +105,18 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
 
 
 def _check_options(options: Certify) -> None:
-    """Raises OptionError for options about others that were not given."""
+    """Raises OptionError for options that need others which were not given."""
     loads = {"--payload": options.payload, "--friction": options.friction, "--gravity-error": options.gravity_error}
     if options.norm and options.disturbance is None:
-        raise OptionError("--norm is about --disturbance; give that too.")
+        raise OptionError("--norm needs --disturbance; give both.")
     if options.link is not None and options.payload is None:
-        raise OptionError("--link is about --payload; give that too.")
+        raise OptionError("--link needs --payload; give both.")
     if options.margin is not None and all(load is None for load in loads.values()):
-        raise OptionError(f"--margin is about {', '.join(loads)}; give one of them too.")
+        raise OptionError(f"--margin needs one of {', '.join(loads)}; give one too.")
 
 
 def figures(result: Certified) -> dict[str, Any]:
-    """Everything found, units in the keys, as JSON can store it; None for what is not finite."""
+    """All results as JSON can store them, with units in the keys; None for numbers that are not finite."""
     certificate, found, proposal = result.certificate, result.attack, result.proposal
     numbers: dict[str, Any] = {
         "arm": None if certificate.robot is None else certificate.robot.name,
@@ -168,9 +168,9 @@ def figures(result: Certified) -> dict[str, Any]:
 
 
 def write_results(result: Certified, results: Results) -> tuple[dict[str, Any], list[str]]:
-    """Writes `FILES` and what goes with them; returns the figures and the names of the files written.
+    """Write the files; returns the figures and the names of the files.
 
-    Raises OSError when they cannot be written.
+    Raises OSError if they cannot be written.
     """
     found, folder, written = figures(result), results.folder, [FILES[0]]
     plot_certificate(result.certificate, result.attack, folder / FILES[0])
@@ -188,17 +188,18 @@ def write_results(result: Certified, results: Results) -> tuple[dict[str, Any], 
 
 
 def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
-    """|τ_d,i| ≤ the numbers, one for all joints or one each, or ‖τ_d‖ ≤ the only one [N·m].
+    """The box |τ_d,i| ≤ numbers, one for all joints or one per joint, or the ball ‖τ_d‖ ≤ number [N·m].
 
-    Raises ArgumentError for another count.
+    Raises:
+        ArgumentError: If there are too many or too few numbers.
     """
     if norm:
         if len(numbers) != 1:
-            raise ArgumentError(f"a norm is one number and {len(numbers)} were given; give one, or leave out --norm.")
+            raise ArgumentError(f"a norm is one number and {len(numbers)} were given; give one, or omit --norm.")
         return Admissible.of(numbers[0], nv)
     if len(numbers) not in (1, nv):
         raise ArgumentError(
-            f"{len(numbers)} torques were given for {nv} joints; give one for every joint, or one for each [N·m]."
+            f"{len(numbers)} torques were given for {nv} joints; give one for all joints, or one per joint [N·m]."
         )
     return Admissible.of(np.full(nv, numbers, dtype=float), nv)
 

@@ -1,4 +1,4 @@
-"""`nbs-pin collect`: motions of an arm in MuJoCo, to learn its dynamics from."""
+"""`nbs-pin collect`: motions of an arm in MuJoCo, as data for learning its dynamics."""
 
 from pathlib import Path
 from typing import Any
@@ -18,17 +18,17 @@ from nbs_pin.reports.plotting import ACTUAL, LIMIT, TORQUE, picture
 from nbs_pin.robots.robot import Robot, load_robot
 
 FILES = ("data.npz", "coverage.png", SUMMARY)
-"""What it writes, the data first and the summary last."""
+"""The files that are written, the data first and the summary last."""
 _DOTS = 4000
 _AT_LIMIT = 1.0 - 1e-9
 
 
 def run(options: Collect, console: Console, notes: Console) -> None:
-    """Collects, writes and prints; raises NbsPinError and OSError."""
+    """Collect, write and print; raises NbsPinError or OSError."""
     with notes.status(f"loading {options.robot}"):
         robot = load_robot(options.robot)
     if options.friction and not (robot.damping.any() or robot.friction.any()):
-        raise OptionError(f"--friction was given, but the URDF of {robot.name} states none; leave it out.")
+        raise OptionError(f"--friction was given, but the URDF of {robot.name} states none; omit it.")
     results = Results.of(options, robot.name, robot, robot=robot.source)
     results.check(FILES, options.force, whose="other data")
     given = keywords(options, collect) | {
@@ -47,7 +47,7 @@ def run(options: Collect, console: Console, notes: Console) -> None:
 
 
 def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
-    """What the samples cover, per joint, as JSON can store it; units in the keys, for sliding joints m and N."""
+    """The range of the samples per joint, as JSON can store it; units in the keys, m and N for prismatic joints."""
     limit = torque_limits(robot)
     return {
         "samples": len(data),
@@ -66,10 +66,10 @@ def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
 
 
 def plot_coverage(data: Dataset, path: str | Path, robot: Robot) -> Path:
-    """Draws which states the samples cover and writes the picture (PNG); returns its path.
+    """Plot the states that the samples cover and write the picture (PNG); returns its path.
 
-    A column per joint: velocity against position with the joint's range, and torque against acceleration with the
-    torque limits where they are within sight; at most 4000 samples, evenly picked.
+    Each column shows velocity against position with the range of a joint, and torque against acceleration with its
+    limits if they are near. At most 4000 samples, evenly picked, are drawn.
     """
     shown = np.unique(np.linspace(0, len(data) - 1, _DOTS).astype(int))
     q, v, a, tau = (x[shown] for x in (data.q, data.v, data.a, data.tau))
@@ -97,7 +97,7 @@ def _rms(x: np.ndarray) -> list[float]:
 
 
 def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """A row per joint; `figures` as the function of that name gives them."""
+    """Print a row per joint; `figures` from the function of that name."""
     headings = ("q from\n[rad]", "to\n[rad]", "RMS v\n[rad/s]", "RMS acc.\n[rad/s²]", "RMS τ\n[N·m]", "at limit")
     shown = table(title, *headings)
     columns = ("q_least_rad", "q_most_rad", "rms_velocity_rad_per_s", "rms_acceleration_rad_per_s2", "rms_torque_Nm")

@@ -1,4 +1,4 @@
-"""`nbs-pin compare`: how far a model of an arm is from Pinocchio's."""
+"""`nbs-pin compare`: errors of a model of an arm against Pinocchio's."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -33,17 +33,15 @@ from nbs_pin.simulation.simulate import simulate
 from nbs_pin.storage.checkpoints import load
 
 FILES = ("errors.png", "errors.csv", SUMMARY)
-"""What `write_results` writes, the summary last."""
+"""Files of `write_results`, the summary last."""
 TRAJECTORIES = 374
-"""Starts for which the bound on δ holds for 95 % of further ones, but for one chance in a million (`accuracy/mismatch.py`)."""
+"""Starts with which the bound on δ holds for 95 % of further ones, at confidence 1 − 1e-6 (`accuracy/mismatch.py`)."""
 _ENDINGS = ("", ".nbs", ".urdf", ".xacro", ".xml")
-
-
 _PRINTED = {"mass_matrix": "M", "coriolis": "C v", "gravity": "G", "inverse": "torque", "forward": "acceleration"}
 
 
 def run(options: Compare, console: Console, notes: Console) -> None:
-    """Compares, writes and prints; raises NbsPinError and OSError."""
+    """Compare, write and print; raises NbsPinError or OSError."""
     with notes.status(f"loading {options.model}"):
         model = model_of(options.model)
         robot = _arm(options, model)
@@ -62,20 +60,20 @@ def run(options: Compare, console: Console, notes: Console) -> None:
 
 
 class Comparison(NamedTuple):
-    """Errors, their map over two joints, and why there is no closed loop if there is none."""
+    """Errors of a model, their map over two joints, and the reason if there is no closed loop."""
 
     errors: ModelErrors
     heat: ErrorMap | None
-    """None for an arm of one joint."""
+    """None for an arm with one joint."""
     missing: str
-    """Empty where there is a closed loop."""
+    """Why there is no closed loop, empty if there is one."""
 
 
 def model_of(text: str) -> DynamicsProvider:
-    """The model that a .nbs file holds, the one its law believes in if it holds a law, or Pinocchio's of an arm.
+    """The model in a .nbs file, the model of a controller in a .nbs file, or Pinocchio's model of an arm.
 
-    Raises ArgumentError for a law without a model, and a file that is neither by its ending; errors of `load` and
-    `load_robot` else.
+    Raises:
+        ArgumentError: If the controller has no model or the file has another extension; errors of loading otherwise.
     """
     if Path(text).suffix not in _ENDINGS:
         raise ArgumentError(
@@ -89,7 +87,7 @@ def model_of(text: str) -> DynamicsProvider:
         return stored
     if isinstance(stored, ModelLaw):
         return stored.dynamics
-    raise ArgumentError(f"{text} holds a {type(stored).__name__}, which has no model of its arm; give one that has.")
+    raise ArgumentError(f"{text} contains a {type(stored).__name__}, which has no model of its arm; give one that has.")
 
 
 def compare_models(
@@ -106,11 +104,13 @@ def compare_models(
     frequency: float = 1.0,
     progress: bool = False,
 ) -> Comparison:
-    """The model against Pinocchio's of the arm, on a box and along a closed loop.
+    """Compare a model with Pinocchio's of the arm, on a box of states and along a closed loop.
 
-    samples, speed, seed, box: as in `compare`. joints: those of the map, from 0; None takes `telling_joints`.
-    run: the closed loop, its plant this arm; None simulates `closed_loop` from so many starts, none for 0.
-    Raises ArgumentError for arguments that do not fit, and a run of another arm or one in which joint friction acted.
+    `samples`, `speed`, `seed` and `box` are those of `compare`, `joints` those of the map, from 0 (None takes
+    `telling_joints`). `run` is the closed loop on this arm; None simulates `closed_loop` from `trajectories` starts.
+
+    Raises:
+        ArgumentError: If arguments do not fit, or the run is of another arm or with joint friction.
     """
     truth = PinocchioDynamics(robot)
     check_joints(model, truth)
@@ -120,7 +120,9 @@ def compare_models(
             raise ArgumentError(f"the run is of the arm '{run.robot}', not of {robot.name}; give one of that arm.")
         plant = str(run.info.get("plant", ""))
         if "joint_friction=" in plant and "joint_friction=drop" not in plant:
-            raise ArgumentError("joint friction acted in the run, so its torques do not tell v̇; record one without it.")
+            raise ArgumentError(
+                "joint friction acted in the run, so its torques do not determine v̇; record one without it."
+            )
         missing = ""
     elif trajectories:
         try:
@@ -128,7 +130,7 @@ def compare_models(
                 closed_loop(model, robot, trajectories, frequency=frequency, seed=seed, progress=progress),
                 "",
             )
-        except SimulationDiverged as error:  # of a model so wrong that its law is unstable: that is a result
+        except SimulationDiverged as error:  # a model so wrong that its law is unstable is a result, too
             missing = f"the closed loop diverged\n{str(error)[:60]} …"
     with waiting("comparing", progress):
         errors = compare(model, truth, samples, speed, seed, box, run)
@@ -151,11 +153,13 @@ def closed_loop(
     seed: int = 1,
     progress: bool = False,
 ) -> Run:
-    """Neural backstepping on the model, with the gains it has on the exact one and a plant that is the exact one.
+    """Simulate neural backstepping with the model, with the gains for the exact model, on the exact plant.
 
-    The starts are at rest, drawn independently and uniformly within ±start_error [rad] of the beginning of
+    The starts are at rest, drawn independently and uniformly within ±`start_error` [rad] of the start of
     `Sinusoid.for_robot` at `frequency` [rad/s]; the arm's effort limits act. bandwidth [rad/s], duration, period [s].
-    Raises SimulationDiverged when a motion does.
+
+    Raises:
+        SimulationDiverged: If a motion diverges.
     """
     truth = PinocchioDynamics(robot)
     gains = gains_for_robot(robot, truth, bandwidth=bandwidth, period=period)
@@ -175,7 +179,7 @@ def closed_loop(
 
 
 def figures(result: Comparison, robot: Robot) -> dict[str, Any]:
-    """Everything found, units in the keys, as JSON can store it; None for what is not finite."""
+    """All results as JSON can store them, with units in the keys; None for numbers that are not finite."""
     e, m = result.errors, result.errors.mismatch
     numbers: dict[str, Any] = {
         "relative_error": e.errors._asdict(),
@@ -213,7 +217,7 @@ def figures(result: Comparison, robot: Robot) -> dict[str, Any]:
 
 
 def write_results(result: Comparison, robot: Robot, results: Results, title: str) -> dict[str, Any]:
-    """Writes `FILES`; returns the figures. Raises OSError when they cannot be written."""
+    """Write `FILES` and return the figures; raises OSError if they cannot be written."""
     found, folder = figures(result, robot), results.folder
     labels = [f"{joint.name} [{'m' if joint.prismatic else 'rad'}]" for joint in robot.joints]
     why = result.missing or "no closed loop was run"
@@ -224,7 +228,7 @@ def write_results(result: Comparison, robot: Robot, results: Results, title: str
 
 
 def _rows(found: dict[str, Any], robot: Robot) -> Iterator[tuple[str, str, Any]]:
-    """Every figure as a row of the table: its name, where it holds, its value."""
+    """Every figure as a row of the table: name, where it holds, value."""
     for name, value in found["relative_error"].items():
         yield f"{name}_error", "box", value
     for region, kind in (("by_speed", "speed ×"), ("by_distance", "distance ×")):
@@ -251,21 +255,21 @@ def _rows(found: dict[str, Any], robot: Robot) -> Iterator[tuple[str, str, Any]]
 
 
 def _arm(options: Compare, model: DynamicsProvider) -> Robot:
-    """The true arm; raises OptionError when neither the file nor the options name one."""
+    """The true arm; raises OptionError if neither the file nor the options name one."""
     if options.against is not None:
         return load_robot(options.against)
     if model.robot is None or not options.model.endswith(SAVED):
-        raise OptionError(f"'{options.model}' does not say what to compare with; give --against ROBOT, the true arm.")
+        raise OptionError(f"'{options.model}' does not name its true arm; give --against ROBOT.")
     return model.robot
 
 
 def _region(options: Compare, robot: Robot) -> dict[str, Any]:
-    """Where to compare: the box of the data, or the arm's."""
+    """The region to compare in: the box of the data, or the arm's."""
     if options.data is None:
         return {"speed": 2.0 if options.speed is None else options.speed}
     data = load_dataset(options.data)
     if data.nv != robot.nv:
-        raise OptionError(f"--data '{options.data}' has {data.nv} joints and {robot.name} {robot.nv}; give its own.")
+        raise OptionError(f"--data '{options.data}' has {data.nv} joints and {robot.name} {robot.nv}; give data of it.")
     lower, upper, fastest = data.q.min(axis=0), data.q.max(axis=0), abs(data.v).max(axis=0)
     return {"box": (lower, upper), "speed": fastest if options.speed is None else options.speed}
 
@@ -281,7 +285,7 @@ def _pair(options: Compare, nv: int) -> tuple[int, int] | None:
 
 
 def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Errors over the box and along the run side by side, then what counts for the whole model."""
+    """Print the errors over the box and along the run, then figures of the whole model."""
     along = figures["along_run"]
     shown = table(title, "box", *([] if along is None else ["closed loop"]), first="relative error of")
     for key, name in _PRINTED.items():
@@ -292,8 +296,7 @@ def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
     for line in (
         f"torque nMSE {_number(figures['torque_nmse'])}; least eigenvalue of the model's M "
         f"{_number(figures['eigenvalue_margin_kgm2'])} kg·m²; {_number(low)} M ≤ model's M ≤ {_number(high)} M",
-        f"torque × {figures['scale_factor']:.6g} fits best, and leaves a relative error of "
-        f"{_number(figures['scale_error'])}",
+        f"torque × {figures['scale_factor']:.6g} fits best, with a relative error of {_number(figures['scale_error'])}",
         f"free motion: true energy drifts by {_number(figures['energy_drift'])} of the kinetic energy "
         f"(integrator alone {_number(figures['energy_drift_floor'])})",
         *_mismatch_lines(figures),
@@ -308,9 +311,9 @@ def _mismatch_lines(figures: dict[str, Any]) -> list[str]:
     constants = (_number(found[name]) for name in ("a_Nm_per_rad", "b_Nms_per_rad", "c_Nm"))
     bound = "closed loop: ‖δ‖ ≤ {} ‖q‖ + {} ‖v‖ + {} N·m".format(*constants)
     if found["violation_chance"] >= 1.0:
-        return [f"{bound} on this run; {found['trajectories']} starts say nothing of further ones"]
+        return [f"{bound} on this run; {found['trajectories']} starts are too few to bound further ones"]
     return [
-        f"{bound} on {found['trajectories']} starts; a further one breaks it with a chance of at most "
+        f"{bound} on {found['trajectories']} starts; a further one exceeds it with a chance of at most "
         f"{found['violation_chance']:.2%}, confidence 1 − {found['doubt']:g} (probabilistic, for starts drawn alike)"
     ]
 

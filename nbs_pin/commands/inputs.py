@@ -1,4 +1,4 @@
-"""What several commands are given: an arm with its limits, a law by name or from a file."""
+"""Inputs of several commands: an arm with its limits, a law by name or from a file."""
 
 import math
 from typing import Any
@@ -14,7 +14,7 @@ from nbs_pin.storage.checkpoints import load
 
 
 def arm_of(options: Track | Train) -> Robot:
-    """The arm with the effort limits of the options; raises OptionError when they contradict each other."""
+    """The arm with the effort limits of the options; raises OptionError if they contradict each other."""
     if options.no_effort_limit and options.effort_limit is not None:
         raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
     robot = load_robot(options.robot)
@@ -24,14 +24,14 @@ def arm_of(options: Track | Train) -> Robot:
 
 
 def law_of(name: str, robot: Robot, **settings: Any) -> Controller:
-    """The law of that name (`build_law`), or the one that a .nbs file holds, whatever the settings say.
+    """The law of that name (`build_law`), or the controller in a .nbs file, which ignores the settings.
 
     Raises:
-        ArgumentError: For an unknown name, a file that holds a model, or a file for another arm; errors of `load` else.
+        ArgumentError: If the name is unknown or the file has a model or is for another arm; errors of `load` otherwise.
     """
     if not name.endswith(SAVED):
         return build_law(name, robot, **settings)
     stored = load(name, robot)
     if not isinstance(stored, Controller):
-        raise ArgumentError(f"{name} holds a {type(stored).__name__}, a model; give a file of a controller.")
+        raise ArgumentError(f"{name} contains a {type(stored).__name__}, a model; give a file with a controller.")
     return stored

@@ -1,4 +1,4 @@
-"""`nbs-pin learn`: a model of an arm from its data, and how well it explains motions that it never saw."""
+"""`nbs-pin learn`: a model of an arm from data, and its error on held-out motions."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -24,16 +24,16 @@ from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.checkpoints import save
 
 FILES = ("model.nbs", "learning.png", SUMMARY)
-"""What it writes, the model first and the summary last."""
-_ENDED = {"held out": "no better on what was held out", "iterations": "all iterations done"}
+"""The files that are written, the model first and the summary last."""
+_ENDED = {"held out": "no further progress on held-out data", "iterations": "all iterations done"}
 
 
 def run(options: Learn, console: Console, notes: Console) -> None:
-    """Learns, writes and prints; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
+    """Learn, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     with notes.status(f"loading {options.data}"):
         data, robot = data_and_arm(options.data, options.robot)
     name = options.data.stem if robot is None else robot.name
-    # The same data in another place are the same data: their fingerprint counts, not their path.
+    # Data are identified by their fingerprint, not by their path.
     results = Results.of(options, name, robot, data=None, data_sha256=sha256_of(options.data))
     results.check(FILES, options.force, whole={"interrupted": False}, whose="another model")
     given = {name: getattr(options, name) for name in ("optimiser", "iterations")}
@@ -56,7 +56,7 @@ def run(options: Learn, console: Console, notes: Console) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """A model, and the data that it was and was not learned from."""
+    """A learned model, with its training and test data."""
 
     model: DynamicsProvider
     report: FitReport
@@ -68,9 +68,11 @@ class Learned:
 
 
 def arm_of(data: Dataset) -> Robot | None:
-    """The arm that the data say they are of, None where they say nothing.
+    """The arm that the data name, if any.
 
-    Raises ArgumentError when its description is another one today, RobotNotFound when it is gone.
+    Raises:
+        ArgumentError: If its description has changed.
+        RobotNotFound: If its description is gone.
     """
     said = data.about.get("robot")
     if not isinstance(said, dict) or not said.get("source"):
@@ -78,20 +80,20 @@ def arm_of(data: Dataset) -> Robot | None:
     robot = load_robot(said["source"], **said.get("options", {}))
     if robot.sha256 != said.get("sha256", robot.sha256):
         raise ArgumentError(
-            f"{data!r}: the description {said['source']} has changed since; give the arm that they are of as it was."
+            f"{data!r}: the description {said['source']} has changed since; give the arm as it was then."
         )
     return robot
 
 
 def data_and_arm(path: str | Path, arm: str | None) -> tuple[Dataset, Robot | None]:
-    """The data in a file (`load_log`) and the arm of that name or path, or the one they say they are of."""
+    """The data in a file (`load_log`) and the arm of that name or path, or else the one that the data name."""
     given = None if arm is None else load_robot(arm)
     data = load_log(path, robot=given)
     return data, given or arm_of(data)
 
 
 def learn(data: Dataset, model: str, robot: Robot | None, seed: int = 0, **settings: Any) -> Learned:
-    """The model that `fit` makes of the data, settings and errors as there, and the data it did not learn from."""
+    """The model that `fit` learns from the data, with its settings and errors, and the data held out as a test."""
     train, test = split_data(data, settings.pop("held_out", None), seed)
     found: Any = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
     joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
@@ -99,10 +101,9 @@ def learn(data: Dataset, model: str, robot: Robot | None, seed: int = 0, **setti
 
 
 def figures(result: Learned) -> dict[str, Any]:
-    """How well the model explains the data, as JSON can store it; units in the keys, for sliding joints N.
+    """The results of the fit as JSON can store them; units in the keys, N for prismatic joints.
 
-    Per joint the root mean square of the torque error where it was learned and where it was held out, beside the
-    deviation of the torque.
+    Each joint has the RMS torque error on training and test data, and the standard deviation of its torque.
     """
     report = dataclasses.asdict(result.report)
     curves = {name: report.pop(name) for name in ("history", "held_out")}
@@ -124,15 +125,15 @@ def figures(result: Learned) -> dict[str, Any]:
 
 
 def plot_learning(result: Learned, path: str | Path) -> Path:
-    """Draws how the fit went and writes the picture (PNG); returns its path.
+    """Plot the course of the fit and write the picture (PNG); returns its path.
 
-    Left: normalised mean squared residual by iteration, learned from and held out. Right: per joint the root mean
-    square of the torque error on both, beside the deviation of the torque.
+    Left: normalised mean squared residual by iteration, on training and held-out data. Right: RMS torque error of each
+    joint on both, beside the standard deviation of its torque.
     """
     with picture(path, 11.0, 4.2) as figure:
         curve, bars = figure.subplots(1, 2)
         for name, values, colour in (
-            ("learned from", result.report.history, ACTUAL),
+            ("training", result.report.history, ACTUAL),
             ("held out", result.report.held_out, REFERENCE),
         ):
             if values:
@@ -149,8 +150,8 @@ def plot_learning(result: Learned, path: str | Path) -> Path:
 
 def _draw_errors(axes: Any, result: Learned) -> None:
     place = np.arange(len(result.joints))
-    axes.semilogy(place, result.train.tau.std(axis=0), "_", color=LIMIT, markersize=18, label="deviation of the torque")
-    parts = (("learned from", result.train, ACTUAL, -0.12), ("held out", result.test, REFERENCE, 0.12))
+    axes.semilogy(place, result.train.tau.std(axis=0), "_", color=LIMIT, markersize=18, label="standard deviation")
+    parts = (("training", result.train, ACTUAL, -0.12), ("held out", result.test, REFERENCE, 0.12))
     for name, data, colour, shift in parts:
         if data is not None:
             axes.semilogy(place + shift, _errors(result, data), "o", color=colour, markersize=5, label=name)
@@ -158,7 +159,7 @@ def _draw_errors(axes: Any, result: Learned) -> None:
         place, result.joints, rotation=30 if len(place) > 4 else 0, ha="right" if len(place) > 4 else "center"
     )
     unit = "N, N·m" if any(result.prismatic) else "N·m"
-    axes.set_title(f"root mean square of the torque error [{unit}]", loc="left")
+    axes.set_title(f"RMS torque error [{unit}]", loc="left")
     axes.legend(frameon=False)
 
 
@@ -167,7 +168,7 @@ def _errors(result: Learned, data: Dataset) -> np.ndarray:
 
 
 def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """A row per joint, then what counts for the whole arm."""
+    """Print a row per joint, then figures of the whole arm."""
     headings = ("torque\ndeviation [N·m]", "error [N·m]", "error, held\nout [N·m]", "friction\n[N·m·s, N·m]")
     shown = table(title, *headings)
     for i, joint in enumerate(figures["joints"]):
@@ -188,11 +189,11 @@ def _lines(figures: dict[str, Any]) -> list[str]:
     train, test = (figures[name] for name in ("train_nmse", "test_nmse"))
     shown, more = figures["unidentifiable"][:3], len(figures["unidentifiable"]) - 3
     return [
-        f"mean square of the torque error over the torque's variance: {_short(train)} on {figures['samples']} samples"
+        f"mean squared torque error over the variance of the torque: {_short(train)} on {figures['samples']} samples"
         + ("" if test is None else f", {_short(test)} on {figures['test_samples']} of trajectories held out"),
         f"{figures['parameters']} numbers learned in {figures['seconds']:.1f} s "
         f"({_ENDED.get(figures['stopped'], figures['stopped'])})",
-        *(f"the data leave open: {text}" for text in shown),
+        *(f"the data do not determine: {text}" for text in shown),
         *([f"… and {more} more in {SUMMARY}"] if more > 0 else []),
     ]
 

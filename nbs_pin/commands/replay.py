@@ -1,4 +1,4 @@
-"""`nbs-pin replay`: a recorded run as a page that plays in the browser."""
+"""`nbs-pin replay`: a recorded run as a page for the browser."""
 
 import webbrowser
 
@@ -12,7 +12,7 @@ from nbs_pin.robots.robot import load_robot
 
 
 def run(options: Replay, console: Console, notes: Console) -> None:
-    """Writes the page and says where; raises NbsPinError or OSError."""
+    """Write the page and print its path; raises NbsPinError or OSError."""
     source = options.run_file / "run.npz" if options.run_file.is_dir() else options.run_file
     page = options.out or source.with_name("replay.html")
     if page.is_dir():

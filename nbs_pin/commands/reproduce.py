@@ -1,4 +1,4 @@
-"""`nbs-pin reproduce`: the paper's experiments again, on one page."""
+"""`nbs-pin reproduce`: the paper's experiments and further studies, on one page."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from nbs_pin.reproduction.model_study import reproduce_models
 from nbs_pin.reproduction.paper import reproduce_paper
 
 FILES = ("report.md", SUMMARY)
-"""What it writes beside the files of its parts."""
+"""The files that are written besides those of the parts."""
 PARTS: dict[str, Callable[[Path, int, bool], Sequence[Any]]] = {
     "paper": reproduce_paper,
     "fair": fair_part,
@@ -26,11 +26,11 @@ PARTS: dict[str, Callable[[Path, int, bool], Sequence[Any]]] = {
     "models": reproduce_models,
     "certificates": reproduce_certificates,
 }
-"""Each writes its files into a folder and gives sections of the page."""
+"""Functions that write the files of a part into a folder and return its sections of the page."""
 
 
 def run(options: Reproduce, console: Console, notes: Console) -> None:
-    """Runs, writes and prints; raises NbsPinError or OSError."""
+    """Run the parts, write and print; raises NbsPinError or OSError."""
     results = Results.of(options, "paper", None)
     results.check(FILES, options.force)
     chosen = list(PARTS) if options.part == "all" else [options.part]
@@ -38,8 +38,8 @@ def run(options: Reproduce, console: Console, notes: Console) -> None:
     with results.made() as folder:
         sections = [section for name in chosen for section in PARTS[name](folder, options.seed, True)]
         wall_time = time.perf_counter() - began
-        lead = f"Made by `nbs-pin reproduce --part {options.part} --seed {options.seed}` in {wall_time:.0f} s."
-        write_whole(folder / FILES[0], page("The paper's experiments, run again", lead, sections).encode())
+        lead = f"Written by `nbs-pin reproduce --part {options.part} --seed {options.seed}` in {wall_time:.0f} s."
+        write_whole(folder / FILES[0], page("The paper's experiments, reproduced", lead, sections).encode())
         figures = {name: value for section in sections for name, value in section.figures.items()}
         results.write_summary(figures, wall_time_s=wall_time)
     console.print(f"{', '.join(chosen)}: done in {wall_time:.0f} s", highlight=False)

@@ -1,4 +1,4 @@
-"""Folders that commands write into: what decides their contents, and how they are shown."""
+"""Result folders of commands: the facts that determine their contents, and how they are shown."""
 
 import contextlib
 import dataclasses
@@ -27,21 +27,21 @@ _NO_SETTINGS = ("out", "resume", "force")
 
 @dataclass(frozen=True)
 class Results:
-    """The folder of a command's results, and the facts that decide them."""
+    """The folder of a command's results, and the facts that determine them."""
 
     folder: Path
     facts: dict[str, Any]
-    """Settings, versions and the arm's fingerprint: equal for the very same run."""
+    """Settings, versions and the arm's fingerprint, which are equal for identical runs."""
 
     @classmethod
     def of(cls, options: Any, name: str, robot: Robot | None, /, **resolved: Any) -> "Results":
-        """The folder that the options name, or out/COMMAND-NAME.
+        """The folder that the options give, or out/COMMAND-NAME.
 
         Args:
-            options: The command's options; all but the folder and how to treat it are settings.
-            name: What the results are of, usually the arm.
+            options: The command's options; all are settings, except for the folder and its treatment.
+            name: Name of the results, usually the arm's.
             robot: The arm, or None.
-            resolved: Settings whose value was worked out; they take the place of the options of their names.
+            resolved: Settings that were computed; they replace the options of the same names.
         """
         command = type(options).__name__.lower()
         folder = options.out or Path("out") / f"{command}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
@@ -57,14 +57,14 @@ class Results:
         whose: str = "another run",
         remedy: str = "give another --out",
     ) -> None:
-        """Raises OptionError when the folder holds results that are not those of the very same run.
+        """Raises OptionError if the folder holds results of another run.
 
         Args:
             names: The files that count as results.
-            force: Whether they may be replaced all the same.
-            whole: What summary.json must say beside the facts.
-            whose: What other results are called in the error.
-            remedy: What the error advises beside --force.
+            force: Whether they may be overwritten.
+            whole: Entries that summary.json must have besides the facts.
+            whose: Name of other results in the error.
+            remedy: Advice in the error besides --force.
         """
         if self.folder.exists() and not self.folder.is_dir():
             raise OptionError(f"--out '{self.folder}' is a file; give a folder.")
@@ -77,7 +77,7 @@ class Results:
 
     @contextlib.contextmanager
     def made(self) -> Iterator[Path]:
-        """The folder, made before any long work so that a bad path is known at once; removed if it stays empty."""
+        """The folder, created before any long work so that a bad path fails at once; removed if it stays empty."""
         new = [path for path in (self.folder, *self.folder.parents) if not path.exists()]
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -88,17 +88,17 @@ class Results:
                     path.rmdir()
 
     def write_summary(self, figures: Mapping[str, Any], **more: Any) -> Path:
-        """Writes summary.json: the facts, the figures and what else is given, all as JSON can store it."""
+        """Write summary.json with the facts, the figures and further entries, all as JSON can store them."""
         return write_whole(self.folder / SUMMARY, summary_text(self.facts | more | {"figures": figures}).encode())
 
     def show(self, console: Console, names: Iterable[str]) -> None:
-        """Prints the paths of the results, one a line."""
+        """Print the paths of the results, one per line."""
         for name in names:
             console.print(str(self.folder / name), soft_wrap=True, highlight=False, markup=False)
 
 
 def settings_of(options: Any, **resolved: Any) -> dict[str, Any]:
-    """Everything that decides a command's results, as JSON can store it; files by name and SHA-256."""
+    """Everything that determines a command's results, as JSON can store it; files by name and SHA-256."""
     settings = {name: value for name, value in dataclasses.asdict(options).items() if name not in _NO_SETTINGS}
     for name, value in list(settings.items()):
         if name not in resolved and isinstance(value, str | Path):
@@ -114,12 +114,12 @@ def sha256_of(file: Path) -> str:
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
-    """A summary as the text of its file."""
+    """A summary as the text of summary.json."""
     return json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def summary_in(folder: Path) -> dict[str, Any]:
-    """What summary.json of the folder holds, nothing when it cannot be read."""
+    """The content of summary.json in the folder, empty if it cannot be read."""
     try:
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
     except (OSError, ValueError):

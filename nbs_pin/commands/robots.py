@@ -14,22 +14,22 @@ from nbs_pin.robots.robot import Robot, load_robot
 
 
 class Arm(NamedTuple):
-    """An arm in figures."""
+    """Figures of an arm."""
 
     name: str
     joints: int
     least_effort: float
-    """Smallest effort limit of its joints [N·m], inf for none."""
+    """Smallest effort limit of its joints [N·m], inf without limits."""
     most_effort: float
-    """Largest effort limit of its joints [N·m], inf for none."""
+    """Largest effort limit of its joints [N·m], inf without limits."""
     continuous: int
-    """How many joints turn without end."""
+    """Number of continuous joints."""
     viscous_friction: bool
     coulomb_friction: bool
 
 
 def run(options: Robots, console: Console, notes: Console) -> None:
-    """Prints the table; raises NbsPinError when an arm cannot be loaded."""
+    """Print the table; raises NbsPinError if an arm cannot be loaded."""
     shown = Table(box=box.SIMPLE_HEAD)
     shown.add_column("name", no_wrap=True)
     for heading in ("joints", "effort [N·m]", "continuous", "friction"):
@@ -40,14 +40,14 @@ def run(options: Robots, console: Console, notes: Console) -> None:
     console.print(shown)
     console.print(
         "ROBOT may also be a path to a .urdf file, or .xacro with the extra nbs-pin[xacro]:\n"
-        "one fixed base, at most 64 moving joints, their limits stated.",
+        "with a fixed base and at most 64 moving joints, whose limits are stated.",
         highlight=False,
         markup=False,
     )
 
 
 def known_arms() -> list[Arm]:
-    """Every arm that `load_robot` knows by name, loaded and measured."""
+    """The figures of every arm that `load_robot` knows by name."""
     return [describe(name, load_robot(name)) for name in ROBOT_NAMES]
 
 
@@ -66,7 +66,7 @@ def describe(name: str, robot: Robot) -> Arm:
 
 
 def _cells(arm: Arm) -> tuple[str, ...]:
-    """The columns of an arm."""
+    """The cells of an arm's row."""
     span = f"{arm.least_effort:g}" + (f" to {arm.most_effort:g}" if arm.most_effort > arm.least_effort else "")
     effort = "none" if math.isinf(arm.least_effort) else span
     frictions = {"viscous": arm.viscous_friction, "Coulomb": arm.coulomb_friction}

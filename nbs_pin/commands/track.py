@@ -1,4 +1,4 @@
-"""`nbs-pin track`: an arm follows a motion; run, summary, picture and replay land in a folder."""
+"""`nbs-pin track`: simulate an arm that follows a motion; write run, summary, figure and replay."""
 
 import os
 import tempfile
@@ -36,13 +36,13 @@ from nbs_pin.simulation.registry import build_plant
 from nbs_pin.simulation.simulate import simulate
 
 FILES = ("run.npz", "tracking.png", "replay.html", SUMMARY)
-"""What `write_results` writes, the summary last."""
-_NOTICEABLE = 1.0  # seconds of compilation that are worth a line
-_ROWS_OF_ARRAYS = 8  # the arrays of a Run with a number per row and joint
+"""Files of `write_results`, the summary last."""
+_NOTICEABLE = 1.0  # compilation times above this are printed [s]
+_ROWS_OF_ARRAYS = 8  # arrays of a Run with one number per row and joint
 
 
 def run(options: Track, console: Console, notes: Console) -> None:
-    """Tracks, writes and prints; raises NbsPinError or OSError."""
+    """Track, write and print; raises NbsPinError or OSError."""
     if options.start is not None and options.start_error:
         raise OptionError("--start and --start-error were both given; choose one.")
     with notes.status(f"loading {options.robot}"):
@@ -70,7 +70,7 @@ def run(options: Track, console: Console, notes: Console) -> None:
 
 
 class Tracked(NamedTuple):
-    """A run and what it took."""
+    """A run and the time it took."""
 
     run: Run
     compile_time: float
@@ -98,15 +98,17 @@ def track(
     seed: int = 0,
     progress: bool = False,
 ) -> Tracked:
-    """The arm following a motion it is able to follow; `Robot.with_effort_limit` gives its drives other limits.
+    """Simulate an arm that follows a feasible motion; `Robot.with_effort_limit` sets other effort limits.
 
     plant, controller: by name (`build_plant`, `law_of`) or built. reference: None takes
-    `Sinusoid.for_robot(robot)`. start_error: added to every joint with alternating sign, the arm then starting at rest;
-    0 starts on the reference. start: the configuration [rad] to start from at rest, in place of `start_error`.
-    joint_friction: "keep" lets the URDF's friction act, fed forward by laws that model it. integrator: of a plant by
+    `Sinusoid.for_robot(robot)`. start_error: initial error of every joint, with alternating sign, at rest [rad]; 0
+    starts on the reference. start: configuration to start from at rest [rad], in place of `start_error`.
+    joint_friction: "keep" simulates the URDF's friction, fed forward by laws that model it. integrator: of a plant by
     name, None its usual one. plant_step, lookahead [s]: as in `simulate`. seed: of the network weights.
-    Raises ArgumentError for a motion outside the arm's position, velocity or effort limits, or settings that do not
-    fit, and SimulationDiverged when the arm leaves the finite numbers.
+
+    Raises:
+        ArgumentError: If the motion violates the arm's position, velocity or effort limits, or settings do not fit.
+        SimulationDiverged: If the simulation diverges.
     """
     friction = JointFriction.of(robot) if joint_friction == "keep" else None
     reference = Sinusoid.for_robot(robot) if reference is None else reference
@@ -141,7 +143,7 @@ def track(
 def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     """`metrics.summary` of the run and the RMS error over its last 30 % [rad], as JSON can store them.
 
-    robot: adds how far each joint went beyond its position range [rad]; no plant of ours has joint stops.
+    With a robot, also how far each joint left its position range [rad], as the plants have no joint stops.
     """
     values = metrics.summary(run)
     values["rms_error_last_30_percent_rad"] = metrics.rms_error(run, 0.7 * float(run.t[-1])).tolist()
@@ -152,10 +154,9 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
 
 
 def write_results(run: Run, folder: str | Path, robot: Robot, summary: dict[str, Any]) -> Path:
-    """Writes `FILES` for the run into the folder, all drawn before the first takes its place; returns the folder.
+    """Write `FILES` for the run into the folder, and return the folder; `summary` is the content of summary.json.
 
-    summary: what summary.json holds. Files of those names are replaced, and left alone when drawing or writing fails.
-    Raises OSError when they cannot be written.
+    Files of those names are replaced only after all have been drawn. Raises OSError if they cannot be written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -180,7 +181,7 @@ def _check_size(nv: int, duration: float, period: float) -> None:
 
 
 def _plant_step(plant: Plant, robot: Robot, period: float) -> float | None:
-    """A step [s] short enough for RK4 to follow the plant's joint friction, or None for the usual one."""
+    """A step short enough for RK4 to follow the plant's joint friction [s], or None for the usual one."""
     if not isinstance(plant, DynamicsPlant) or plant.friction is None:
         return None
     # Friction is a damper of this slope near rest; RK4 is stable up to 2.78 of its fastest time constant.
@@ -191,15 +192,15 @@ def _plant_step(plant: Plant, robot: Robot, period: float) -> float | None:
 
 
 def _start(options: Track, nv: int) -> list[float] | None:
-    """The configuration to start from [rad], or None; raises OptionError for another number of joints."""
+    """The configuration to start from [rad], or None; raises OptionError if the number of joints differs."""
     start = None if options.start is None else plain_numbers(options.start)
     if start is not None and len(start) != nv:
-        raise OptionError(f"--start '{options.start}' has {len(start)} numbers for {nv} joints; give one for each.")
+        raise OptionError(f"--start '{options.start}' has {len(start)} numbers for {nv} joints; give one per joint.")
     return start
 
 
 def _print(console: Console, title: str, figures: dict[str, Any], compile_time: float, wall_time: float) -> None:
-    """A row per joint, then what counts for the whole arm; `figures` as the function of that name gives them."""
+    """Print a row per joint, then figures of the whole arm; `figures` from the function of that name."""
     after = figures["late_after_s"]
     late = f"after {after:g} s\n[rad]"
     shown = table(title, "RMS error\n[rad]", late, "last 30 %\n[rad]", "peak\n[N·m]", "limit\n[N·m]")
@@ -217,7 +218,7 @@ def _print(console: Console, title: str, figures: dict[str, Any], compile_time: 
 
 
 def _converged(figures: dict[str, Any]) -> str:
-    """When the error came to stay below the paper's threshold, in words."""
+    """The time after which the error stays below the paper's threshold, in words."""
     time = figures["convergence_time_s"]
     return "not within the run" if time is None else f"{time:.3f} s"
 
@@ -228,7 +229,7 @@ def _lines(figures: dict[str, Any], compile_time: float, wall_time: float) -> li
     return [
         f"converged (‖error‖ < 0.1 rad to the end): {_converged(figures)}",
         f"some joint at its effort limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
-        *(f"{joint} went {excess:.3g} rad beyond its range: the plant has no joint stops" for joint, excess in outside
+        *(f"{joint} left its range by {excess:.3g} rad: the plant has no joint stops" for joint, excess in outside
           if excess > 0.0),
         *([f"compiled the law in {compile_time:.1f} s, once on this machine"] if compile_time > _NOTICEABLE else []),
         f"simulated {figures['duration_s']:g} s in {wall_time:.1f} s",

@@ -1,4 +1,4 @@
-"""`nbs-pin train`: a controller learns through the closed loop, and says what it gained on starts it never saw."""
+"""`nbs-pin train`: train a controller through the closed loop, and compare before and after on fresh starts."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,19 +25,19 @@ from nbs_pin.training.evaluation import compared, fresh_batch, fresh_figures
 from nbs_pin.training.train import Training, train
 
 CHECKPOINT = "training.ckpt"
-"""What `train_robot` keeps up to date in its folder."""
+"""The checkpoint that `train_robot` keeps up to date in its folder."""
 FILES = ("controller.nbs", "learning.png", SUMMARY)
-"""What `write_results` writes, the summary last."""
-_LONGER = 3.0  # fresh motions last this many times longer than those trained on
+"""Files of `write_results`, the summary last."""
+_LONGER = 3.0  # duration of fresh motions over that of training motions
 
 
 def run(options: Train, console: Console, notes: Console) -> None:
-    """Trains, writes and prints; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
+    """Train, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     with notes.status(f"loading {options.robot}"):
         robot = arm_of(options)
     results = Results.of(options, robot.name, robot, robot=robot.source)
     if not options.resume:
-        whose, remedy = "another or an unfinished training", "give another --out, --resume to go on with it"
+        whose, remedy = "another or an unfinished training", "give another --out, --resume to continue it"
         names, whole = (CHECKPOINT, *FILES), {"interrupted": False}
         results.check(names, options.force, whole=whole, whose=whose, remedy=remedy)
     given = keywords(options, train_robot) | {
@@ -57,7 +57,7 @@ def run(options: Train, console: Console, notes: Console) -> None:
 
 
 class Trained(NamedTuple):
-    """A training, and the same fresh motions under the controller before and after it."""
+    """A training, and the same fresh motions before and after it."""
 
     training: Training
     before: Run
@@ -79,14 +79,16 @@ def train_robot(
     folder: Path | None = None,
     **settings: Any,
 ) -> Trained:
-    """A law for the arm, trained on sinusoids of these frequencies [rad/s] within the arm's effort limits.
+    """Train a law for the arm on sinusoids of these frequencies [rad/s], within the arm's effort limits.
 
-    controller: a law by name, a .nbs file (`law_of`), or one that is built. starts: in all, shared out over
-    the frequencies. cost: by name (`stage_cost`). folder: where `CHECKPOINT` is kept, None for nowhere. duration,
-    period [s], start_error [rad], and settings (epochs, optimiser, resume, …): as `train` has them.
-    The fresh motions last three times longer, from `FRESH_STARTS` starts per frequency that training never saw.
-    Raises ArgumentError for settings that do not fit and a motion outside the arm's limits, KeyboardInterrupt when
-    Ctrl-C comes before the first epoch is over; errors of `train` else.
+    controller: a law by name, a .nbs file (`law_of`), or a built one. starts: in total, divided among the frequencies.
+    cost: by name (`stage_cost`). folder: where `CHECKPOINT` is kept, None for no checkpoint. duration, period [s],
+    start_error [rad] and settings (epochs, optimiser, resume, …): as in `train`. The fresh motions last three times
+    longer, from `FRESH_STARTS` starts per frequency that are not used in training.
+
+    Raises:
+        ArgumentError: If settings do not fit or a motion violates the arm's limits; other errors as in `train`.
+        KeyboardInterrupt: If Ctrl-C comes before the end of the first epoch.
     """
     references = [Sinusoid.for_robot(robot, frequency) for frequency in frequencies]
     for reference in references:
@@ -117,7 +119,7 @@ def train_robot(
 
 
 def figures(result: Trained) -> dict[str, Any]:
-    """What training changed, as JSON can store it; None for a time that never came and for what is not finite."""
+    """The effect of training as JSON can store it; None for times never reached and numbers that are not finite."""
     training = result.training
     held_out, best = training.held_out, training.best_epoch
     numbers: dict[str, Any] = plain(
@@ -138,7 +140,7 @@ def figures(result: Trained) -> dict[str, Any]:
 
 
 def write_results(result: Trained, results: Results, *, interrupted: bool) -> dict[str, Any]:
-    """Writes `FILES`, the trained controller first; returns the figures. Raises OSError when they cannot be written."""
+    """Write `FILES`, the trained controller first, and return the figures; raises OSError if they cannot be written."""
     numbers, training = figures(result), result.training
     save(training.controller, results.folder / FILES[0], info={"trained": results.facts | {"interrupted": interrupted}})
     shown = training.history, training.held_out, training.best_epoch, result.before, result.after
@@ -149,7 +151,7 @@ def write_results(result: Trained, results: Results, *, interrupted: bool) -> di
 
 
 def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """What training changed, a row per figure; `figures` as `figures` gives them."""
+    """Print a row per figure, before and after training; `figures` from the function of that name."""
     shown = table(title, "before", "after", first="")
     for name in ("training", "held-out"):
         costs = figures[f"{name.replace('-', '_')}_cost"]
@@ -165,7 +167,7 @@ def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
     ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
     for line in (
         f"held-out cost lowered by {_number(figures['held_out_cost_lowered_by'], '.1%')}; "
-        f"converged is ‖error‖ < 0.1 rad to the end, from {figures['fresh_starts']} fresh starts",
+        f"converged means ‖error‖ < 0.1 rad to the end, over {figures['fresh_starts']} fresh starts",
         f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
         f"the best after {figures['best_epoch']}",
     ):

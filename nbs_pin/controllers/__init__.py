@@ -1,1 +1,1 @@
-"""Tracking laws."""
+"""Tracking control laws."""

@@ -1,7 +1,8 @@
-"""Convex, non-decreasing activations with their first two derivatives, for numpy and torch alike."""
+"""Convex, non-decreasing activations with their first two derivatives, for numpy and torch."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -13,23 +14,23 @@ from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.kernels.layout import ActivationCode
 
+_Derivatives: TypeAlias = tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "*shape"]]
+
 
 class Activation(ABC):
     """σ: ℝ → ℝ, convex and non-decreasing, so that an input-convex network built from it is convex."""
 
     @abstractmethod
-    def derivatives(
-        self, x: Float[Array, "*shape"]
-    ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "*shape"]]:
+    def derivatives(self, x: Float[Array, "*shape"]) -> _Derivatives:
         """σ(x), σ'(x) and σ''(x)."""
 
     @property
     def kernel(self) -> tuple[int, float] | None:
-        """Code and parameter of its compiled form (`kernels/layout.py`), or None where there is none."""
+        """Code and parameter of the compiled form (`kernels/layout.py`), or None if there is none."""
         return None
 
     def curvature_range(self, a: Interval) -> Interval:
-        """Where σ'' lies over the intervals; anything ≥ 0 unless the activation says more."""
+        """Bounds of σ'' over the intervals; [0, ∞) unless a subclass knows more."""
         return Interval(0.0 * a.low, np.inf + 0.0 * a.high)
 
 
@@ -37,10 +38,9 @@ class Activation(ABC):
 @storable(("d",))
 @dataclass(frozen=True)
 class SmoothedReLU(Activation):
-    """The paper's choice: 0 (x ≤ 0), x²/2d (0 < x < d), x − d/2 (x ≥ d).
+    """The paper's activation: 0 (x ≤ 0), x²/2d (0 < x < d), x − d/2 (x ≥ d), with d > 0.
 
-    σ'' jumps at 0 and at d, and with it the torque of a controller built on it (docs/theory.md §3).
-    Raises ArgumentError unless d > 0. Source: Kolter and Manek 2019, as cited by the paper.
+    σ'', hence the torque, jumps at 0 and d (docs/theory.md §3). Source: Kolter and Manek 2019, as cited by the paper.
     """
 
     d: float = 0.01
@@ -49,10 +49,8 @@ class SmoothedReLU(Activation):
         if not self.d > 0.0:
             raise ArgumentError(f"the smoothing width d is {self.d}; give a positive number.")
 
-    def derivatives(
-        self, x: Float[Array, "*shape"]
-    ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "*shape"]]:
-        """σ, σ', σ''; at the switches the one-sided value of the middle piece is not taken."""
+    def derivatives(self, x: Float[Array, "*shape"]) -> _Derivatives:
+        """σ, σ', σ''; at 0 and d, where σ'' jumps, σ'' = 0."""
         xp = array_namespace(x)
         slope = xp.clip(x / self.d, 0.0, 1.0)
         inside = (x > 0.0) & (x < self.d)
@@ -64,7 +62,7 @@ class SmoothedReLU(Activation):
         return ActivationCode.SMOOTHED_RELU, self.d
 
     def curvature_range(self, a: Interval) -> Interval:
-        """1/d between the switches, 0 outside."""
+        """1/d between 0 and d, 0 outside."""
         inside, touching = (a.low > 0.0) & (a.high < self.d), (a.high >= 0.0) & (a.low <= self.d)
         return Interval(inside / self.d, touching / self.d)
 
@@ -73,10 +71,7 @@ class SmoothedReLU(Activation):
 @storable(("b",))
 @dataclass(frozen=True)
 class Squareplus(Activation):
-    """σ(x) = ½(x + √(x² + b)): smooth everywhere, algebraic, and close to ReLU beyond |x| ≈ √b.
-
-    Raises ArgumentError unless b > 0. Source: Barron 2021, "Squareplus: a softplus-like algebraic rectifier".
-    """
+    """σ(x) = ½(x + √(x² + b)), b > 0: smooth ReLU (Barron 2021, "Squareplus: a softplus-like algebraic rectifier")."""
 
     b: float = 1.0
 
@@ -84,9 +79,7 @@ class Squareplus(Activation):
         if not self.b > 0.0:
             raise ArgumentError(f"the curvature b is {self.b}; give a positive number.")
 
-    def derivatives(
-        self, x: Float[Array, "*shape"]
-    ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "*shape"]]:
+    def derivatives(self, x: Float[Array, "*shape"]) -> _Derivatives:
         """σ, σ', σ''."""
         root = array_namespace(x).sqrt(x * x + self.b)
         return 0.5 * (x + root), 0.5 * (1.0 + x / root), 0.5 * self.b / (root * root * root)
@@ -97,7 +90,7 @@ class Squareplus(Activation):
         return ActivationCode.SQUAREPLUS, self.b
 
     def curvature_range(self, a: Interval) -> Interval:
-        """σ'' is one hump: its least is at an end, its largest at an end or at 0."""
+        """σ'' is unimodal: its minimum is at an end, its maximum at an end or at 0."""
         low, high = (self.derivatives(end)[2] for end in (a.low, a.high))
         top = self.derivatives(np.zeros_like(low))[2]
         return Interval(np.minimum(low, high), np.where((a.low <= 0.0) & (a.high >= 0.0), top, np.maximum(low, high)))

@@ -1,4 +1,4 @@
-"""Laws as machine code: the same numbers, microseconds a step."""
+"""Control laws as machine code: the same torque in microseconds."""
 
 from typing import Any
 
@@ -14,13 +14,15 @@ from nbs_pin.kernels.threads import over_cores
 
 
 class CompiledController(MemorylessController):
-    """τ = M(q) a_r + C(q, v) v_r + G(q) + feedback as machine code.
+    """τ = M(q) a_r + C(q, v) v_r + G(q) + feedback as machine code, for numpy arrays.
 
-    Where the model is a rigid tree (`DynamicsProvider.packed_tree`) one kernel does it all; any other model's own
-    `reference_torque` is called beside the law's kernel. A snapshot, which later changes of the controller it came from
-    do not reach. Numpy only; batches run over all cores. NaN in gives NaN out. Each owns scratch space: one per thread.
+    If the model is a rigid tree (`DynamicsProvider.packed_tree`), one kernel computes the torque; otherwise the law's
+    kernel is combined with the model's own `reference_torque`. The object is a snapshot: later changes of the original
+    controller do not affect it. Batches run on all cores, NaN gives NaN. It owns scratch space: use one per thread.
 
-    law: constants and weights as numpy arrays (`Controller.packed_law`). dynamics: what the law believes of the arm.
+    Args:
+        law: Constants and weights as numpy arrays (`Controller.packed_law`).
+        dynamics: Model of the arm that the law uses.
     """
 
     def __init__(self, law: Packed, dynamics: DynamicsProvider) -> None:
@@ -33,15 +35,15 @@ class CompiledController(MemorylessController):
             compile_tree_law()
             self._packed = (*pack_tree_law(law, self._tree), np.empty(law_workspace(law, self._tree)))
         one, two = np.zeros(dynamics.nv), np.zeros((2, dynamics.nv))
-        for x in (one, two):  # so that no first call, of whatever the model compiles, happens inside a control loop
+        for x in (one, two):  # so that nothing is left to compile inside a control loop
             self.torque(x, x, x, x, x)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled as the arguments it is rebuilt from."""
+        """Pickled as its constructor arguments."""
         return type(self), (self.law, self.dynamics)
 
     def compile(self) -> "CompiledController":
-        """The same law with scratch space of its own, so that each `simulate` and each thread may have one."""
+        """The same law with its own scratch space, for another `simulate` or thread."""
         return type(self)(self.law, self.dynamics)
 
     @property
@@ -52,7 +54,8 @@ class CompiledController(MemorylessController):
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ [N·m]; arguments (..., nv), fastest as contiguous float64 vectors (nv,).
 
-        Raises ArgumentError when shapes do not fit, or for tensors: those belong to the controller this one came from.
+        Raises:
+            ArgumentError: If shapes do not match, or for tensors, which only the uncompiled controller takes.
         """
         if isinstance(q, np.ndarray) and q.ndim == 1:
             tau = np.empty(self.nv)
@@ -67,7 +70,7 @@ class CompiledController(MemorylessController):
     def _one(
         self, q: np.ndarray, v: np.ndarray, q_ref: np.ndarray, v_ref: np.ndarray, a_ref: np.ndarray, tau: np.ndarray
     ) -> bool:
-        """The torque of one state → tau; False, and nothing done, unless all have length nv."""
+        """Write the torque of one state to tau; False, with nothing written, unless all have length nv."""
         if self._tree is not None:
             return tree_law(q, v, q_ref, v_ref, a_ref, *self._packed, tau)
         if not law_signals(q, v, q_ref, v_ref, a_ref, *self._packed, self._signals):

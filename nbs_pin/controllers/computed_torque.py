@@ -1,4 +1,4 @@
-"""Computed torque: the model inverted, the error a chosen linear system."""
+"""Computed torque: inverse dynamics with linear error dynamics."""
 
 import numpy as np
 
@@ -26,9 +26,20 @@ from nbs_pin.robots.robot import Robot
 class ComputedTorque(ModelLaw):
     """τ = M(a_d − k_d ż1 − k_p z1) + C v + G, so that z̈1 + k_d ż1 + k_p z1 = M⁻¹τ_d.
 
-    kp: k_p [1/s²], (n,). kd: k_d [1/s], (n,). friction: fed forward at v_d, or None.
     Source: Luh, Walker and Paul 1980; Siciliano et al. 2009, section 8.5.2.
-    Raises ArgumentError unless all gains are positive.
+
+    Args:
+        kp: k_p [1/s²], (n,) or one number.
+        kd: k_d [1/s], (n,) or one number.
+        friction: Joint friction fed forward at v_d, or None.
+
+    Raises:
+        ArgumentError: If a gain is not positive.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.ComputedTorque.for_robot(nbs.load_robot("two_link"), bandwidth=8.0).kp.round(1)
+        array([256. , 333.3])
     """
 
     def __init__(
@@ -47,7 +58,7 @@ class ComputedTorque(ModelLaw):
         period: float = 0.001,
         friction: JointFriction | None = None,
     ) -> "ComputedTorque":
-        """Critically damped, poles at −2ω or, where effort allows more, at the stiffness of `gains_for_robot`."""
+        """Critically damped, with poles at −2ω or, if the effort limits allow, the stiffness of `gains_for_robot`."""
         dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
         gains = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period)
         warn_if_too_fast(robot, dynamics, 2.0 * bandwidth)
@@ -65,7 +76,7 @@ class ComputedTorque(ModelLaw):
         return self.gains.numpy("kd")
 
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
-        """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
+        """τ [N·m]; arguments (..., nv). Raises ArgumentError if shapes or array types do not match."""
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         kp, kd = self.gains.like(q)
         a = a_ref - kd * (v - v_ref) - kp * self.dynamics.difference(q, q_ref)

@@ -1,4 +1,4 @@
-"""The protocol of every controller: memory in, torque and memory out."""
+"""The interface of all controllers: memory and state in, torque and memory out."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -10,7 +10,7 @@ from nbs_pin.kernels.layout import Packed
 
 
 class Controller(ABC):
-    """A tracking law called once per control period; what it must remember is a value the caller keeps."""
+    """A tracking law, evaluated once per control period; its memory is a value that the caller keeps."""
 
     @property
     @abstractmethod
@@ -19,7 +19,7 @@ class Controller(ABC):
 
     @abstractmethod
     def initial_memory(self, q: Vectors) -> Any:
-        """What the law remembers before its first step, for a start at q; None for a law without memory."""
+        """Memory before the first step, for a start at q; None for a law without memory."""
 
     @abstractmethod
     def step(self, memory: Any, q: Vectors, v: Vectors, reference: Reference, period: float) -> tuple[Vectors, Any]:
@@ -27,37 +27,40 @@ class Controller(ABC):
 
     @property
     def packable(self) -> bool:
-        """Whether the law has a compiled form: `packed_law` gives its numbers and `compile` the same law on kernels."""
+        """Whether the law has a compiled form (`packed_law`, `compile`)."""
         return False
 
     def packed_law(self, *, numpy: bool = True) -> Packed:
-        """Constants and weights of the law as the kernels take them (`kernels/layout.py`).
+        """Constants and weights of the law in the layout of the kernels (`kernels/layout.py`).
 
-        numpy: True gives an array, False a tensor of the same numbers, differentiable in the law's parameters.
-        Raises ArgumentError unless the law is `packable`.
+        Args:
+            numpy: True gives an array, False a tensor of the same numbers, differentiable in the law's parameters.
+
+        Raises:
+            ArgumentError: If the law is not `packable`.
         """
-        raise ArgumentError(f"{type(self).__name__} has no compiled form; run it as it is, or build it of known parts.")
+        raise ArgumentError(f"{type(self).__name__} has no compiled form; run it uncompiled, or use built-in parts.")
 
     def compile(self) -> "Controller":
-        """The same law as machine code, for numpy: a snapshot that later changes of this controller do not reach.
+        """The same law as machine code, for numpy: a snapshot that later changes of this controller do not affect.
 
-        It agrees with this form to 1e-12 of the torque. A law without a compiled form is its own: one from outside the
-        package, a subclass, whose torque may be another, or a network with an activation of the user's.
+        The torques agree to a relative 1e-12. A law without a compiled form returns itself: a law from outside the
+        package, a subclass, which may compute another torque, or a network with a user-defined activation.
         """
         return self
 
 
 class MemorylessController(Controller):
-    """A law whose torque depends on the present state and reference alone."""
+    """A law whose torque depends only on the present state and reference."""
 
     @abstractmethod
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """Torque τ [N·m] for the state (q, v) and the reference (q_ref, v_ref, a_ref), all of shape (..., nv)."""
 
     def initial_memory(self, q: Vectors) -> None:
-        """None: nothing is remembered."""
+        """None: the law has no memory."""
         return None
 
     def step(self, memory: None, q: Vectors, v: Vectors, reference: Reference, period: float) -> tuple[Vectors, None]:
-        """`torque` at the present state; memory and period are not used."""
+        """`torque` at the present state; memory and period are unused."""
         return self.torque(q, v, reference.q, reference.v, reference.a), None

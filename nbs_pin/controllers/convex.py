@@ -12,7 +12,7 @@ from nbs_pin.controllers.activations import Activation
 
 
 class ConvexLayer(NamedTuple):
-    """One layer y ← σ(Wy y + Wx x + b) with Wy ≥ 0 elementwise; the first layer has no Wy, a layer may have no b."""
+    """One layer y ← σ(Wy y + Wx x + b) with Wy ≥ 0 elementwise; no Wy in the first layer, b optional."""
 
     wy: Array | None
     wx: Array
@@ -23,8 +23,8 @@ class ConvexLayer(NamedTuple):
 class FICNN(nn.Module):
     """f(x): ℝⁿ → ℝ, convex for every parameter value (paper eq. (6), Amos et al. 2017).
 
-    Layers y_{i+1} = σ(nonnegative(Wy_i) y_i + Wx_i x + b_i), y_0 = 0, the scalar output included. `nonnegative` maps
-    free parameters to weights ≥ 0, which together with a convex, non-decreasing σ makes f convex.
+    Every layer, the scalar output included, is y_{i+1} = σ(nonnegative(Wy_i) y_i + Wx_i x + b_i) with y_0 = 0.
+    `nonnegative` maps free parameters to weights ≥ 0; with a convex, non-decreasing σ, f is then convex.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class FICNN(nn.Module):
             self.register_parameter(f"b{i}", _free(size) if biases else None)
 
     def layers(self, *, numpy: bool) -> tuple[ConvexLayer, ...]:
-        """The layers' effective weights: tensors, differentiable in the parameters, or numpy arrays."""
+        """Effective weights of the layers, as numpy arrays or as tensors differentiable in the parameters."""
         named = {k: p.numpy(force=True) if numpy and p is not None else p for k, p in self._parameters.items()}
         return tuple(
             ConvexLayer(self._nonnegative(named[f"wy{i}"]) if i else None, named[f"wx{i}"], named[f"b{i}"])
@@ -55,7 +55,7 @@ class FICNN(nn.Module):
         )
 
     def terms(self, x: Vectors, dx: Vectors) -> tuple[Scalars, Vectors, Vectors]:
-        """f(x), ∇f(x) and ∇²f(x) dx, in the kind of x; no Hessian matrix is formed."""
+        """f(x), ∇f(x) and ∇²f(x) dx with the array type of x; no Hessian is formed."""
         return convex_terms(self.layers(numpy=not is_torch_array(x)), self.activation, x, dx)
 
 
@@ -87,7 +87,7 @@ def convex_terms(
 
 
 def rectified(weight: Array) -> Array:
-    """max(weight, 0), the paper's way to weights ≥ 0."""
+    """max(weight, 0), the paper's map to weights ≥ 0."""
     return 0.5 * (weight + abs(weight))
 
 

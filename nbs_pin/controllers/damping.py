@@ -21,7 +21,7 @@ from nbs_pin.controllers.gain import Gain
 from nbs_pin.kernels.layout import Packed, pack_damping
 
 DAMPINGS = ("bounded", "paper")
-_CELLS = 400  # intervals that [−radius, radius] is cut into
+_CELLS = 400  # subintervals of [−radius, radius]
 
 
 def _stored(t: Tensors) -> Mapping[str, Any]:
@@ -34,16 +34,21 @@ def _stored(t: Tensors) -> Mapping[str, Any]:
 @known_code
 @storable(("form", "m"), arrays=_stored)
 class Damping(nn.Module):
-    """D(z) = D₀ + R T(Rz)ᵀT(Rz) R [N·m·s/rad], T lower triangular from two tanh networks (docs/theory.md §4).
+    """D(z) = D₀ + R T(Rz)ᵀT(Rz) R [N·m·s/rad], with T lower triangular from two tanh networks (docs/theory.md §4).
 
-    form "bounded": D ⪰ D₀ for every parameter value.
-    form "paper": D = TᵀT with diagonal relu(·) + m, and no D₀. Positive definite, but not ⪰ m²I: T = [[1, 0], [1, 1]]
-    has m = 1 and λ_min(TᵀT) = 0.382.
+    Args:
+        nv: Number of joints.
+        form: "bounded" has D ⪰ D₀ for every parameter value; "paper" has no D₀ and diagonal relu(·) + m in T, hence
+            D ≻ 0 but not D ⪰ m²I: T = [[1, 0], [1, 1]] has m = 1 and λ_min(TᵀT) = 0.382.
+        floor: D₀ (n, n), symmetric positive definite, for "bounded" only.
+        m: Smallest diagonal entry of T, for "paper" only.
+        widths: Hidden layer sizes of both networks.
+        scale: Diagonal of R, (n,); None is 1.
+        gain: Initial weights are drawn from U(−gain, gain).
+        least_share: Training keeps D₀ at or above this share of its initial value (`Gain`).
 
-    floor: D₀ (n, n) symmetric positive definite, for "bounded" only, a `Gain` which training may change but never below
-    least_share of it. m: for "paper" only. scale: R, a diagonal scale (n,).
-    Raises ArgumentError for an unknown form, a floor that is missing, superfluous or not positive definite, a share
-    outside [0, 1), or m ≤ 0.
+    Raises:
+        ArgumentError: For an unknown form, a number out of range, or a floor that is missing or superfluous.
     """
 
     floor: Gain | None
@@ -66,9 +71,7 @@ class Damping(nn.Module):
         if form not in DAMPINGS:
             raise ArgumentError(f"damping '{form}' is unknown; choose one of {', '.join(DAMPINGS)}.")
         if (form == "bounded") != (floor is not None):
-            raise ArgumentError(
-                f"damping '{form}' was given the floor D₀ = {floor}; 'bounded' needs one, 'paper' has none."
-            )
+            raise ArgumentError(f"damping '{form}' was given floor {floor}; 'bounded' needs one, 'paper' has none.")
         if not m > 0.0:
             raise ArgumentError(f"m is {m}; give a positive number, the smallest diagonal entry of T.")
         self.form, self.m = form, m
@@ -88,7 +91,7 @@ class Damping(nn.Module):
         return len(self.scale)
 
     def factor(self, x: Vectors) -> Matrices:
-        """T at the scaled error x = Rz, lower triangular."""
+        """T at the scaled velocity error x = Rz, lower triangular."""
         xp = array_namespace(x)
         diagonal = self.diagonal.output(x)
         if self.form == "paper":
@@ -113,20 +116,17 @@ class Damping(nn.Module):
 
     @property
     def is_packable(self) -> bool:
-        """Whether all parts are the ones the kernels know, and not those of a subclass."""
+        """Whether the kernels implement all parts; False for a subclass."""
         return all(map(is_known, (self, self.diagonal, self.lower)))
 
     def packed(self, *, numpy: bool = True) -> Packed:
-        """The weights as the compiled form of `force` takes them (`kernels/damping.py`).
-
-        numpy: True gives an array, False a tensor of the same numbers, differentiable in the parameters.
-        """
+        """Weights for the kernel of `force` (`kernels/damping.py`), as an array or a differentiable tensor."""
         networks = self.diagonal.layers(numpy=numpy), self.lower.layers(numpy=numpy)
         d0, r = self._constants(numpy=numpy)
         return pack_damping(networks, self.form, self.m, r, d0)
 
     def excess(self, radius: float) -> Interval:
-        """Where T(z)² lies for |z| ≤ radius [rad/s], for one joint [N·m·s/rad]: tanh is monotone on small cells."""
+        """Bounds of T(z)² for |z| ≤ radius [rad/s], for one joint [N·m·s/rad], by interval arithmetic."""
         scale = float(self.scale[0])
         x = Interval.cells(scale * radius, _CELLS)
         layers = self.diagonal.layers(numpy=True)
@@ -143,7 +143,7 @@ class Damping(nn.Module):
 
 @known_code
 class _FCNN(nn.Module):
-    """Tanh hidden layers, linear output; starts like the authors', U(−gain, gain) and no bias (docs/theory.md §8)."""
+    """Tanh hidden layers, linear output; initial weights U(−gain, gain), zero biases, as in docs/theory.md §8."""
 
     def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int, gain: float) -> None:
         super().__init__()

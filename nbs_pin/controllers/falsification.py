@@ -1,4 +1,4 @@
-"""Attempts to catch a controller's parts in a breach of what their structure promises, on seeded samples."""
+"""Seeded sampling tests that try to falsify the properties on which the stability proof of a controller rests."""
 
 import numpy as np
 from jaxtyping import Float
@@ -14,30 +14,30 @@ _STATES = 48
 _SIZES = (0.03, 0.3, 3.0)
 _TOLERANCE = 1e-6
 SAMPLES = _STATES * len(_SIZES)
-"""Errors or velocities that a potential or a damping is tried at."""
+"""Number of errors or velocities at which a potential or a damping is tested."""
 
 
 def falsify_activation(activation: Activation) -> None:
-    """Raises CertificateRefused with a witness unless σ, σ', σ'' look like those of a convex, non-decreasing σ."""
+    """Raises CertificateRefused with a counterexample unless σ, σ', σ'' fit a convex, non-decreasing σ."""
     name, tail = type(activation).__name__, np.geomspace(1e-9, 1e2, 400)
     x = np.unique(np.concatenate([-tail, np.linspace(-4.0, 4.0, 1601), tail]))
-    value, slope, bend = (np.asarray(part, dtype=float) for part in activation.derivatives(x))
-    if not (np.isfinite(value).all() and np.isfinite(slope).all() and np.isfinite(bend).all()):
+    value, slope, curvature = (np.asarray(part, dtype=float) for part in activation.derivatives(x))
+    if not (np.isfinite(value).all() and np.isfinite(slope).all() and np.isfinite(curvature).all()):
         refuse(f"the activation {name} is not finite within ±100", "give a finite σ, σ' and σ''")
     along = slope * (x[:, None] - x)
-    gap = value[:, None] - value - along  # of σ(y), row y, over its tangent at x, column x
+    gap = value[:, None] - value - along  # σ(y), row y, minus its tangent at x, column x
     rounding = 1e-9 * (np.abs(value[:, None]) + np.abs(value) + np.abs(along))
-    falls = slope < -1e-12 * np.abs(slope).max()
-    bent = (gap < -rounding).any(axis=0) | (bend < -1e-12 * np.abs(bend).max())
-    for bad, fault in ((falls, "decreases"), (bent, "is not convex, or σ' not its slope,")):
+    decreasing = slope < -1e-12 * np.abs(slope).max()
+    nonconvex = (gap < -rounding).any(axis=0) | (curvature < -1e-12 * np.abs(curvature).max())
+    for bad, fault in ((decreasing, "decreases"), (nonconvex, "is not convex, or σ' is not its derivative,")):
         if bad.any():
             at = x[int(bad.argmax())]
             refuse(f"the activation {name} {fault} at x = {at:.3g}", "give a convex, non-decreasing σ")
-    _falsify_bend(activation, x)
+    _falsify_curvature(activation, x)
 
 
-def _falsify_bend(activation: Activation, x: Float[np.ndarray, " m"]) -> None:
-    """Raises CertificateRefused where σ'' is not the derivative of σ', looking ever closer at steps that disagree."""
+def _falsify_curvature(activation: Activation, x: Float[np.ndarray, " m"]) -> None:
+    """Raises CertificateRefused where σ'' is not the derivative of σ', bisecting the steps that disagree."""
     a, b = x[:-1], x[1:]
     least = 1e-13 * float(np.abs(activation.derivatives(x[np.abs(x) < 4.0])[1]).max())
     for _ in range(20):
@@ -53,51 +53,51 @@ def _falsify_bend(activation: Activation, x: Float[np.ndarray, " m"]) -> None:
         a, b = np.concatenate([a, middle]), np.concatenate([middle, b])
     refuse(
         f"σ'' of the activation {type(activation).__name__} is not the derivative of σ' near x = {a[0]:.3g}",
-        "give a σ whose slope does not jump, with its derivatives",
+        "give a σ with continuous σ', and its exact derivatives",
     )
 
 
 def falsify_potential(phi: Potential, s: Float[np.ndarray, "n n"], *, exact: bool) -> None:
-    """Raises CertificateRefused with a pair of errors at which Φ is not as convex as S says, or ∇Φ not its gradient.
+    """Raises CertificateRefused with an error z at which Φ is less convex than S states, or ∇Φ is not its gradient.
 
-    Φ(y) ≥ Φ(x) + ∇Φ(x)ᵀ(y − x) + (y − x)ᵀS(y − x). exact: False asks of ∇²Φ dz too whether it is the derivative.
+    Tests Φ(y) ≥ Φ(x) + ∇Φ(x)ᵀ(y − x) + (y − x)ᵀS(y − x) and, unless `exact`, that ∇²Φ dz is the derivative of ∇Φ.
     """
     rng = np.random.default_rng(0)
     x, y = (np.concatenate([size * rng.normal(size=(_STATES, phi.nv)) for size in _SIZES]) for _ in range(2))
     step = y - x
     (at_x, gradient, product), (at_y, _, _) = phi.terms(x, step), phi.terms(y, step)
     if not all(np.isfinite(part).all() for part in (at_x, at_y, gradient, product)):
-        refuse("Φ is not finite within a few radians", "load the last sound checkpoint")
+        refuse("Φ is not finite within a few radians", "load an earlier checkpoint")
     along, least = (gradient * step).sum(-1), (step * matvec(s, step)).sum(-1)
     lack = at_x + along + least - at_y
     bad = lack > _TOLERANCE * (np.abs(at_x) + np.abs(at_y) + np.abs(along) + least)
     if bad.any():
         at = np.round(x[int(bad.argmax())], 3).tolist()
-        refuse(f"Φ is not as convex as its S says, or ∇Φ is not its gradient, at z = {at}", "correct its terms")
+        refuse(f"Φ is less convex than its S states, or ∇Φ is not its gradient, at z = {at}", "correct `terms`")
     if exact:
         return
     h = 1e-6
     rate = (phi.terms(x + h * step, step)[1] - phi.terms(x - h * step, step)[1]) / (2.0 * h)
     off = np.linalg.norm(rate - product, axis=-1) / (np.linalg.norm(rate, axis=-1) + np.linalg.norm(product, axis=-1))
     if np.median(off) > 1e-4:
-        refuse("∇²Φ dz of the potential is not the derivative of ∇Φ", "correct its terms")
+        refuse("∇²Φ dz of the potential is not the derivative of ∇Φ", "correct `terms`")
 
 
 def falsify_damping(damping: Damping, floor: Float[np.ndarray, "n n"]) -> float:
-    """λ_min(D) on sampled z2, small and large; raises CertificateRefused where D ⪰ D₀ fails or its force is no D z2."""
+    """λ_min(D) over sampled z2; raises CertificateRefused if D ⪰ D₀ fails or the force differs from D z2."""
     rng = np.random.default_rng(1)
     z = np.concatenate([size * rng.normal(size=(_STATES, damping.nv)) for size in _SIZES])
     d, force = damping.matrix(z), damping.force(z)
     if not (np.isfinite(d).all() and np.isfinite(force).all()):
-        refuse("D is not finite at velocities of a few rad/s", "load the last sound checkpoint")
+        refuse("D is not finite at velocities of a few rad/s", "load an earlier checkpoint")
     size = np.abs(d).max(axis=(-2, -1))
     least = np.linalg.eigvalsh(d - floor)[:, 0]
     off = np.abs(matvec(d, z) - force).max(axis=-1) > 1e-9 * size * np.abs(z).sum(axis=-1)
     bad = (least < -1e-10 * size) | off | (np.abs(d - d.mT).max(axis=(-2, -1)) > 1e-10 * size)
     if bad.any():
         at = np.round(z[int(bad.argmax())], 3).tolist()
-        refuse(f"D is not symmetric with D ⪰ D₀, or its force is not D z2, at z2 = {at}", "correct the damping")
+        refuse(f"D is not symmetric with D ⪰ D₀, or its force is not D z2, at z2 = {at}", "correct `matrix` or `force`")
     if foreign_code(damping) or damping.floor is not None:
         return float(np.linalg.eigvalsh(d)[:, 0].min())
-    r = damping.scale.numpy(force=True)  # of TᵀT by T itself, which knows twice as many digits of small eigenvalues
+    r = damping.scale.numpy(force=True)  # λ_min(TᵀT) = σ_min(T)², which keeps twice as many digits
     return float(np.linalg.svd(damping.factor(r * z) * r, compute_uv=False)[:, -1].min()) ** 2

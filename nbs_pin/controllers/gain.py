@@ -1,4 +1,4 @@
-"""Gains that training may change, but never below a share of where they began."""
+"""Trainable gains that stay at or above a share of their initial value."""
 
 import torch
 from jaxtyping import Float
@@ -14,12 +14,17 @@ from nbs_pin.base.tensors import positive_definite, positive_scale
 class Gain(nn.Module):
     """G(s) = φG₀ + (1 − φ) E G₀ E with E = diag(eˢ): a positive vector (n,) or a positive definite matrix (n, n).
 
-    For a vector the product is elementwise, G = φG₀ + (1 − φ) e²ˢG₀. G(0) is G₀ to the last bit, and G(s) ⪰ φG₀ for
-    every s. So bounds of the closed loop that are written with φS₀, φΛ₀ and φD₀ (docs/theory.md §5) hold for every
-    value of the parameters, before, during and after training; those written with the present gains are tighter.
+    For a vector the product is elementwise, G = φG₀ + (1 − φ) e²ˢG₀. G(0) equals G₀ exactly, and G(s) ⪰ φG₀ for every
+    s, the trainable parameter `change` (n,), initially zero. Bounds of the closed loop in terms of φS₀, φΛ₀ and φD₀
+    (docs/theory.md §5) therefore hold throughout training; bounds in terms of the present gains are tighter.
 
-    nominal: G₀. least_share: φ in [0, 1); 0 keeps the gain positive and nothing more. name: what errors call it.
-    Parameter `change`: s, (n,), zero at first. Raises ArgumentError unless G₀ is positive (definite) and φ in [0, 1).
+    Args:
+        nominal: G₀.
+        least_share: φ in [0, 1); 0 only keeps the gain positive.
+        name: Name of the gain in error messages.
+
+    Raises:
+        ArgumentError: If G₀ is not positive (definite), or φ is out of range.
     """
 
     nominal: torch.Tensor
@@ -38,17 +43,17 @@ class Gain(nn.Module):
         self.change = nn.Parameter(torch.zeros(len(checked), dtype=torch.float64))
 
     def value(self, *, numpy: bool) -> Float[Array, " n"] | Float[Array, "n n"]:
-        """G: a numpy array, or a tensor that is differentiable in s."""
+        """G as a numpy array, or as a tensor differentiable in s."""
         parts = self.nominal, self.change, self.least_share
         nominal, s, share = (x.numpy(force=True) for x in parts) if numpy else parts
         e = array_namespace(s).exp(s)
         squares = e * e if nominal.ndim == 1 else e[:, None] * e
-        return nominal * (share + (1.0 - share) * squares)  # at s = 0 the bracket is 1 exactly, for every φ
+        return nominal * (share + (1.0 - share) * squares)  # the bracket is exactly 1 at s = 0
 
     def like(self, x: Array) -> Float[Array, " n"] | Float[Array, "n n"]:
-        """G in the kind of x."""
+        """G with the array type of x."""
         return self.value(numpy=not is_torch_array(x))
 
     def numpy(self) -> Float[Array, " n"] | Float[Array, "n n"]:
-        """G as a numpy array of its own."""
+        """G as a new numpy array."""
         return self.value(numpy=True)

@@ -1,4 +1,4 @@
-"""Gains for an arm that nobody tuned, from its inertia and its effort limits."""
+"""Default gains of an arm from its inertia and effort limits."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -50,10 +50,12 @@ def gains_for_robot(
 ) -> Gains:
     """K = k M_e, D₀ = 2ζ√(K M_e), with √k·h = `stiffness_per_sample` and K_i·`start_error` within the effort limit.
 
-    M_e: `effective_inertia`. bandwidth: ω [rad/s]. period: control period h [s]. √k·h = 0.03 is soft, 0.1 a good
-    default, 0.4 still stable without delay (docs/theory.md §2). damping_ratio: ζ. start_error: the error [rad] up to
-    which the stiffness alone saturates no joint.
-    Raises ArgumentError when ω or h is out of range, or the dynamics is of another number of joints.
+    M_e is `effective_inertia`, `bandwidth` ω [rad/s], `period` the control period h [s], `damping_ratio` ζ, and
+    `start_error` the largest error [rad] at which the stiffness alone saturates no joint. √k·h = 0.03 is soft, 0.1 a
+    good default, 0.4 still stable without delay (docs/theory.md §2).
+
+    Raises:
+        ArgumentError: If ω or h is out of range, or robot and dynamics differ in their number of joints.
     """
     check_sampling(bandwidth, period)
     if dynamics.nv != robot.nv:
@@ -66,10 +68,10 @@ def gains_for_robot(
 def pd_gains(
     robot: Robot, dynamics: DynamicsProvider, *, bandwidth: float, period: float
 ) -> tuple[JointArray, JointArray]:
-    """K_p [N·m/rad], that of `gains_for_robot`, and K_d [N·m·s/rad], critical for the largest inertia each joint moves.
+    """K_p [N·m/rad] of `gains_for_robot` and K_d [N·m·s/rad], critically damped at the largest inertia of each joint.
 
-    K_d stays at or below ½M_e/h, a quarter of what makes a sampled damper on that inertia alone chatter (2M_e/h).
-    Raises ArgumentError when ω or h is out of range.
+    K_d is at most ½M_e/h, a quarter of the gain at which a sampled damper on the inertia M_e chatters (2M_e/h).
+    Raises ArgumentError if ω or h is out of range.
     """
     kp = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period).stiffness
     critical = 2.0 * np.sqrt(kp * largest_inertia(robot, dynamics))
@@ -77,21 +79,18 @@ def pd_gains(
 
 
 def effective_inertia(robot: Robot, dynamics: DynamicsProvider) -> JointArray:
-    """M_e,i = min_q 1/(M(q)⁻¹)_ii [kg·m²] over sampled configurations: the least inertia a torque at joint i moves.
-
-    The other joints are free to give way, which is what a light direction of M feels (docs/theory.md §2).
-    """
+    """M_e,i = min_q 1/(M(q)⁻¹)_ii [kg·m²] over sampled q: the inertia at joint i when the others are free to move."""
     inverse = np.linalg.inv(dynamics.mass_matrix(sample_configurations(robot)))
     return (1.0 / np.diagonal(inverse, axis1=-2, axis2=-1)).min(axis=0)
 
 
 def largest_inertia(robot: Robot, dynamics: DynamicsProvider) -> JointArray:
-    """max_q M_ii(q) [kg·m²] over sampled configurations: the most inertia joint i moves with the others held."""
+    """max_q M_ii(q) [kg·m²] over sampled q: the inertia at joint i when the others are held."""
     return np.diagonal(dynamics.mass_matrix(sample_configurations(robot)), axis1=-2, axis2=-1).max(axis=0)
 
 
 def sample_configurations(robot: Robot, count: int = 1000, seed: int = 0) -> Float[np.ndarray, "count n"]:
-    """Uniform configurations within the position limits, a full turn where there are none [rad]."""
+    """Configurations drawn uniformly from the position limits, or from a full turn if a joint has none [rad]."""
     return np.random.default_rng(seed).uniform(*robot.sampling_range, (count, robot.nv))
 
 
@@ -107,23 +106,23 @@ def check_sampling(bandwidth: float, period: float) -> None:
 
 
 def warn_if_too_fast(robot: Robot, dynamics: DynamicsProvider, bandwidth: float, start_error: float = 0.3) -> None:
-    """Warns when ω asks a joint for several times its effort limit from `start_error` [rad]: ω²M_ii of it alone.
+    """Warns if ω²M_ii·`start_error` [N·m] exceeds six times the effort limit of a joint.
 
-    A law that saturates for long has no proof left, and from about six times the limit some arms no longer converge.
+    No stability proof covers a saturated law, and from about that value some arms no longer converge.
     """
     asked = bandwidth**2 * largest_inertia(robot, dynamics) * start_error / robot.effort_limit
     worst = int(np.argmax(asked))
     if asked[worst] > 6.0:
         warnings.warn(
-            f"a bandwidth of {bandwidth:g} rad/s asks joint '{robot.joint_names[worst]}' of {robot.name} for"
-            f" {asked[worst]:.1f} times its effort limit from an error of {start_error} rad and may not converge from"
-            f" there; take at most {bandwidth * np.sqrt(6.0 / asked[worst]):.3g} rad/s, or start on the reference.",
+            f"at a bandwidth of {bandwidth:g} rad/s joint '{robot.joint_names[worst]}' of {robot.name} needs"
+            f" {asked[worst]:.1f} times its effort limit from an error of {start_error} rad and may not converge; take"
+            f" at most {bandwidth * np.sqrt(6.0 / asked[worst]):.3g} rad/s, or start on the reference.",
             stacklevel=3,
         )
 
 
 def positive_gains(nv: int, **gains: PerJoint) -> tuple[JointArray, ...]:
-    """The gains as float arrays (nv,), a number for all joints broadcast; raises ArgumentError unless positive."""
+    """The gains as float arrays (nv,), single numbers broadcast; raises ArgumentError unless all are positive."""
     arrays = {name: np.asarray(gain, dtype=float) for name, gain in gains.items()}
     for name, gain in arrays.items():
         if gain.shape not in ((), (nv,)) or not (gain > 0.0).all():
@@ -133,32 +132,29 @@ def positive_gains(nv: int, **gains: PerJoint) -> tuple[JointArray, ...]:
 
 @known_code
 class PositiveGains(nn.ModuleDict):
-    """Gains by name, one positive number per joint each; training may make them anything positive (`Gain`, φ = 0).
-
-    Raises ArgumentError unless each is one positive number, or one per joint (nv,).
-    """
+    """Named gains, each one positive number or one per joint (nv,); training keeps them positive (`Gain`, φ = 0)."""
 
     def __init__(self, nv: int, **gains: PerJoint) -> None:
         arrays = zip(gains, positive_gains(nv, **gains), strict=True)
         super().__init__({name: Gain(array, name=name) for name, array in arrays})
 
     def value(self, *, numpy: bool) -> tuple[Float[Array, " n"], ...]:
-        """All gains in the order they were given in: numpy arrays, or tensors differentiable in the parameters."""
+        """All gains in the order given, as numpy arrays or as tensors differentiable in the parameters."""
         return tuple(cast(Gain, gain).value(numpy=numpy) for gain in self.values())
 
     def like(self, x: Array) -> tuple[Float[Array, " n"], ...]:
-        """All gains in the kind of x."""
+        """All gains with the array type of x."""
         return self.value(numpy=not is_torch_array(x))
 
     def numpy(self, name: str) -> JointArray:
-        """The gain of that name."""
+        """The gain of that name as a numpy array."""
         return self.named(name).numpy()
 
     def named(self, name: str) -> Gain:
-        """The gain of that name with what training may change of it."""
+        """The gain of that name with its trainable parameter."""
         return cast(Gain, self[name])
 
 
 def stored_gains(*names: str) -> Callable[[Tensors], Mapping[str, Any]]:
-    """The gains of a law that its tensors hold, when they are its `PositiveGains` (`base/storable.py`)."""
+    """Reader of a law's `PositiveGains` from its stored tensors (`base/storable.py`)."""
     return lambda t: {name: t[f"gains.{name}.nominal"].numpy(force=True) for name in names}

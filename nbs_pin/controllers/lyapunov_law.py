@@ -1,4 +1,4 @@
-"""Laws with a storage function: what certificates, monitors and adversaries read of a controller."""
+"""Laws with a Lyapunov function, in the form that certificates, monitors and attacks use."""
 
 from abc import abstractmethod
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from nbs_pin.controllers.model_law import ModelLaw
 
 
 class Errors(NamedTuple):
-    """The signals of one step of a backstepping or sliding law, each of shape (..., nv) but the value."""
+    """Error signals of a backstepping or sliding law, each (..., nv) except the value."""
 
     z1: Array
     """q ⊖ q_d [rad]."""
@@ -30,7 +30,7 @@ class Errors(NamedTuple):
 
 
 class Lyapunov(NamedTuple):
-    """The constants of V and of its decay as they now stand, and the claims that support them."""
+    """Constants of V and of its decay for the present parameters, and the claims that support them."""
 
     stiffness: Float[np.ndarray, "n n"]
     """S, with Φ(z1) ≥ z1ᵀSz1 and zᵀ∇²Φz ≥ 2zᵀSz [J/rad²]."""
@@ -41,9 +41,9 @@ class Lyapunov(NamedTuple):
     inertial_rate: float
     """ω [1/s]."""
     coupling: float
-    """ζ: 1 for a law that feeds −∇Φ back, 0 for one that does not."""
+    """ζ: 1 if the law feeds back −∇Φ, 0 if it does not."""
     claims: tuple[Claim, ...]
-    """How each of these is known, and everything else that V̇ rests on."""
+    """How each of these is known, and everything else on which V̇ depends."""
 
 
 class LyapunovLaw(ModelLaw):
@@ -51,8 +51,8 @@ class LyapunovLaw(ModelLaw):
 
     V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ(ωM + D(z2))z2 + (1 − ζ)z2ᵀ∇Φ + z2ᵀτ_d.
 
-    A law states here what its Φ, Λ, D, ω and ζ are and how that is known; `certify`, `monitor` and `attack` ask for
-    nothing else. Source: docs/theory.md §2, docs/certificates.md §2.
+    A subclass states its Φ, Λ, D, ω and ζ and how they are known; `certify`, `monitor` and `attack` need nothing else.
+    Source: docs/theory.md §2, docs/certificates.md §2.
     """
 
     inertial_rate: float = 0.0
@@ -66,29 +66,29 @@ class LyapunovLaw(ModelLaw):
 
     @abstractmethod
     def damping_force(self, z2: Array) -> Vectors:
-        """D(z2)z2 [N·m], without the part ωM z2."""
+        """D(z2)z2 [N·m], without ωM z2."""
 
     @abstractmethod
     def damping_matrix(self, z2: Array) -> Matrices:
-        """D(z2) [N·m·s/rad], without the part ωM."""
+        """D(z2) [N·m·s/rad], without ωM."""
 
     @abstractmethod
     def rate_like(self, x: Array) -> Float[Array, " n"]:
-        """The diagonal of Λ [rad/s per N·m] in the kind of x."""
+        """The diagonal of Λ [rad/s per N·m] with the array type of x."""
 
     @abstractmethod
     def lyapunov(self) -> Lyapunov:
-        """S, Λ, D₀, ω, ζ read from the numbers as they now stand, with a claim for each.
+        """S, Λ, D₀, ω and ζ of the present parameters, with a claim for each.
 
         Raises:
-            CertificateRefused: Where the numbers give the proof no ground.
+            CertificateRefused: If the parameters violate an assumption of the proof.
         """
 
     def errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
         """The signals z1, z2, v_r, a_r, ∇Φ and Φ for the state (q, v) and the reference, all of shape (..., nv).
 
         Raises:
-            ArgumentError: When shapes or array kinds do not fit.
+            ArgumentError: If shapes or array types do not match.
         """
         return self._errors(*as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref))
 
@@ -99,7 +99,7 @@ class LyapunovLaw(ModelLaw):
         return e.value + 0.5 * _dot(e.z2, matvec(self.dynamics.mass_matrix(q), e.z2))
 
     def dissipation(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Scalars:
-        """The rate at which V falls without disturbance and friction [W]: the sum of `losses`."""
+        """−V̇ without disturbance and friction [W]: the sum of `losses`."""
         q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
         in_potential, in_damping = self.losses(q, self._errors(q, v, q_ref, v_ref, 0.0 * v_ref))
         return in_potential + in_damping
@@ -111,11 +111,11 @@ class LyapunovLaw(ModelLaw):
         return _dot(e.gradient, self.rate_like(e.gradient) * e.gradient), _dot(e.z2, force)
 
     def extra_stiffness(self, radius: float) -> Interval:
-        """Of one joint: where Φ'' − 2S lies for |z1| ≤ radius [rad] [N·m/rad]; ≥ 0 unless more is known."""
+        """For one joint: bounds of Φ'' − 2S [N·m/rad] for |z1| ≤ radius [rad]; [0, ∞) unless overridden."""
         return Interval(np.float64(0.0), np.float64(np.inf))
 
     def extra_damping(self, radius: float) -> Interval:
-        """Of one joint: where D − D₀ lies for |z2| ≤ radius [rad/s] [N·m·s/rad]; ≥ 0 unless more is known."""
+        """For one joint: bounds of D − D₀ [N·m·s/rad] for |z2| ≤ radius [rad/s]; [0, ∞) unless overridden."""
         return Interval(np.float64(0.0), np.float64(np.inf))
 
     def _errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:

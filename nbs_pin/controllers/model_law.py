@@ -1,4 +1,4 @@
-"""What every law with a model of the arm is: a belief, friction to feed forward, parameters and a compiled form."""
+"""Base of all laws with a model of the arm: model, friction feed-forward, parameters and compiled form."""
 
 from typing import Any
 
@@ -16,8 +16,12 @@ from nbs_pin.kernels.layout import Packed, pack_law
 class ModelLaw(MemorylessController, nn.Module):
     """τ = M(q) a_r + C(q, v) v_r + G(q) + feedback + friction; its gains and networks are torch parameters.
 
-    dynamics: what the law believes of the arm. friction: fed forward at the velocity the law names, or None.
-    Raises ArgumentError when the friction is for another number of joints.
+    Args:
+        dynamics: Model of the arm that the law uses.
+        friction: Joint friction fed forward at a velocity that the subclass states, or None.
+
+    Raises:
+        ArgumentError: If friction is for another number of joints.
     """
 
     def __init__(self, dynamics: DynamicsProvider, friction: JointFriction | None) -> None:
@@ -31,7 +35,7 @@ class ModelLaw(MemorylessController, nn.Module):
 
     @property
     def packable(self) -> bool:
-        """Whether law, error and friction are the ones the kernels know, and not those of a subclass."""
+        """Whether the kernels implement the law, its error and its friction; False for a subclass."""
         wraps = type(self.dynamics).difference is DynamicsProvider.difference
         return wraps and is_known(self) and (self.friction is None or is_known(self.friction)) and self._has_kernel
 
@@ -45,7 +49,7 @@ class ModelLaw(MemorylessController, nn.Module):
 
     @property
     def _has_kernel(self) -> bool:
-        """Whether the law and its parts have a kernel; a law that says nothing runs as it is written."""
+        """Whether the law and its parts have a kernel; False unless a subclass overrides it."""
         return False
 
     def _packed(self, numpy: bool) -> Packed:
@@ -53,7 +57,7 @@ class ModelLaw(MemorylessController, nn.Module):
         raise NotImplementedError
 
     def _pack(self, law: int, gains: tuple[Array, Array], **parts: Any) -> Packed:
-        """The law of that code (`kernels/layout.py`) with its gains; parts: those of `layout.pack_law`."""
+        """The law with this code (`kernels/layout.py`) and these gains; parts: those of `layout.pack_law`."""
         continuous = None if self.dynamics.robot is None else self.dynamics.robot.continuous
         f = self.friction
         return pack_law(law, gains, continuous, None if f is None else (f.viscous, f.coulomb, f.transition), **parts)

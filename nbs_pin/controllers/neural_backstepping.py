@@ -43,14 +43,20 @@ def _stored(t: Tensors) -> Mapping[str, Any]:
 class NeuralBackstepping(LyapunovLaw):
     """τ = M(φ̇ − ωz2) + C(q, v)φ + G − ∇Φ(z1) − D(z2)z2 with φ = v_d − Λ∇Φ(z1), z1 = q ⊖ q_d, z2 = v − φ.
 
-    With V = Φ + ½z2ᵀM z2:  V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ(ωM + D)z2 + z2ᵀτ_d for every weight of Φ and D (docs/theory.md §2).
-    Λ = I, ω = 0 with the `paper` networks is the paper's law (its eq. (9)); the paper's Λ = I has the wrong units.
+    With V = Φ + ½z2ᵀM z2:  V̇ = −∇ΦᵀΛ∇Φ − z2ᵀ(ωM + D)z2 + z2ᵀτ_d for all weights of Φ and D (docs/theory.md §2).
+    `paper_controller` gives the paper's law, its eq. (9), with Λ = I, which has the wrong units, and ω = 0.
 
-    dynamics: what the law believes of the arm. potential: Φ. damping: D without its ωM part.
-    rate: Λ [rad/s per N·m], (nv,), positive, diagonal; a `Gain`, which training may change but never below least_share
-    of it. inertial_rate: ω ≥ 0 [1/s].
-    friction: joint friction to feed forward at φ, or None; it is monotone in v, so it only adds dissipation.
-    Raises ArgumentError when sizes disagree or Λ, ω are out of range.
+    Args:
+        dynamics: Model of the arm that the law uses.
+        potential: Φ.
+        damping: D, without its ωM part.
+        rate: Diagonal of Λ [rad/s per N·m], (nv,), positive; None is 1.
+        inertial_rate: ω ≥ 0 [1/s].
+        friction: Joint friction fed forward at φ, or None; monotone in v, it only adds dissipation.
+        least_share: Training keeps Λ at or above this share of its initial value (`Gain`).
+
+    Raises:
+        ArgumentError: If the numbers of joints differ, or Λ or ω is out of range.
     """
 
     def __init__(
@@ -91,15 +97,28 @@ class NeuralBackstepping(LyapunovLaw):
         least_share: float = 0.5,
         seed: int = 0,
     ) -> "NeuralBackstepping":
-        """A controller for an arm that nobody tuned, from its inertia, effort limits and control period.
+        """A controller with gains from the arm's inertia, effort limits and control period, without tuning.
 
-        bandwidth: ω [rad/s], the rate at which errors decay; warns when it is too fast for the effort limits.
-        period: control period h [s].
-        potential: "smooth" or "paper". damping: "inertial" (ωM + D₀ + TᵀT), "bounded" (D₀ + TᵀT) or "paper" (TᵀT).
-        dynamics: None takes Pinocchio's model of `robot`. gains: None computes them (`gains_for_robot`).
-        least_share: what training leaves at least of S, Λ and D₀ (`Gain`).
-        The paper's networks with S = I, Λ = I are built by hand: see `paper_controller`.
-        Raises ArgumentError for unknown names or numbers out of range.
+        Args:
+            robot: The arm.
+            dynamics: Model of the arm that the law uses; None takes Pinocchio's.
+            bandwidth: ω [rad/s], the rate at which errors decay; warns if it is too fast for the effort limits.
+            period: Control period h [s].
+            potential: "smooth" or "paper".
+            damping: "inertial" (ωM + D₀ + TᵀT), "bounded" (D₀ + TᵀT) or "paper" (TᵀT).
+            friction: Joint friction to feed forward, or None.
+            gains: K, Λ and D₀; None computes them (`gains_for_robot`).
+            least_share: Training keeps S, Λ and D₀ at or above this share of their initial values (`Gain`).
+            seed: Seed of the initial network weights.
+
+        Raises:
+            ArgumentError: For an unknown name or a number out of range.
+
+        Example:
+            >>> import nbs_pin as nbs
+            >>> law = nbs.NeuralBackstepping.for_robot(nbs.load_robot("panda"), bandwidth=8.0, period=0.001)
+            >>> law.nv, law.inertial_rate
+            (7, 8.0)
         """
         if damping not in DAMPINGS:
             raise ArgumentError(f"damping '{damping}' is unknown; choose one of {', '.join(DAMPINGS)}.")
@@ -117,9 +136,16 @@ class NeuralBackstepping(LyapunovLaw):
         return cls(dynamics, phi, d, rate=chosen.rate, inertial_rate=omega, friction=friction, least_share=least_share)
 
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
-        """τ [N·m]; the ωM part of the damping joins the reference acceleration and costs nothing.
+        """τ [N·m]; arguments (..., nv), numpy arrays or torch tensors (differentiable).
 
-        Raises ArgumentError when shapes or array kinds do not fit.
+        Raises:
+            ArgumentError: If shapes or array types do not match.
+
+        Example:
+            >>> import nbs_pin as nbs
+            >>> law, zero = nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link")), [0.0, 0.0]
+            >>> law.torque(zero, zero, [0.1, 0.1], zero, zero).round(1)
+            array([141.9,  79.6])
         """
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         e = self._errors(q, v, q_ref, v_ref, a_ref)
@@ -128,7 +154,7 @@ class NeuralBackstepping(LyapunovLaw):
         return tau if self.friction is None else tau + self.friction.torque(e.v_r)
 
     def potential_terms(self, z1: Array, dz: Array) -> tuple[Array, Array, Array]:
-        """Φ, ∇Φ and ∇²Φ dz of the potential network."""
+        """Φ(z1) [J], ∇Φ(z1) [N·m] and ∇²Φ(z1) dz of the potential network."""
         return self.potential.terms(z1, dz)
 
     def damping_force(self, z2: Array) -> Vectors:
@@ -140,19 +166,19 @@ class NeuralBackstepping(LyapunovLaw):
         return self.damping.matrix(z2)
 
     def rate_like(self, x: Array) -> Float[Array, " n"]:
-        """Λ [rad/s per N·m] in the kind of x."""
+        """The diagonal of Λ [rad/s per N·m] with the array type of x."""
         return self.rate.like(x)
 
     def extra_stiffness(self, radius: float) -> Interval:
-        """ψ'' of an arm of one joint [N·m/rad]."""
+        """Bounds of ψ'' for one joint [N·m/rad]."""
         return self.potential.curvature(radius)
 
     def extra_damping(self, radius: float) -> Interval:
-        """T² of an arm of one joint [N·m·s/rad]."""
+        """Bounds of T² for one joint [N·m·s/rad]."""
         return super().extra_damping(radius) if self.damping.floor is None else self.damping.excess(radius)
 
     def lyapunov(self) -> Lyapunov:
-        """S, Λ, D₀ and ω, with a claim for ψ, Φ, D, Λ, ω and the friction that is fed forward."""
+        """S, Λ, D₀ and ω, with claims for ψ, Φ, D, Λ, ω and the friction feed-forward."""
         phi, d, n = self.potential, self.damping, self.nv
         for name, part, kind in (("Φ", phi, Potential), ("D", d, Damping), ("Λ", self.rate, Gain)):
             check_kind(name, part, kind)
@@ -160,12 +186,8 @@ class NeuralBackstepping(LyapunovLaw):
         check_kind("D₀", d.floor, Gain | None)
         check_parts(n, {"Φ": phi.nv, "D": d.nv, "Λ": len(self.rate.nominal)}, self.friction)
         damping = damping_claims(d)
-        claims = (
-            *potential_claims(phi, self.rate),
-            *damping,
-            *rate_claims(self.rate, self.inertial_rate, n),
-            *friction_claims(self.friction),
-        )
+        claims = (*potential_claims(phi, self.rate), *damping, *rate_claims(self.rate, self.inertial_rate, n))
+        claims += friction_claims(self.friction)
         floor = damping[0].value * np.eye(n) if d.floor is None else np.asarray(d.floor.numpy())
         stiffness, rate = np.asarray(phi.stiffness.numpy()), np.asarray(self.rate.numpy())
         return Lyapunov(stiffness, rate, floor, float(self.inertial_rate), self.coupling, claims)
@@ -176,17 +198,12 @@ class NeuralBackstepping(LyapunovLaw):
 
     def _packed(self, numpy: bool) -> Packed:
         rate = self.rate.value(numpy=numpy)
-        return self._pack(
-            LawCode.BACKSTEPPING,
-            (rate, 0.0 * rate),
-            inertial_rate=self.inertial_rate,
-            potential=self.potential.packed(numpy=numpy),
-            damping=self.damping.packed(numpy=numpy),
-        )
+        parts = {"potential": self.potential.packed(numpy=numpy), "damping": self.damping.packed(numpy=numpy)}
+        return self._pack(LawCode.BACKSTEPPING, (rate, 0.0 * rate), inertial_rate=self.inertial_rate, **parts)
 
 
 def paper_controller(dynamics: DynamicsProvider, *, m: float = 0.001, seed: int = 0) -> NeuralBackstepping:
-    """The paper's controller as its section V-A sets it up: S = I, Λ = I, ψ three 32-wide layers, D = TᵀT.
+    """The paper's controller as set up in its section V-A: S = I, Λ = I, three layers of 32 in ψ, D = TᵀT.
 
     Source: paper eqs. (9), (10); initial weights U(−0.1, 0.2) and U(−0.2, 0.2) as in docs/theory.md §8.
     """
@@ -197,7 +214,7 @@ def paper_controller(dynamics: DynamicsProvider, *, m: float = 0.001, seed: int 
 def paper_controller_for(
     robot: Robot, *, bandwidth: float = 8.0, period: float = 0.001, friction: JointFriction | None = None, seed: int = 0
 ) -> NeuralBackstepping:
-    """`paper_controller` on the bundled two_link, the paper's networks with this arm's own gains on every other."""
+    """`paper_controller` for the bundled two_link; for any other arm the paper's networks with `gains_for_robot`."""
     if robot.source == "two_link":
         return paper_controller(PinocchioDynamics(robot), seed=seed)
     return NeuralBackstepping.for_robot(

@@ -1,7 +1,7 @@
-"""What the parts of a Lyapunov law claim, read from the numbers as they now stand, whoever built or edited them.
+"""Claims for the parts of a Lyapunov law, read from their present parameters, however they were set.
 
-Constructors are not trusted. What is known code is PROVED by its structure; a part of another class, or with a method
-replaced, is EMPIRICAL, on sampled errors. Numbers that give the proof no ground raise CertificateRefused.
+Known code is PROVED by its structure; a part of another class, or with a replaced method, is EMPIRICAL, tested on
+sampled errors. Parameters that violate an assumption of the proof raise CertificateRefused.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ DAMPING = "D ⪰ D₀, least eigenvalue"
 
 
 def potential_claims(phi: Potential, rate: Gain) -> tuple[Claim, ...]:
-    """ψ convex, ψ(0) = 0, μ and ρ of Φ = zᵀSz + ψ and the rate Λ."""
+    """Claims: ψ convex, ψ(0) = 0, and μ and ρ of Φ = zᵀSz + ψ with the rate Λ."""
     n = phi.nv
     if phi.form not in POTENTIALS:
         refuse(f"the potential has the form {phi.form!r}", f"choose one of {', '.join(POTENTIALS)}")
@@ -47,7 +47,7 @@ def potential_claims(phi: Potential, rate: Gain) -> tuple[Claim, ...]:
 
 
 def damping_claims(damping: Damping) -> tuple[Claim, ...]:
-    """D ⪰ D₀, or what is known of D = TᵀT without a floor."""
+    """Claims: D ⪰ D₀, or lower bounds on D = TᵀT without a floor."""
     if damping.form not in DAMPINGS:
         refuse(f"the damping has the form {damping.form!r}", f"choose one of {', '.join(DAMPINGS)}")
     _scale("D", damping.scale.numpy(force=True))
@@ -63,16 +63,16 @@ def damping_claims(damping: Damping) -> tuple[Claim, ...]:
     measured = falsify_damping(damping, np.zeros((n, n)))
     if not measured > 0.0:
         refuse("D = TᵀT is singular at a sampled velocity", "take damping 'bounded', which has a floor")
-    said = f"D = TᵀT has no floor, and m² is none: least on {SAMPLES} sampled velocities"
+    said = f"D = TᵀT has no floor, and m² does not bound it: smallest on {SAMPLES} sampled velocities"
     claims = [Claim(DAMPING, measured, "N·m·s/rad", Label.EMPIRICAL, said)]
     if not why:
-        because = "true for every z2 as tanh is bounded, seldom large enough to be of use (docs/theory.md §5)"
+        because = "holds for every z2 as tanh is bounded, but is seldom large enough to be useful (docs/theory.md §5)"
         claims.append(Claim("TᵀT, least eigenvalue", _product_floor(damping), "N·m·s/rad", Label.PROVED, because))
     return tuple(claims)
 
 
 def rate_claims(rate: Gain, inertial_rate: Any, nv: int) -> tuple[Claim, ...]:
-    """The least entry of Λ, and ω."""
+    """Claims: the least entry of Λ, and ω."""
     lam, odd = positive_gain("the rate Λ", rate, nv, 1)
     if not isinstance(inertial_rate, float | int) or not 0.0 <= inertial_rate < np.inf:
         refuse(f"the inertial rate ω is {inertial_rate}", "give a finite number ≥ 0")
@@ -83,7 +83,7 @@ def rate_claims(rate: Gain, inertial_rate: Any, nv: int) -> tuple[Claim, ...]:
 
 
 def friction_claims(friction: JointFriction | None) -> tuple[Claim, ...]:
-    """None without friction; raises CertificateRefused for friction that falls with velocity."""
+    """Claim about the friction, if any; raises CertificateRefused for friction that falls with velocity."""
     if friction is None:
         return ()
     constants = np.concatenate([friction.viscous, friction.coulomb, [friction.transition]])
@@ -98,7 +98,7 @@ def friction_claims(friction: JointFriction | None) -> tuple[Claim, ...]:
 
 
 def check_parts(dynamics_nv: int, sizes: dict[str, int], friction: JointFriction | None) -> None:
-    """Raises CertificateRefused when parts are for different numbers of joints."""
+    """Raises CertificateRefused if the parts are for different numbers of joints."""
     if friction is not None:
         sizes = sizes | {"friction": friction.viscous.size}
     wrong = [f"{name} is for {size}" for name, size in sizes.items() if size != dynamics_nv]
@@ -107,13 +107,13 @@ def check_parts(dynamics_nv: int, sizes: dict[str, int], friction: JointFriction
 
 
 def check_kind(name: str, part: Any, kind: Any) -> None:
-    """Raises CertificateRefused for a part that is no such part at all."""
+    """Raises CertificateRefused if the part is not an instance of `kind`."""
     if not isinstance(part, kind):
-        refuse(f"{name} of the controller is a {type(part).__name__}", "give what its constructor makes of it")
+        refuse(f"{name} of the controller is a {type(part).__name__}", "keep the part that the constructor made")
 
 
 def positive_gain(name: str, gain: Gain, n: int, axes: int) -> tuple[Float[np.ndarray, "..."], str]:
-    """The gain as it stands and why its code may not be the package's; raises CertificateRefused unless positive."""
+    """The gain and why its code is not known, empty if it is; raises CertificateRefused unless it is positive."""
     share, value = float(gain.least_share), gain.numpy()
     if not 0.0 <= share < 1.0:
         refuse(f"{name} has a least share of {share:g}, outside [0, 1)", "build the controller again")
@@ -133,7 +133,7 @@ def _scale(name: str, scale: JointArray) -> None:
 
 
 def _convexity(phi: Potential, odd_gain: str) -> tuple[Known, float]:
-    """How ψ is known to be convex, and its least effective weight; raises CertificateRefused where it is not."""
+    """How ψ is known to be convex, and its least effective weight; raises CertificateRefused if it may not be."""
     network: Any = phi.network
     why = odd_gain or foreign_code(phi) or foreign_code(network)
     if foreign_code(network):
@@ -145,7 +145,7 @@ def _convexity(phi: Potential, odd_gain: str) -> tuple[Known, float]:
         if weights and not min(weights) >= 0.0:
             refuse(f"ψ has the effective weight {min(weights):.3g} in W^(y), so it need not be convex", "keep them ≥ 0")
         if len(layers[-1].wx) != 1 or layers[0].wx.shape[1] != phi.nv:
-            refuse("the network of ψ is no scalar function of the error", f"give one of {phi.nv} inputs and one output")
+            refuse("the network of ψ has other inputs or outputs", f"give one with {phi.nv} inputs and one output")
         least = min(weights, default=0.0)
     activation = _activation(network.activation)
     return known(why or activation, "weights W^(y) ≥ 0, σ convex and non-decreasing; value: the least of W^(y)"), least
@@ -156,26 +156,26 @@ def _array(x: Array) -> Float[np.ndarray, "*shape"]:
 
 
 def _activation(activation: Activation) -> str:
-    """Why σ is not known to be convex and non-decreasing, empty if it is; raises CertificateRefused if it is not."""
+    """Why σ is not proved convex and non-decreasing, empty if it is; raises CertificateRefused if tests refute it."""
     if not foreign_code(activation):
         width = next(iter(vars(activation).values()))
         if not 0.0 < width < np.inf:
-            refuse(f"the activation is {activation}", "its width must be positive and finite, or its slope jumps")
+            refuse(f"the activation is {activation}", "its width must be positive and finite")
         return ""
     falsify_activation(activation)
-    return f"{type(activation).__name__} is an activation that is not the package's"
+    return f"the activation {type(activation).__name__} is not from this package"
 
 
 def _zero(phi: Potential, convex: Known) -> Known:
-    """How ψ(0) = 0 and ∇ψ(0) = 0 are known; raises CertificateRefused where they do not hold."""
+    """How ψ(0) = 0 and ∇ψ(0) = 0 are known; raises CertificateRefused if they do not hold."""
     zero = np.zeros(phi.nv)
     value, gradient, _ = phi.terms(zero, zero)
     size, slope, _ = phi.terms(zero + 1.0, zero)
-    # The smooth form subtracts what f(0) and ∇f(0) are, to rounding; the paper's is zero to the last bit.
+    # The smooth form subtracts f(0) and ∇f(0) up to rounding; the paper's form is exactly zero.
     allowed = 0.0 if phi.form == "paper" else 1e-9
     if abs(value) > allowed * abs(size) or np.abs(gradient).max() > allowed * np.abs(slope).max():
         refuse(
-            f"Φ(0) = {float(value):.3g} and ‖∇Φ(0)‖ = {np.linalg.norm(gradient):.3g}, so errors do not end at zero",
+            f"Φ(0) = {float(value):.3g} and ‖∇Φ(0)‖ = {np.linalg.norm(gradient):.3g}, so errors need not vanish",
             "the paper's ψ takes no biases and needs σ(0) = σ'(0) = 0: take form 'smooth' for others",
         )
     if convex.label is not Label.PROVED:
@@ -184,10 +184,10 @@ def _zero(phi: Potential, convex: Known) -> Known:
 
 
 def _product_floor(damping: Damping) -> float:
-    """λ_min(R TᵀT R) ≥ min R² σ², the better of two bounds on T with t_ii in [m, d_i], |t_ij| ≤ c_ij.
+    """λ_min(R TᵀT R) ≥ min R² σ², σ the larger of two lower bounds on σ_min(T) with t_ii in [m, d_i], |t_ij| ≤ c_ij.
 
-    σ ≥ mⁿ((n − 1)/F²)^((n−1)/2) with F² = Σd_i² + Σc_ij² ≥ ‖T‖_F² (docs/theory.md §5), and |T⁻¹| ≤ ⟨T⟩⁻¹ with ⟨T⟩ of
-    diagonal m and −c_ij below it, entry by entry.
+    They are mⁿ((n − 1)/F²)^((n−1)/2) with F² = Σd_i² + Σc_ij² ≥ ‖T‖_F² (docs/theory.md §5), and 1/‖⟨T⟩⁻¹‖, as
+    |T⁻¹| ≤ ⟨T⟩⁻¹ entry by entry, with m on the diagonal of ⟨T⟩ and −c_ij below it.
     """
     n, m = damping.nv, float(damping.m)
     top, (low, high) = np.maximum(_range(damping.diagonal)[1], 0.0) + m, _range(damping.lower)
@@ -198,7 +198,7 @@ def _product_floor(damping: Damping) -> float:
         return 0.0
     product = m**n * ((n - 1) / square) ** ((n - 1) / 2) if n > 1 else m
     inverse = np.eye(n) / m
-    for i in range(1, n):  # (mI − C)⁻¹ row by row: sums of positive numbers, of which none loses digits
+    for i in range(1, n):  # (mI − C)⁻¹ row by row: sums of positive numbers, without cancellation
         inverse[i] += below[i, :i] @ inverse[:i] / m
     norm = float(np.linalg.norm(inverse, 2))
     sigma = max(product, 1.0 / norm if np.isfinite(norm) else 0.0)
@@ -206,7 +206,7 @@ def _product_floor(damping: Damping) -> float:
 
 
 def _range(network: Any) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Least and largest outputs of a tanh network: b ∓ Σ|w|; ∓inf for one without a hidden layer."""
+    """Smallest and largest outputs of a tanh network: b ∓ Σ|w|; ∓inf without a hidden layer."""
     layers = network.layers(numpy=True)
     weight, bias = layers[-1]
     spread = np.abs(weight).sum(axis=1) if len(layers) > 1 else np.full(len(bias), np.inf)

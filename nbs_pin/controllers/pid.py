@@ -1,4 +1,4 @@
-"""PID without a model, as an industrial joint controller has it."""
+"""PID control of each joint without a model, as in industrial controllers."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from nbs_pin.robots.robot import Robot, configuration_difference
 
 
 class PIDMemory(NamedTuple):
-    """What a PID remembers between two samples, each (..., nv)."""
+    """State of a PID between two samples, each (..., nv)."""
 
     integral: Array
     """Integral torque [N·m]."""
@@ -32,11 +32,24 @@ class PIDMemory(NamedTuple):
 class PID(Controller, nn.Module):
     """τ = −K_p z1 − I − K_d y,  İ = K_i z1,  T_f ẏ = ż1 − y, per joint, with clamping anti-windup.
 
-    The integral rests while the torque is saturated and the error would drive it further (Åström and Hägglund 2006,
-    section 3.5). kp [N·m/rad], ki [N·m/(rad·s)], kd [N·m·s/rad]: (n,), positive, parameters. filter_time: T_f ≥ 0 [s].
-    effort_limit: where saturation begins [N·m], (n,). continuous: joints whose error wraps, (n,) or None.
-    robot: the arm it is for, which its checkpoint remembers, or None.
-    Raises ArgumentError for gains, limits or a filter time out of range, or an arm of another number of joints.
+    I is held while τ is saturated and z1 would saturate it further (Åström and Hägglund 2006, section 3.5).
+
+    Args:
+        kp: K_p [N·m/rad], (n,).
+        ki: K_i [N·m/(rad·s)], (n,) or one number.
+        kd: K_d [N·m·s/rad], (n,) or one number.
+        effort_limit: Largest |τ| before saturation [N·m], (n,) or one number.
+        filter_time: T_f ≥ 0 [s].
+        continuous: True for joints whose error is wrapped, (n,); None for no joint.
+        robot: The arm, stored with the controller by `save`, or None.
+
+    Raises:
+        ArgumentError: If a number is out of range, or the numbers of joints differ.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.PID.for_robot(nbs.load_robot("two_link"), bandwidth=8.0).ki.round(1)
+        array([666.7, 666.7])
     """
 
     def __init__(
@@ -55,7 +68,7 @@ class PID(Controller, nn.Module):
         self.gains = PositiveGains(nv, kp=kp, ki=ki, kd=kd)
         (self.effort_limit,) = positive_gains(nv, effort_limit=effort_limit)
         if not 0.0 <= filter_time < np.inf:
-            raise ArgumentError(f"filter_time is {filter_time} s; give a time ≥ 0.")
+            raise ArgumentError(f"filter_time is {filter_time} s; give a finite time ≥ 0.")
         self.filter_time = filter_time
         self.continuous = np.zeros(nv, dtype=bool) if continuous is None else np.asarray(continuous, dtype=bool)
         if self.continuous.shape != (nv,):
@@ -66,17 +79,10 @@ class PID(Controller, nn.Module):
 
     @classmethod
     def for_robot(cls, robot: Robot, *, bandwidth: float = 8.0, period: float = 0.001) -> "PID":
-        """PD gains from the arm's inertia (`pd_gains`), integral time 4/ω, derivative filter two samples long."""
+        """Gains of `pd_gains`, integral time 4/ω, and a derivative filter of two periods."""
         kp, kd = pd_gains(robot, PinocchioDynamics(robot), bandwidth=bandwidth, period=period)
-        return cls(
-            kp=kp,
-            ki=0.25 * bandwidth * kp,
-            kd=kd,
-            effort_limit=robot.effort_limit,
-            filter_time=2.0 * period,
-            continuous=robot.continuous,
-            robot=robot,
-        )
+        gains = {"kp": kp, "ki": 0.25 * bandwidth * kp, "kd": kd, "effort_limit": robot.effort_limit}
+        return cls(**gains, filter_time=2.0 * period, continuous=robot.continuous, robot=robot)
 
     @property
     def nv(self) -> int:
@@ -99,17 +105,17 @@ class PID(Controller, nn.Module):
         return self.gains.numpy("kd")
 
     def initial_memory(self, q: Vectors) -> PIDMemory:
-        """No integral, derivative at rest, in the kind of q."""
+        """Zero integral and derivative with the array type of q."""
         xp = array_namespace(q)
         return PIDMemory(xp.zeros_like(q), xp.zeros_like(q))
 
     def step(
         self, memory: PIDMemory, q: Vectors, v: Vectors, reference: Reference, period: float
     ) -> tuple[Vectors, PIDMemory]:
-        """τ [N·m] for the next period [s], and the memory after it; torch in, differentiable torch out."""
+        """τ [N·m] for the next period [s], and the memory after it; differentiable for tensors."""
         xp, (kp, ki, kd) = array_namespace(q), self.gains.like(q)
         z1 = configuration_difference(q, reference.q, self.continuous)
-        blend = period / (self.filter_time + period)  # backward Euler of the filter
+        blend = period / (self.filter_time + period)  # backward Euler for the filter
         derivative = memory.derivative + blend * (v - reference.v - memory.derivative)
         tau = -kp * z1 - memory.integral - kd * derivative
         winding = (abs(tau) > constant_like(q, self.effort_limit)) & (tau * z1 < 0.0)
@@ -118,11 +124,11 @@ class PID(Controller, nn.Module):
 
     @property
     def packable(self) -> bool:
-        """Whether this is the law that the kernel knows, and not a subclass."""
+        """Whether the kernel implements this law: True unless it is a subclass."""
         return is_known(self)
 
     def packed_law(self, *, numpy: bool = True) -> Packed:
-        """Its six rows of gains (`Controller.packed_law`)."""
+        """Gains, limits, T_f and wrapped joints for the kernel (`Controller.packed_law`)."""
         if not self.packable:
             return super().packed_law(numpy=numpy)
         kp, ki, kd = self.gains.value(numpy=numpy)
@@ -134,9 +140,10 @@ class PID(Controller, nn.Module):
 
 
 class CompiledPID(Controller):
-    """`PID.step` as machine code, memory in, memory out; numpy only.
+    """`PID.step` as machine code, for numpy arrays.
 
-    law: rows k_p, k_i, k_d, effort limit, T_f, continuous (6n) as numpy arrays (`Controller.packed_law`).
+    Args:
+        law: Rows K_p, K_i, K_d, effort limit, T_f, continuous, (6n,), as a numpy array (`Controller.packed_law`).
     """
 
     def __init__(self, law: Packed) -> None:
@@ -149,16 +156,13 @@ class CompiledPID(Controller):
         return len(self.weights) // 6
 
     def initial_memory(self, q: Vectors) -> PIDMemory:
-        """No integral, derivative at rest."""
+        """Zero integral and derivative."""
         return PIDMemory(np.zeros_like(q), np.zeros_like(q))
 
     def step(
         self, memory: PIDMemory, q: Array, v: Array, reference: Reference, period: float
     ) -> tuple[Vectors, PIDMemory]:
-        """τ [N·m] for the next period [s], and the memory after it.
-
-        Raises ArgumentError when shapes do not fit, or for tensors.
-        """
+        """τ [N·m] for the next period [s], and the memory after it; ArgumentError for tensors or wrong shapes."""
         if isinstance(q, np.ndarray) and q.ndim == 1:
             out = np.empty((3, self.nv))
             try:
@@ -172,17 +176,9 @@ class CompiledPID(Controller):
     def _steps(
         self, memory: PIDMemory, q: Array, v: Array, reference: Reference, period: float
     ) -> tuple[Vectors, PIDMemory]:
-        given = as_vectors(
-            self.nv,
-            integral=memory.integral,
-            derivative=memory.derivative,
-            q=q,
-            v=v,
-            q_ref=reference.q,
-            v_ref=reference.v,
-        )
+        given = as_vectors(self.nv, **memory._asdict(), q=q, v=v, q_ref=reference.q, v_ref=reference.v)
         if is_torch_array(given[0]):
-            raise ArgumentError("a compiled PID was given torch tensors, expected numpy arrays; convert them.")
+            raise ArgumentError("a compiled PID was given torch tensors, expected numpy arrays; call `PID.step`.")
         out = np.empty((3, given[0].size))
         pid(*(np.array(x, dtype=float).ravel() for x in given), float(period), self.weights, out)
         tau, integral, derivative = out.reshape(3, *given[0].shape)

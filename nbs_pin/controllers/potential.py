@@ -21,7 +21,7 @@ from nbs_pin.kernels.convex import subtract_tangent
 from nbs_pin.kernels.layout import Packed, pack_potential
 
 POTENTIALS = ("paper", "smooth")
-_CELLS = 400  # intervals that [−radius, radius] is cut into
+_CELLS = 400  # subintervals of [−radius, radius]
 
 
 def _stored(t: Tensors) -> Mapping[str, Any]:
@@ -32,16 +32,20 @@ def _stored(t: Tensors) -> Mapping[str, Any]:
 @known_code
 @storable({"form": "form"}, parts={"activation": "network.activation"}, arrays=_stored)
 class Potential(nn.Module):
-    """Φ(z) = zᵀSz + ψ(z) [J], so that ∇²Φ ⪰ 2S everywhere (docs/theory.md §3).
+    """Φ(z) = zᵀSz + ψ(z) [J] with ψ convex, so that ∇²Φ ⪰ 2S everywhere (docs/theory.md §3).
 
-    form "paper": ψ(z) = f(Rz), f a FICNN without biases and with the smoothed ReLU, zero with zero gradient at 0; its
-    second derivative, and so the torque, jumps where a pre-activation crosses 0 or d.
-    form "smooth": the Bregman form ψ(z) = f(Rz) − f(0) − ∇f(0)ᵀRz of a smooth FICNN with biases; C^∞.
+    Args:
+        stiffness: Initial S (n, n), symmetric positive definite [J/rad²].
+        form: "smooth" is the Bregman form ψ(z) = f(Rz) − f(0) − ∇f(0)ᵀRz of a smooth FICNN f with biases, C^∞. "paper"
+            is ψ(z) = f(Rz), f without biases and with the smoothed ReLU; its second derivative, and so the torque,
+            jumps where a pre-activation crosses 0 or d.
+        widths: Hidden layer sizes of f.
+        activation: σ of f; None takes `Squareplus` or, for "paper", `SmoothedReLU`.
+        scale: Diagonal of R, (n,), to bring errors of weak and strong joints to one size; None is 1, as in the paper.
+        least_share: Training keeps S at or above this share of its initial value (`Gain`).
 
-    stiffness: S₀ (n, n) symmetric positive definite [J/rad²]; S is a `Gain`, which training may change but never
-    below least_share · S₀. scale: R, a diagonal input scale (n,), which brings errors of weak and strong joints to one
-    size; 1 is the paper's. Raises ArgumentError for an unknown form, an S₀ that is not symmetric positive definite, a
-    share outside [0, 1) or an R that is not positive.
+    Raises:
+        ArgumentError: For an unknown form or a number out of range.
     """
 
     scale: torch.Tensor
@@ -85,7 +89,7 @@ class Potential(nn.Module):
         return 2.0 * float(np.linalg.eigvalsh(self.stiffness.numpy())[0])
 
     def terms(self, z: Vectors, dz: Vectors) -> tuple[Scalars, Vectors, Vectors]:
-        """Φ(z) [J], ∇Φ(z) [N·m] and ∇²Φ(z) dz, in the kind of z."""
+        """Φ(z) [J], ∇Φ(z) [N·m] and ∇²Φ(z) dz with the array type of z."""
         xp = array_namespace(z)
         s, r = self.stiffness.like(z), self.scale if is_torch_array(z) else self.scale.numpy(force=True)
         value, gradient, product = self._psi(r * z, r * dz)
@@ -94,15 +98,11 @@ class Potential(nn.Module):
 
     @property
     def is_packable(self) -> bool:
-        """Whether all parts are the ones the kernels know, and not those of a subclass."""
+        """Whether the kernels implement all parts; False for a subclass."""
         return all(map(is_known, (self, self.network, self.network.activation)))
 
     def packed(self, *, numpy: bool = True) -> Packed:
-        """The weights as the compiled form of `terms` takes them (`kernels/convex.py`).
-
-        numpy: True gives an array, False a tensor of the same numbers, differentiable in the parameters.
-        Raises ArgumentError when the activation has no compiled form.
-        """
+        """Weights for the kernel of `terms`, as array or tensor; ArgumentError if the activation has no kernel."""
         activation = self.network.activation
         if activation.kernel is None:
             raise ArgumentError(f"{activation} has no compiled form; take SmoothedReLU or Squareplus.")
@@ -114,9 +114,9 @@ class Potential(nn.Module):
         return subtract_tangent(packed) if self.form == "smooth" and numpy else packed
 
     def curvature(self, radius: float) -> Interval:
-        """Where ψ'' lies for |z| ≤ radius [rad], for one joint [N·m/rad]: interval arithmetic on small cells.
+        """Bounds of ψ'' for |z| ≤ radius [rad], for one joint [N·m/rad], by interval arithmetic.
 
-        Of each layer y = σ(a), y' = σ'(a) a', y'' = σ''(a) a'² + σ'(a) a'', with σ and σ' monotone.
+        For each layer y = σ(a), y' = σ'(a) a', y'' = σ''(a) a'² + σ'(a) a'', with σ and σ' monotone.
         """
         scale, activation = float(self.scale[0]), self.network.activation
         x = Interval.cells(scale * radius, _CELLS)

@@ -1,4 +1,4 @@
-"""Laws by name: what the shell offers, and `build_law` makes."""
+"""Control laws by name, for the command line and `build_law`."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -19,20 +19,19 @@ LAWS: dict[str, Entry] = {
     "pd-gravity": Entry(f"{_LAWS}.pd:PD.for_robot", {"feedforward": "gravity"}),
     "pid": Entry(f"{_LAWS}.pid:PID.for_robot"),
 }
-"""Every law by name. A function here takes a robot, and by name whatever it can use of `build_law`'s settings."""
+"""All laws by name; each entry takes a robot and, as keywords, the settings of `build_law` that it supports."""
 
 
 def build_law(name: str, robot: "Robot", **settings: Any) -> "Controller":
-    """The law of that name, tuned for the arm.
+    """The law of that name with default gains for the arm.
 
     Args:
         name: One of `LAWS`.
         robot: The arm.
-        settings: bandwidth [rad/s], period [s], friction (a `JointFriction` to feed forward), dynamics, seed; a law
-            takes those it knows.
+        settings: bandwidth [rad/s], period [s], friction, dynamics, seed; those that the law does not take are ignored.
 
     Raises:
-        ArgumentError: For an unknown name or numbers out of range.
+        ArgumentError: For an unknown name or a number out of range.
     """
     law: Controller = entry("controller", name, LAWS, ", a .nbs file, or build one").make(robot, **settings)
     return law

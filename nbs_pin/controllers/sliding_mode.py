@@ -28,19 +28,23 @@ def _stored(t: Tensors) -> Mapping[str, Any]:
 class SlidingMode(SlotineLi):
     """τ = M a_r + C(q, v) v_r + G − K s − η tanh(s/ε), with s, v_r and a_r of `SlotineLi`.
 
-    The storage function is that of `SlotineLi`; the switching term is damping: D(s) = K + diag(η tanh(s/ε)/s) ⪰ K.
+    The Lyapunov function is that of `SlotineLi`; the switching term is damping: D(s) = K + diag(η tanh(s/ε)/s) ⪰ K.
     Source: Slotine and Li 1991, "Applied Nonlinear Control", sections 7.2 and 9.1.
 
     Args:
-        dynamics: What the law believes of the arm.
         rate: λ [1/s], (n,) or one number.
         gain: K [N·m·s/rad], (n,) or one number.
-        switching: η [N·m], (n,) or one number: the disturbance that the law is to outweigh.
-        boundary: ε [rad/s], (n,) or one number: the speed error from which it does.
-        friction: Fed forward at v_r, or None.
+        switching: η [N·m], (n,) or one number: the disturbance to reject.
+        boundary: ε [rad/s], (n,) or one number: width of the boundary layer.
+        friction: Joint friction fed forward at v_r, or None.
 
     Raises:
-        ArgumentError: Unless all of them are positive.
+        ArgumentError: If a gain is not positive.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.SlidingMode.for_robot(nbs.load_robot("two_link"), switching=5.0).boundary.round(3)
+        array([0.02, 0.1 ])
     """
 
     def __init__(
@@ -68,7 +72,7 @@ class SlidingMode(SlotineLi):
         switching: PerJoint = 1.0,
         friction: JointFriction | None = None,
     ) -> "SlidingMode":
-        """λ and K of `SlotineLi.for_robot`, and a boundary layer with η/ε = ¼M_e/h, short of chatter."""
+        """λ and K of `SlotineLi.for_robot`, and a boundary layer with η/ε = ¼M_e/h, wide enough to avoid chatter."""
         model = PinocchioDynamics(robot) if dynamics is None else dynamics
         law = SlotineLi.for_robot(robot, model, bandwidth=bandwidth, period=period)
         boundary = 4.0 * period * np.asarray(switching) / effective_inertia(robot, model)
@@ -76,7 +80,7 @@ class SlidingMode(SlotineLi):
         return cls(model, **gains, friction=friction)
 
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
-        """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
+        """τ [N·m]; arguments (..., nv). Raises ArgumentError if shapes or array types do not match."""
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         rate, _ = self.gains.like(q)
         s = v - v_ref + rate * self.dynamics.difference(q, q_ref)
@@ -96,11 +100,11 @@ class SlidingMode(SlotineLi):
         return super().damping_matrix(z2) + xp.eye(self.nv, dtype=z2.dtype) * extra[..., None]
 
     def extra_damping(self, radius: float) -> Interval:
-        """η tanh(z2/ε)/z2 of one joint, largest at 0."""
+        """Bounds of η tanh(z2/ε)/z2 for one joint; the largest value is η/ε, at 0."""
         return Interval(np.float64(0.0), np.float64(self.switching.numpy("switching")[0] / self.boundary[0]))
 
     def lyapunov(self) -> Lyapunov:
-        """That of `SlotineLi`, with a claim for the switching term."""
+        """Constants and claims of `SlotineLi`, with a claim for the switching term."""
         found = super().lyapunov()
         switching, boundary = self.switching.numpy("switching"), self.boundary
         if not (np.isfinite([*switching, *boundary]).all() and switching.min() > 0.0 and boundary.min() > 0.0):

@@ -30,12 +30,21 @@ from nbs_pin.robots.robot import Robot
 class SlotineLi(LyapunovLaw):
     """τ = M a_r + C(q, v) v_r + G − K s,  v_r = v_d − λ z1,  a_r = a_d − λ ż1,  s = v − v_r.
 
-    With V = z1ᵀλKz1 + ½sᵀM s:  V̇ = −ż1ᵀKż1 − z1ᵀλKλz1 + sᵀτ_d. In the terms of `LyapunovLaw` Φ = z1ᵀλKz1, Λ = ½K⁻¹,
-    D = K, ω = 0 and ζ = 0.
+    With V = z1ᵀλKz1 + ½sᵀM s:  V̇ = −ż1ᵀKż1 − z1ᵀλKλz1 + sᵀτ_d. In the terms of `LyapunovLaw`, Φ = z1ᵀλKz1, Λ = ½K⁻¹,
+    D = K, ω = ζ = 0. Source: Slotine and Li 1987, "On the adaptive control of robot manipulators", without adaptation.
 
-    rate: λ [1/s], (n,). gain: K [N·m·s/rad], (n,). friction: fed forward at v_r, or None.
-    Source: Slotine and Li 1987, "On the adaptive control of robot manipulators", without adaptation.
-    Raises ArgumentError unless all gains are positive.
+    Args:
+        rate: λ [1/s], (n,) or one number.
+        gain: K [N·m·s/rad], (n,) or one number.
+        friction: Joint friction fed forward at v_r, or None.
+
+    Raises:
+        ArgumentError: If a gain is not positive.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.SlotineLi.for_robot(nbs.load_robot("two_link"), bandwidth=8.0).gain.round(1)
+        array([41.7, 41.7])
     """
 
     coupling = 0.0
@@ -56,7 +65,7 @@ class SlotineLi(LyapunovLaw):
         period: float = 0.001,
         friction: JointFriction | None = None,
     ) -> "SlotineLi":
-        """λ = ω, and K such that a static error meets the stiffness λK of `gains_for_robot`, short of chatter."""
+        """λ = ω, and K from the stiffness λK of `gains_for_robot`, at most ½M_e/h to avoid chatter."""
         dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
         gains = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period)
         warn_if_too_fast(robot, dynamics, bandwidth)
@@ -74,7 +83,7 @@ class SlotineLi(LyapunovLaw):
         return self.gains.numpy("gain")
 
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
-        """τ [N·m]; arguments (..., nv). Raises ArgumentError when shapes or kinds do not fit."""
+        """τ [N·m]; arguments (..., nv). Raises ArgumentError if shapes or array types do not match."""
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         rate, gain = self.gains.like(q)
         v_r = v_ref - rate * self.dynamics.difference(q, q_ref)
@@ -98,19 +107,19 @@ class SlotineLi(LyapunovLaw):
         return xp.eye(self.nv, dtype=z2.dtype) * gain + 0.0 * z2[..., None]
 
     def rate_like(self, x: Array) -> Float[Array, " n"]:
-        """Λ = ½K⁻¹ [rad/s per N·m] in the kind of x, so that Λ∇Φ = λz1."""
+        """Λ = ½K⁻¹ [rad/s per N·m] with the array type of x, so that Λ∇Φ = λz1."""
         return 0.5 / self.gains.like(x)[1]
 
     def extra_stiffness(self, radius: float) -> Interval:
-        """None: Φ is quadratic."""
+        """0: Φ is quadratic."""
         return Interval.of(np.float64(0.0))
 
     def extra_damping(self, radius: float) -> Interval:
-        """None: D is constant."""
+        """0: D is constant."""
         return Interval.of(np.float64(0.0))
 
     def lyapunov(self) -> Lyapunov:
-        """S = λK, Λ = ½K⁻¹, D₀ = K, with claims for both gains and the friction that is fed forward."""
+        """S = λK, Λ = ½K⁻¹, D₀ = K, with claims for both gains and the friction feed-forward."""
         check_parts(self.nv, {name: len(self.gains.named(name).nominal) for name in ("rate", "gain")}, self.friction)
         rate, odd_rate = positive_gain("λ", self.gains.named("rate"), self.nv, 1)
         gain, odd_gain = positive_gain("K", self.gains.named("gain"), self.nv, 1)

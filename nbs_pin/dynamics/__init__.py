@@ -1,1 +1,1 @@
-"""Models of an arm: what the controller believes."""
+"""Dynamics models of an arm, on which controllers rely."""

@@ -1,4 +1,4 @@
-"""The planar two-link arm in closed form: the paper's example, and an oracle for everything else."""
+"""Dynamics of a planar two-link arm in closed form, the example of the paper."""
 
 import numpy as np
 from jaxtyping import Float
@@ -20,9 +20,16 @@ from nbs_pin.robots.robot import Robot
 class AnalyticDynamics(DynamicsProvider):
     """Two massless rods of lengths l₁, l₂ [m] with point masses m₁, m₂ [kg] at their ends, gravity g [m/s²].
 
-    With β = q: V = (m₁ + m₂) g l₁ sin β₁ + m₂ g l₂ sin(β₁ + β₂). Source: paper, section V-A (m = l = 1, g = 9.8),
-    with the sign G = +∂V/∂q and the Christoffel C (docs/theory.md §1).
-    Raises ArgumentError when a mass or length is not positive.
+    V = (m₁ + m₂) g l₁ sin q₁ + m₂ g l₂ sin(q₁ + q₂). Source: paper, section V-A (m = l = 1, g = 9.8, β = q), with the
+    sign G = +∂V/∂q and the Christoffel matrix C (docs/theory.md §1). `robot` supplies limits and drawings.
+
+    Raises:
+        ArgumentError: If a mass or length is not positive, or a number is not finite.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.bias(nbs.AnalyticDynamics(), q=[0, 0], v=[0, 0])
+        array([29.4,  9.8])
     """
 
     def __init__(
@@ -35,8 +42,8 @@ class AnalyticDynamics(DynamicsProvider):
         numbers = np.array([*masses, *lengths])
         if not (np.isfinite([*numbers, gravity]).all() and (numbers > 0.0).all()):
             raise ArgumentError(
-                f"masses {masses}, lengths {lengths} and gravity {gravity} were given, expected finite numbers; masses"
-                " [kg] and lengths [m] must be positive."
+                f"masses {masses} kg, lengths {lengths} m, gravity {gravity} m/s² were given, expected finite numbers;"
+                " masses and lengths must be positive."
             )
         (m1, m2), (l1, l2) = masses, lengths
         self._robot, self.masses, self.lengths, self.gravity_constant = robot, masses, lengths, gravity
@@ -47,12 +54,12 @@ class AnalyticDynamics(DynamicsProvider):
 
     @property
     def nv(self) -> int:
-        """Two joints."""
+        """Number of joints, 2."""
         return 2
 
     @property
     def robot(self) -> Robot | None:
-        """The arm whose limits and drawings belong to these equations, if one was given."""
+        """The arm with these dynamics, if one was given."""
         return self._robot
 
     def mass_matrix(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2 2"]:
@@ -65,7 +72,7 @@ class AnalyticDynamics(DynamicsProvider):
         return xp.stack([xp.stack([shoulder, corner], axis=-1), xp.stack([corner, forearm], axis=-1)], axis=-2)
 
     def coriolis_matrix(self, q: Float[Array, "*batch 2"], v: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2 2"]:
-        """C(q, v) [N·m·s], the Christoffel one."""
+        """C(q, v) [N·m·s], the Christoffel matrix of M."""
         xp = array_namespace(q)
         h = self._coupling * xp.sin(q[..., 1])
         v1, v2 = v[..., 0], v[..., 1]
@@ -80,7 +87,7 @@ class AnalyticDynamics(DynamicsProvider):
         return xp.stack([self._weights[0] * xp.cos(q[..., 0]) + elbow, elbow], axis=-1)
 
     def packed_tree(self) -> Packed | None:
-        """Two point masses on joints about z, with gravity along −y; None for a subclass."""
+        """Two point masses on joints about z, with gravity along −y; None for a subclass, which may differ."""
         if type(self) is not AnalyticDynamics:
             return None
         (upper, lower), along, z = self.lengths, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -91,17 +98,14 @@ class AnalyticDynamics(DynamicsProvider):
         return pack_tree(links, np.array([0.0, -self.gravity_constant, 0.0]))
 
     def structure_claims(self) -> ModelClaims:
-        """λ_min(M) ≥ det M / trace M ≥ m₁m₂l₁²l₂² / (largest trace), of the numbers that the equations run on.
-
-        Raises CertificateRefused when masses or lengths were changed after the object was made.
-        """
+        """λ_min(M) ≥ m₁m₂l₁²l₂² / max trace M; raises CertificateRefused if the attributes are inconsistent."""
         try:
             stated = AnalyticDynamics(self.masses, self.lengths, self.gravity_constant)
         except ArgumentError as error:
-            raise CertificateRefused(f"the two-link model is none: {error}") from error
+            raise CertificateRefused(f"the two-link model is not valid: {error}") from error
         names = ("_shoulder", "_forearm", "_coupling", "_weights")
         if any(getattr(stated, name) != getattr(self, name) for name in names):
-            refuse("the two-link model does not move as its masses and lengths say", "build it again from them")
+            refuse("the equations of the two-link model do not match its masses and lengths", "construct it again")
         (m1, m2), (l1, l2) = self.masses, self.lengths
         trace = (m1 + m2) * l1 * l1 + 2.0 * m2 * l2 * l2 + 2.0 * m2 * l1 * l2
         least = (1.0 - ROUNDING) * m1 * m2 * (l1 * l2) ** 2 / trace

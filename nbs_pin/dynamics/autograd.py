@@ -1,4 +1,4 @@
-"""Numpy functions of one state, with known vector-Jacobian products, as differentiable torch functions of batches."""
+"""Numpy functions of one state with known vector-Jacobian products, as differentiable torch functions of batches."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from nbs_pin.base.arrays import over_rows
 def differentiable(
     value: Callable[..., np.ndarray], vjp: Callable[..., Sequence[np.ndarray]], *arguments: torch.Tensor
 ) -> torch.Tensor:
-    """The function `value` over the rows of tensors with equal leading axes, once differentiable through `vjp`."""
+    """`value` of the rows of tensors with equal leading axes, differentiable once, by `vjp`."""
     return _OverRows.apply(value, vjp, *arguments)  # type: ignore[no-untyped-call]
 
 

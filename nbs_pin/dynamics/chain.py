@@ -1,4 +1,4 @@
-"""The chain network: every rigid tree of joints, and nothing else, with only the order of the joints given."""
+"""The chain network: a parameterisation of all rigid trees whose joints have a given order and type."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,28 +26,30 @@ from nbs_pin.kernels.trees import tree_torques
 class Chain(LagrangianNetwork):
     """T̂ = ½ Σ_j ‖Ṫ_j L_j‖² + ½ Σ_j (r_j² + ε) v_j², V̂ = −Σ_j g·T_j L_j(L_jᵀ)₄, T_j = T_parent(j) A_j E(q_j).
 
-    Source: docs/theory.md §6.
+    T_j is the 4×4 homogeneous transform of body j, A_j that of its joint at q = 0, and E a rotation about z or a
+    translation along z. L_jL_jᵀ is the pseudo-inertia [[Σ m xxᵀ, Σ m x], [·, Σ m]] of the body. So for all parameter
+    values the bodies are physically consistent, T̂ is quadratic in v, and M̂ = Σ_j B_jᵀB_j + diag(r² + ε) ⪰ εI with the
+    flattened ∂_iT_j L_j as column i of B_j. r_j² is the rotor inertia, initially zero. Source: docs/theory.md §6.
 
-    A linear recursion along the tree: T_j is the 4×4 homogeneous transform of body j, A_j that of its joint at q = 0,
-    and E turns about z, or slides along z. L_jL_jᵀ is the body's pseudo-inertia [[Σ m xxᵀ, Σ m x], [·, m]], so for all
-    parameter values every body is physical, T̂ is exactly quadratic and M̂ = Σ_j B_jᵀB_j + diag(r² + ε) ⪰ ε1, column i of
-    B_j being ∂_iT_j L_j in a row. r_j² is the inertia of the joint's rotor, zero at the start.
+    Args:
+        parents: Per joint, 0 for the base and i + 1 for joint i.
+        epsilon: ε [kg·m², kg].
+        seed: Seed of the initial links of about 0.3 m and 1 kg, and of the direction of gravity, 9.81 m/s².
 
-    parents: 0 for the base, i + 1 for joint i. prismatic: joints that slide. epsilon: ε [kg·m², kg]. seed: of a random
-    start, with links of some 0.3 m and 1 kg and gravity of 9.81 m/s² in a random direction.
-    Raises ArgumentError when a parent does not come before its child, or ε is not positive.
+    Raises:
+        ArgumentError: If a parent does not come before its child, or ε is not positive and finite.
     """
 
     turns: Tensor
-    """(n, 3) rotation of A_j, as axis times angle [rad]."""
+    """(n, 3) rotation vector of A_j [rad]."""
     positions: Tensor
     """(n, 3) translation of A_j [m]."""
     factors: Tensor
-    """(n, 4, 4) L_j, whose lower triangle is read."""
+    """(n, 4, 4) L_j; only the lower triangle is used."""
     field: Tensor
     """(3,) gravity g in the base frame [m/s²]."""
     rotors: Tensor
-    """(n,) r: square roots of the rotors' inertias."""
+    """(n,) r, square roots of the rotor inertias."""
 
     def __init__(
         self,
@@ -60,18 +62,18 @@ class Chain(LagrangianNetwork):
         self.parents, self.prismatic = [int(i) for i in parents], [bool(slides) for slides in prismatic]
         if len(self.parents) != len(self.prismatic) or any(not 0 <= p <= i for i, p in enumerate(self.parents)):
             raise ArgumentError(
-                f"parents {self.parents} and prismatic {self.prismatic} make no tree; give one entry per joint, parents"
-                " first, 0 for the base and i + 1 for joint i."
+                f"parents {self.parents} and prismatic {self.prismatic} do not form a tree; give one entry per joint,"
+                " parents before children, 0 for the base and i + 1 for joint i."
             )
         if not 0.0 < epsilon < np.inf:
-            raise ArgumentError(f"epsilon is {epsilon}, expected a small inertia > 0 [kg·m²]; 1e-12 is usual.")
+            raise ArgumentError(f"epsilon is {epsilon} kg·m², expected a small finite inertia > 0; 1e-12 is usual.")
         self.nv, self.epsilon = len(self.parents), epsilon
         for name, value in random_tree(self.nv, np.random.default_rng(seed))._asdict().items():
             setattr(self, name, nn.Parameter(torch.from_numpy(value)))
         self.rotors = nn.Parameter(torch.zeros(self.nv, dtype=torch.float64))
 
     def mass_matrix(self, q: Vectors) -> Matrices:
-        """M̂(q) = Σ_j B_jᵀB_j + diag(r² + ε) [kg·m²], column i of B_j being ∂_iT_j L_j."""
+        """M̂(q) = Σ_j B_jᵀB_j + diag(r² + ε) [kg·m²], with the flattened ∂_iT_j L_j as column i of B_j."""
         frames = self._frames(q)
         rates = self._rates(frames)  # (…, n joints, n bodies, 4, 4)
         columns = (rates @ self.factors.tril()).flatten(-2).flatten(-2)
@@ -82,7 +84,7 @@ class Chain(LagrangianNetwork):
         return -(self._frames(q) @ self._moments())[..., :3, 0].sum(-2) @ self.field
 
     def gravity(self, q: Vectors) -> Vectors:
-        """Ĝ(q) [N·m], by −g·∂_iT_j of the first moments."""
+        """Ĝ_i = −Σ_j g·∂_iT_j L_j(L_jᵀ)₄ [N·m]."""
         rates = self._rates(self._frames(q))
         return -torch.einsum("...ijk,k->...i", (rates @ self._moments())[..., :3, 0], self.field)
 
@@ -91,7 +93,7 @@ class Chain(LagrangianNetwork):
         return self.parents == parents.tolist() and self.prismatic == prismatic.tolist()
 
     def packed_tree(self) -> Packed:
-        """The same tree for the kernels of `kernels/trees.py`, r² + ε as armature."""
+        """The tree for the kernels (`kernels/trees.py`), with r² + ε as armature."""
         with torch.no_grad():
             rotations, factors = rotation_matrices(self.turns), self.factors.tril()
             inertia = (factors @ factors.mT).numpy(force=True)
@@ -106,18 +108,18 @@ class Chain(LagrangianNetwork):
         return Packed(np.array(layout, dtype=np.int64), np.concatenate(weights))
 
     def structure_claims(self) -> ModelClaims:
-        """M̂ = Σ_j B_jᵀB_j + diag(r² + ε) ⪰ min(r² + ε) I; raises CertificateRefused for parents that make no tree."""
+        """M̂ ⪰ min(r² + ε) I; raises CertificateRefused if the parents do not form a tree or ε is not positive."""
         parents, n = list(self.parents), self.nv
         if len(parents) != n or len(self.prismatic) != n or any(not 0 <= p <= i for i, p in enumerate(parents)):
-            refuse(f"the chain's parents {parents} make no tree of {n} joints", "give parents first, 0 for the base")
+            refuse(f"the chain's parents {parents} do not form a tree of {n} joints", "put parents before children")
         if not 0.0 < self.epsilon < np.inf:
-            refuse(f"the model's M̂ has ε = {self.epsilon:g}", "εI must be positive, or M̂ may be singular: give ε > 0")
+            refuse(f"the model's M̂ has ε = {self.epsilon:g}", "εI must be positive definite: give a finite ε > 0")
         least = self.epsilon + float(np.min(self.rotors.numpy(force=True) ** 2))
         because = "M̂ = Σ_j B_jᵀB_j + diag(r² + ε) ⪰ min(r² + ε)I"
         return quadratic(Claim(POSITIVE, least, "kg·m²", Label.PROVED, because))
 
     def compiled(self) -> CompiledTorque:
-        """`torque` by one Newton–Euler pass per row."""
+        """`torque` as machine code, by one Newton–Euler pass per row."""
         return TreeTorque(*self.packed_tree())
 
     def _frames(self, q: Tensor) -> Tensor:
@@ -134,7 +136,7 @@ class Chain(LagrangianNetwork):
         return torch.stack(frames, -3)
 
     def _rates(self, frames: Tensor) -> Tensor:
-        """∂_iT_j = T_i S_i T_i⁻¹ T_j for every joint i at or before body j, else 0: (…, n, n, 4, 4)."""
+        """∂_iT_j = T_i S_i T_i⁻¹ T_j for joints i on the path from the base to body j, else 0: (…, n, n, 4, 4)."""
         n, twists = self.nv, frames.new_zeros(self.nv, 4, 4)
         for i, slides in enumerate(self.prismatic):
             if slides:
@@ -158,7 +160,7 @@ class Chain(LagrangianNetwork):
 
 @dataclass(frozen=True, eq=False)
 class TreeTorque:
-    """Rows of q, v, w, a → M(q) a + C(q, v) w + G(q) of a packed tree."""
+    """M(q) a + C(q, v) w + G(q) of a packed tree, for rows of q, v, w, a."""
 
     layout: Int[np.ndarray, " layout"]
     weights: Float[np.ndarray, " weights"]
@@ -170,7 +172,7 @@ class TreeTorque:
         w: Float[np.ndarray, "rows n"],
         a: Float[np.ndarray, "rows n"],
     ) -> Float[np.ndarray, "rows n"]:
-        """One pass per row."""
+        """One Newton–Euler pass per row."""
         tau, work = np.empty(q.shape), np.empty(tree_workspace(Packed(self.layout, self.weights)))
         tree_torques(q, v, w, a, self.layout, self.weights, work, tau)
         return tau
@@ -186,7 +188,7 @@ class Tree(NamedTuple):
 
 
 def random_tree(n: int, rng: np.random.Generator) -> Tree:
-    """Directions at random, some 0.3 m between joints, bodies of 1 kg with a mean radius of 0.15 m."""
+    """Random axes, about 0.3 m between joints, bodies of about 1 kg with a radius of about 0.15 m."""
     turns = rng.normal(size=(n, 4))
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)  # uniform unit quaternions
     angle = 2.0 * np.arctan2(np.linalg.norm(turns[:, 1:], axis=1), turns[:, 0])
@@ -198,14 +200,14 @@ def random_tree(n: int, rng: np.random.Generator) -> Tree:
 
 
 def rotation_matrices(turns: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """exp[δ]× of every row δ [rad]."""
+    """Rotation matrices exp([δ]×) of the rotation vectors δ in the rows [rad]."""
     x, y, z = turns.unbind(-1)
     o = torch.zeros_like(x)
     return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(-1, 3, 3))
 
 
 def _joint(q: Tensor, slides: bool) -> Tensor:
-    """E(q): by q along z or about it, (…, 4, 4)."""
+    """E(q), the translation by q along z or rotation by q about z, (…, 4, 4)."""
     o, one = torch.zeros_like(q), torch.ones_like(q)
     c, s, z = (one, o, q) if slides else (q.cos(), q.sin(), o)
     rows = [c, -s, o, o, s, c, o, o, o, o, one, z, o, o, o, one]

@@ -1,4 +1,4 @@
-"""The Lagrangian with M̂ = LLᵀ + εI: positive definite for every parameter value, its torque written out."""
+"""The Lagrangian network with M̂ = LLᵀ + εI, positive definite for every parameter value."""
 
 from collections.abc import Sequence
 
@@ -20,12 +20,15 @@ from nbs_pin.dynamics.tanh_network import TanhNetwork
 class CholeskyNetwork(LagrangianNetwork):
     """M̂(q) = R L(q)L(q)ᵀ R + εI ⪰ εI and V̂(q), with L lower triangular; one tanh network gives L and V̂.
 
-    Source: Lutter, Ritter and Peters 2019, "Deep Lagrangian Networks"; without their softplus on the diagonal, which
-    positive definiteness does not need.
+    Source: Lutter, Ritter and Peters 2019, "Deep Lagrangian Networks", but without softplus on the diagonal of L.
 
-    prismatic: for every joint whether it slides. widths: of the hidden layers. epsilon: ε [kg·m²], below the smallest
-    eigenvalue of the arm's M. inertia, energy: what one unit of the network means (`Scales`). seed: of the first
-    parameters. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
+    Args:
+        epsilon: ε [kg·m²], below the smallest eigenvalue of the arm's M.
+        inertia: R², (n,) [kg·m²], inertia of one unit of the network (`Scales`); None is 1.
+        energy: Potential energy of one unit of the network [J].
+
+    Raises:
+        ArgumentError: If there are no joints, or ε or a scale is not positive and finite.
     """
 
     fit_widths = (32, 32)
@@ -70,9 +73,9 @@ class CholeskyNetwork(LagrangianNetwork):
         return self.scales.energy * self.network(self.features(q))[..., -1]
 
     def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors) -> Vectors:
-        """M̂ a + Ĉ(q, v) w + Ĝ [N·m] by one pass forward with tangents along v and w, and one pass back.
+        """M̂ a + Ĉ(q, v) w + Ĝ [N·m] by one forward pass with tangents along v and w, and one reverse pass.
 
-        Of vᵀLLᵀw the gradient in L is v(Lᵀw)ᵀ + w(Lᵀv)ᵀ.
+        The gradient of vᵀLLᵀw in L is v(Lᵀw)ᵀ + w(Lᵀv)ᵀ.
         """
         root, x = self.scales.root, self.features(q)
         tangents = [self.features.push(x, s) for s in ((v,) if w is v else (v, w))]
@@ -92,7 +95,7 @@ class CholeskyNetwork(LagrangianNetwork):
         return quadratic(floored(float(self.scales.epsilon), "M̂ = LLᵀ + εI"))
 
     def compiled(self) -> CompiledTorque | None:
-        """`torque` as machine code (`kernels/cholesky.py`); None for a subclass, which may have another torque."""
+        """`torque` as machine code (`kernels/cholesky.py`); None for a subclass, which may change it."""
         if type(self) is not CholeskyNetwork:
             return None
         from nbs_pin.kernels.cholesky import CholeskyTorque, pack_cholesky
@@ -103,9 +106,9 @@ class CholeskyNetwork(LagrangianNetwork):
 
     @property
     def _is_potential(self) -> Tensor:
-        """1 at the output that is V̂."""
+        """1 at the output V̂, 0 elsewhere."""
         return 1.0 - self._place.sum(-1)
 
     def _factor(self, output: Tensor) -> Tensor:
-        """The outputs in their places in L; the last one, V̂, has none."""
+        """The outputs arranged as L, without the last one, V̂."""
         return (output @ self._place).reshape(*output.shape[:-1], self.nv, self.nv)

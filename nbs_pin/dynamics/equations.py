@@ -1,4 +1,4 @@
-"""The equations of motion, written once for every `DynamicsProvider`; shapes are checked here (docs/theory.md §1)."""
+"""The equations of motion of any `DynamicsProvider`, with checks of the shapes (docs/theory.md §1)."""
 
 from nbs_pin.base.arrays import Array, Scalars, Vectors, array_namespace, as_vectors, matvec
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -7,19 +7,37 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 def reference_torque(dynamics: DynamicsProvider, q: Array, v: Array, v_r: Array, a_r: Array) -> Vectors:
     """M(q) a_r + C(q, v) v_r + G(q) [N·m], for a reference velocity v_r [rad/s] and acceleration a_r [rad/s²].
 
-    All arguments have shape (..., nv). Raises ArgumentError on other shapes. Source: docs/theory.md §1.
+    Raises:
+        ArgumentError: If a shape is not (..., nv).
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.reference_torque(nbs.AnalyticDynamics(), q=[0, 0], v=[0, 0], v_r=[0, 0], a_r=[1, 0])
+        array([34.4, 11.8])
     """
     return dynamics.reference_torque(*as_vectors(dynamics.nv, q=q, v=v, v_r=v_r, a_r=a_r))
 
 
 def inverse_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, a: Array) -> Vectors:
-    """τ = M(q) a + C(q, v) v + G(q) [N·m]: the torque that produces the acceleration a [rad/s²]."""
+    """τ = M(q) a + C(q, v) v + G(q) [N·m], the torque that produces the acceleration a [rad/s²].
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.inverse_dynamics(nbs.AnalyticDynamics(), q=[0, 0], v=[0, 0], a=[-9.8, 9.8])
+        array([0., 0.])
+    """
     q, v, a = as_vectors(dynamics.nv, q=q, v=v, a=a)
     return dynamics.reference_torque(q, v, v, a)
 
 
 def forward_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, tau: Array) -> Vectors:
-    """v̇ = M(q)⁻¹(τ − C(q, v) v − G(q)) [rad/s²]: the acceleration that the torque τ [N·m] produces."""
+    """v̇ = M(q)⁻¹(τ − C(q, v) v − G(q)) [rad/s²], the acceleration produced by the torque τ [N·m].
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.forward_dynamics(nbs.AnalyticDynamics(), q=[0, 0], v=[0, 0], tau=[0, 0])
+        array([-9.8,  9.8])
+    """
     return dynamics.forward_dynamics(*as_vectors(dynamics.nv, q=q, v=v, tau=tau))
 
 
@@ -36,6 +54,6 @@ def kinetic_energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
 
 
 def energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
-    """E = ½ vᵀM(q)v + V(q) [J]; along every motion dE/dt = vᵀτ."""
+    """E = ½ vᵀM(q)v + V(q) [J]; dE/dt = vᵀτ along every motion."""
     q, v = as_vectors(dynamics.nv, q=q, v=v)
     return kinetic_energy(dynamics, q, v) + dynamics.potential_energy(q)

@@ -1,4 +1,4 @@
-"""What a network sees of a configuration: sine and cosine of joints that turn, the position of joints that slide."""
+"""Input features of the networks: sine and cosine of revolute joints, the position of prismatic joints."""
 
 from collections.abc import Sequence
 
@@ -14,10 +14,10 @@ from nbs_pin.base.known_code import known_code
 
 @known_code
 class JointFeatures(nn.Module):
-    """x(q) = (sin q_r, cos q_r, q_p) for the revolute joints r and the prismatic joints p, with its derivative.
+    """x(q) = (sin q_r, cos q_r, q_p) for revolute joints r and prismatic joints p, and ∂x/∂q (docs/theory.md §6).
 
-    So a network of x has period 2π in every angle; on three links this alone divides its error by four
-    (docs/theory.md §6). prismatic: for every joint whether it slides. Raises ArgumentError for no joints.
+    Raises:
+        ArgumentError: If there are no joints.
     """
 
     prismatic: torch.Tensor
@@ -28,9 +28,9 @@ class JointFeatures(nn.Module):
         super().__init__()
         slides = torch.tensor([bool(x) for x in prismatic])
         if not len(slides):
-            raise ArgumentError("prismatic is empty; give a truth value for every joint, at least one.")
+            raise ArgumentError("prismatic is empty; give one truth value per joint, at least one.")
         self.register_buffer("prismatic", slides)
-        # Joints in the order of the features, and the place of every joint in that order.
+        # Joints in the order of the features, and the index of every joint in that order.
         self.register_buffer("_joints", torch.argsort(slides.long(), stable=True), persistent=False)
         self.register_buffer("_order", torch.argsort(self._joints), persistent=False)
         self.turning = int((~slides).sum())
@@ -42,7 +42,7 @@ class JointFeatures(nn.Module):
 
     @property
     def order(self) -> np.ndarray:
-        """Joints in the order of the features: those that turn, then those that slide."""
+        """Joints in the order of the features: revolute, then prismatic."""
         return self._joints.numpy(force=True)
 
     @property
@@ -62,7 +62,7 @@ class JointFeatures(nn.Module):
         return torch.cat([cosine * angles, -sine * angles, positions], dim=-1)
 
     def pull(self, x: Float[torch.Tensor, "*batch m"], gradient: Float[torch.Tensor, "*batch m"]) -> Vectors:
-        """(∂x/∂q)ᵀ of a gradient in the features x."""
+        """(∂x/∂q)ᵀ times a gradient in the features x."""
         (sine, cosine), r = self._waves(x), self.turning
         angles = cosine * gradient[..., :r] - sine * gradient[..., r : 2 * r]
         return torch.cat([angles, gradient[..., 2 * r :]], dim=-1)[..., self._order]

@@ -1,4 +1,4 @@
-"""Friction in the joints, for the plant that has it and the controller that feeds it forward."""
+"""Joint friction, for plants and for feedforward in controllers."""
 
 from dataclasses import dataclass
 
@@ -15,10 +15,16 @@ from nbs_pin.robots.robot import Robot
 @storable(("viscous", "coulomb", "transition"))
 @dataclass(frozen=True, eq=False)
 class JointFriction:
-    """Friction torque viscous·v + coulomb·tanh(v / transition) [N·m], against the motion.
+    """Friction torque viscous·v + coulomb·tanh(v / transition) [N·m], opposing the motion.
 
-    The tanh makes Coulomb friction smooth, so that it has a derivative and an explicit integrator can follow it:
-    near v = 0 it is a damper of coulomb / transition, and a step h is stable for h·coulomb / (transition·M) < 2.
+    The tanh makes Coulomb friction differentiable and suitable for explicit integrators: near v = 0 it is a damper with
+    coefficient coulomb / transition, and a step h is stable for h·coulomb / (transition·M) < 2.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> nbs.JointFriction(viscous=[0.5, 0.2], coulomb=[1.0, 0.0]).torque(np.array([2.0, -1.0]))
+        array([ 2. , -0.2])
     """
 
     viscous: JointArray
@@ -33,9 +39,7 @@ class JointFriction:
             object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=float)))
             value = getattr(self, name)
             if value.ndim != 1 or not (np.isfinite(value).all() and (value >= 0.0).all()):
-                raise ArgumentError(
-                    f"{name} friction is {value.tolist()}, expected finite numbers ≥ 0, one per joint; correct it."
-                )
+                raise ArgumentError(f"{name} friction is {value.tolist()}; give finite numbers ≥ 0, one per joint.")
         if self.viscous.shape != self.coulomb.shape:
             raise ArgumentError(
                 f"viscous has {self.viscous.size} joints and coulomb {self.coulomb.size}; give one number per joint."
@@ -45,17 +49,17 @@ class JointFriction:
 
     @classmethod
     def of(cls, robot: Robot, transition: float = 0.01) -> "JointFriction":
-        """The friction that the arm's URDF states (`<dynamics damping friction>`); zero where it states none."""
+        """Friction from the URDF of the robot (`<dynamics damping friction>`), zero where it has none."""
         return cls(robot.damping, robot.friction, transition)
 
     def torque(self, v: Vectors) -> Vectors:
-        """Torque [N·m] that friction takes at the velocity v [rad/s]; numpy in numpy out, torch in torch out."""
+        """Friction torque [N·m] at the velocity v [rad/s], with the array type of v (numpy or torch)."""
         viscous, coulomb = constant_like(v, self.viscous), constant_like(v, self.coulomb)
         return viscous * v + coulomb * array_namespace(v).tanh(v / self.transition)
 
 
 def friction_of_size(friction: JointFriction | None, nv: int) -> JointFriction | None:
-    """The friction itself; raises ArgumentError unless it is None or has a number for each of the nv joints."""
+    """Return the friction; raise ArgumentError unless it is None or has nv joints."""
     if friction is not None and friction.viscous.size != nv:
         raise ArgumentError(
             f"the friction is for {friction.viscous.size} joints, the arm has {nv}; give one per joint."

@@ -1,4 +1,4 @@
-"""An arm with its URDF's geometry and inertias that were measured."""
+"""Rigid-body dynamics with the geometry of a URDF and identified inertial parameters."""
 
 from dataclasses import replace
 from typing import Any
@@ -19,20 +19,24 @@ from nbs_pin.dynamics.structure import ModelClaims, rigid_tree_claims
 from nbs_pin.robots.robot import Robot
 
 _ROUNDING = 1e-9
-"""How far below zero an eigenvalue of J, scaled to a unit diagonal, is still taken for a zero that was rounded."""
+"""Allowance for rounding in the smallest eigenvalue of J, scaled to a unit diagonal."""
 
 
 @known_code
 @storable(("parameters", "rotor_inertia", "report"), parts=("robot", "friction"))
 class IdentifiedDynamics(PinocchioDynamics):
-    """M, C, G of an arm with the joints of `robot` and the inertial parameters given here instead of its own.
+    """M, C, G of an arm with the joints of `robot` and the given inertial parameters in place of its own.
 
-    robot: gives geometry, gravity, limits and drawings; its own inertias play no part. parameters: (n, 10), per body
-    mass [kg], first moment [kg·m] and inertia about the joint's origin [kg·m²] in Pinocchio's order (m, mx, my, mz,
-    Ixx, Ixy, Iyy, Ixz, Iyz, Izz). friction: what was identified beside them, for laws that feed it forward; it is no
-    part of M, C, G. rotor_inertia: per joint [kg·m², kg], a part of M, zero by default. report: how they were found,
-    for the reader. Raises ArgumentError for another number of joints, a body that no mass distribution has, and a rotor
-    inertia below zero.
+    Args:
+        robot: Geometry, gravity, limits and drawings; its inertias are not used.
+        parameters: (n, 10), per body mass [kg], first moment [kg·m] and inertia about the joint's origin [kg·m²], in
+            the order of Pinocchio (m, mx, my, mz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz).
+        friction: Friction for laws that feed it forward; not part of M, C, G.
+        rotor_inertia: (n,) [kg·m², kg], added to the diagonal of M; None is zero.
+        report: Record of the identification (`IdentificationReport`).
+
+    Raises:
+        ArgumentError: For a wrong number of joints, a body that is not physically consistent, or rotor inertia < 0.
     """
 
     def __init__(
@@ -55,36 +59,32 @@ class IdentifiedDynamics(PinocchioDynamics):
 
     @property
     def robot(self) -> Robot:
-        """The arm as its file describes it."""
+        """The arm with the inertias of its URDF."""
         return self._described
 
     def structure_claims(self) -> ModelClaims | None:
-        """Those of a rigid tree."""
+        """The claims of a rigid tree."""
         return rigid_tree_claims(self.packed_tree())
 
 
 def _consistent(parameters: np.ndarray, robot: Robot) -> np.ndarray:
-    """The parameters; raises ArgumentError unless there is a solid body for each of the arm's joints."""
+    """Return the parameters; raise ArgumentError unless every joint has a physically consistent body."""
     if parameters.shape != (robot.nv, 10):
-        raise ArgumentError(
-            f"parameters have shape {parameters.shape}, expected ({robot.nv}, 10): ten for each joint of {robot.name}."
-        )
+        raise ArgumentError(f"parameters have shape {parameters.shape}, expected ({robot.nv}, 10); give ten per joint.")
     for name, body in zip(robot.joint_names, parameters, strict=True):
         j = pseudo_inertia(body)
         scale = np.sqrt(np.diag(j)) if (np.isfinite(body).all() and (np.diag(j) > 0.0).all()) else None
         if scale is None or np.linalg.eigvalsh(j / scale / scale[:, None])[0] < -_ROUNDING:
             raise ArgumentError(
                 f"the body behind joint '{name}' has parameters {body.tolist()}, which no distribution of mass has; "
-                "give finite ones whose pseudo-inertia is positive definite."
+                "give finite parameters with a positive definite pseudo-inertia."
             )
     return parameters
 
 
 def _rotors(rotor_inertia: Array | None, robot: Robot) -> np.ndarray:
-    """One finite number ≥ 0 per joint; raises ArgumentError otherwise."""
+    """Return one finite number ≥ 0 per joint; raise ArgumentError otherwise."""
     rotors = np.zeros(robot.nv) if rotor_inertia is None else floats("rotor_inertia", rotor_inertia).copy()
     if rotors.shape != (robot.nv,) or not (np.isfinite(rotors).all() and (rotors >= 0.0).all()):
-        raise ArgumentError(
-            f"rotor_inertia is {rotors.tolist()}, expected {robot.nv} finite numbers ≥ 0 [kg·m²]; correct it."
-        )
+        raise ArgumentError(f"rotor_inertia is {rotors.tolist()}, expected {robot.nv} finite numbers ≥ 0 [kg·m²].")
     return rotors

@@ -1,4 +1,4 @@
-"""A learned Lagrangian as the model of an arm: numpy and torch alike, machine code where the network has it."""
+"""A learned Lagrangian as a dynamics model, for numpy arrays and torch tensors."""
 
 import copy
 from collections.abc import Callable
@@ -29,13 +29,16 @@ from nbs_pin.robots.robot import Robot
 class LagrangianDynamics(DynamicsProvider, nn.Module):
     """M̂, Ĉ, Ĝ and V̂ of a learned Lagrangian network (docs/theory.md §6).
 
-    The network is copied and its parameters are frozen: no training of a controller changes its model. Where its T̂ is
-    not quadratic, the ingredients are those at rest, and `reference_torque` and `forward_dynamics` are the exact
+    The network is copied and its parameters are frozen, so that training a controller does not change the model. Where
+    T̂ is not quadratic, M̂, Ĉ and Ĝ are taken at v = 0, while `reference_torque` and `forward_dynamics` are the exact
     Euler–Lagrange equation with the inertia at (q, v).
 
-    network: float64. robot: the arm whose limits and drawings belong to it, or None. friction: what was learned beside
-    the Lagrangian, for laws that feed it forward; it is no part of M̂, Ĉ, Ĝ. report: how it was learned, for the reader.
-    Raises ArgumentError when robot or friction are for another number of joints, or the network is not in float64.
+    Args:
+        friction: Friction learned with the Lagrangian, for laws that feed it forward; not part of M̂, Ĉ, Ĝ.
+        report: Record of the fit (`FitReport`).
+
+    Raises:
+        ArgumentError: If robot or friction have another number of joints, or the network is not float64.
     """
 
     network: LagrangianNetwork
@@ -50,7 +53,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         super().__init__()
         if robot is not None and robot.nv != network.nv:
             raise ArgumentError(
-                f"the network is for {network.nv} joints and {robot.name} has {robot.nv}; give its own arm."
+                f"the network is for {network.nv} joints and {robot.name} has {robot.nv}; give its arm."
             )
         for name, x in network.named_parameters():
             if x.dtype != torch.float64:
@@ -74,7 +77,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         return self._evaluate(self.network.mass_matrix, q=q)
 
     def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
-        """Ĉ(q, v) [N·m·s], the Christoffel one of M̂(q)."""
+        """Ĉ(q, v) [N·m·s], the Christoffel matrix of M̂."""
         return self._evaluate(self.network.coriolis_matrix, q=q, v=v)
 
     def gravity(self, q: Vectors) -> Vectors:
@@ -86,7 +89,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         return self._evaluate(self.network.potential, q=q)
 
     def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
-        """M̂ a_r + Ĉ(q, v) v_r + Ĝ [N·m], in numpy by the network's machine code where it has one."""
+        """M̂ a_r + Ĉ(q, v) v_r + Ĝ [N·m], for numpy arrays by machine code where the network has it."""
         vectors = as_vectors(self.nv, q=q, v=v, v_r=v_r, a_r=a_r)
         if is_torch_array(vectors[0]) or self._machine_code is None:
             return self._evaluate(self.network.torque, q=q, v=v, v_r=v_r, a_r=a_r)
@@ -94,7 +97,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         return self._machine_code(*rows).reshape(vectors[0].shape)
 
     def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
-        """v̇ [rad/s²] that the torque τ [N·m] produces, in numpy by machine code where the network is a rigid tree."""
+        """v̇ [rad/s²] under the torque τ [N·m], for numpy arrays by machine code where the network is a rigid tree."""
         vectors = as_vectors(self.nv, q=q, v=v, tau=tau)
         tree = None if is_torch_array(vectors[0]) else self._tree
         if tree is None:
@@ -105,19 +108,19 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         return a.reshape(vectors[0].shape)
 
     def packed_tree(self) -> Packed | None:
-        """The network as a rigid tree, where it is one; None for a subclass, which may have changed an equation."""
+        """The network as a rigid tree, or None; None for a subclass, which may change equations."""
         return self._tree if type(self) is LagrangianDynamics else None
 
     def suits(self, robot: Robot) -> bool:
-        """Whether the network's joints are those of the arm."""
+        """Whether the joints of the network match those of the robot."""
         return self.network.suits(robot.parents, robot.prismatic)
 
     def structure_claims(self) -> ModelClaims | None:
-        """What the network claims of itself; raises CertificateRefused when its machine code is another network's."""
+        """The claims of the network; raises CertificateRefused if its machine code does not match its weights."""
         if self._tree is not None:
             now = self.network.packed_tree()
             if now is None or not all(np.array_equal(x, y) for x, y in zip(self._tree, now, strict=True)):
-                refuse("the model's machine code is not that of its weights", "load the model again")
+                refuse("the model's machine code does not match its weights", "load the model again")
         return self.network.structure_claims()
 
     @cached_property
@@ -129,18 +132,18 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         return self.network.compiled()
 
     def _evaluate(self, function: Callable[..., torch.Tensor], **arguments: Array) -> Array:
-        """The network's function over leading batch axes, in the kind of the arguments."""
+        """The function over leading batch axes, with the array type of the arguments (numpy or torch)."""
         vectors = as_vectors(self.nv, **arguments)
         if is_torch_array(vectors[0]):
             return function(*vectors)
         device = next((x.device for x in self.network.parameters()), None)
-        # The same array becomes the same tensor: the network knows shorter ways then.
+        # The same array becomes the same tensor, since `torque` is cheaper when w is v.
         tensors = {id(x): torch.from_numpy(np.array(x)).to(device) for x in vectors}
         with torch.no_grad():
             return function(*(tensors[id(x)] for x in vectors)).numpy(force=True)
 
 
 def _forget_machine_code(module: nn.Module, keys: Any) -> None:
-    """Other weights, another machine code."""
+    """Discard the machine code of the previous weights."""
     for name in ("_machine_code", "_tree"):
         vars(module).pop(name, None)

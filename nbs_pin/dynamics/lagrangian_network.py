@@ -1,4 +1,4 @@
-"""Networks that give a Lagrangian L = T − V: what every one of them offers, and the Euler–Lagrange equation once."""
+"""Base classes of networks for a Lagrangian L = T − V, with the Euler–Lagrange equation."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -17,26 +17,26 @@ from nbs_pin.kernels.layout import Packed
 
 Tensor: TypeAlias = torch.Tensor
 CompiledTorque: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Rows (m, n) of q, v, w, a to rows of M(q) a + C(q, v) w + G(q)."""
+"""Function from rows (m, n) of q, v, w, a to rows of M(q) a + C(q, v) w + G(q)."""
 
 
 class LagrangianNetwork(nn.Module, ABC):
     """T̂(q, v) and V̂(q) with learned parameters; float64 tensors with leading batch axes (docs/theory.md §6).
 
-    A subclass gives `mass_matrix` and `potential`; everything else follows by automatic differentiation, and is
-    differentiable in parameters and arguments. A subclass overrides it only with a faster route to the same numbers.
+    Subclasses implement `mass_matrix` and `potential`. All else follows by automatic differentiation, is differentiable
+    in parameters and arguments, and is overridden only with a faster way to compute the same values.
     """
 
     nv: int
     """Number of joints n."""
     fit_widths: tuple[int, ...] = (24, 24)
-    """Hidden layers that `fit` takes unless told otherwise: small enough for Levenberg–Marquardt."""
+    """Default hidden layer sizes of `fit`, small enough for Levenberg–Marquardt."""
     quadratic: bool = True
     """Whether T̂ is exactly ½ vᵀM̂(q)v, so that Ṁ − 2C is skew and the stability theory holds."""
 
     @abstractmethod
     def mass_matrix(self, q: Vectors) -> Matrices:
-        """M̂(q) [kg·m²]; for a T̂ that is not quadratic the one at v = 0."""
+        """M̂(q) [kg·m²]; ∂²T̂/∂v² at v = 0 where T̂ is not quadratic."""
 
     @abstractmethod
     def potential(self, q: Vectors) -> Scalars:
@@ -55,7 +55,7 @@ class LagrangianNetwork(nn.Module, ABC):
         return grad(lambda x: self.potential(x).sum())(q)
 
     def mass_rates(self, q: Vectors) -> Float[Tensor, "n *batch n n"]:
-        """∂M̂/∂q_k, stacked over k first."""
+        """∂M̂/∂q_k, with k as the first axis."""
         return along_every_joint(self.mass_matrix, q)
 
     def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
@@ -66,7 +66,7 @@ class LagrangianNetwork(nn.Module, ABC):
         return 0.5 * (along + turned - turned.mT)
 
     def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors) -> Vectors:
-        """M̂(q) a + Ĉ(q, v) w + Ĝ(q) [N·m]; cheaper when w is the very tensor v.
+        """M̂(q) a + Ĉ(q, v) w + Ĝ(q) [N·m]; cheaper when w is the same object as v.
 
         Ĉ(q, v) w = ½(∂_v M̂ w + ∂_w M̂ v − ∇_q vᵀM̂w): two directional derivatives of M̂ and one gradient.
         """
@@ -79,34 +79,34 @@ class LagrangianNetwork(nn.Module, ABC):
         return matvec(mass, a) + 0.5 * (matvec(along_v, w) + matvec(along_w, v)) - grad(lagrangian)(q)
 
     def acceleration(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
-        """v̇ [rad/s²] that the torque τ [N·m] produces; torch.linalg.LinAlgError where the inertia is singular."""
+        """v̇ [rad/s²] under the torque τ [N·m]; raises torch.linalg.LinAlgError if the inertia is singular."""
         bias = self.torque(q, v, v, torch.zeros_like(v))
         return torch.linalg.solve(self.inertia(q, v), (tau - bias)[..., None])[..., 0]
 
     def suits(self, parents: Int[np.ndarray, " n"], prismatic: Bool[np.ndarray, " n"]) -> bool:
-        """Whether the network is for an arm of these joints (`Robot.parents`, `Robot.prismatic`)."""
+        """Whether the network fits an arm with these joints (`Robot.parents`, `Robot.prismatic`)."""
         seen = [part for part in self.children() if isinstance(part, JointFeatures)]
         return all(features.prismatic.tolist() == prismatic.tolist() for features in seen)
 
     def packed_tree(self) -> Packed | None:
-        """The network as a rigid tree for the kernels of `kernels/trees.py`, or None where it is none."""
+        """The network as a rigid tree for the kernels (`kernels/trees.py`), or None if it is not a rigid tree."""
         return None
 
     def structure_claims(self) -> ModelClaims | None:
-        """What the structure of this very class proves of M̂ and Ĉ (`DynamicsProvider.structure_claims`)."""
+        """What the structure of exactly this class proves about M̂ and Ĉ (`DynamicsProvider.structure_claims`)."""
         return None
 
     def compiled(self) -> CompiledTorque | None:
-        """`torque` as machine code with the present parameters, picklable, or None where there is none."""
+        """`torque` as picklable machine code with the present parameters, or None if there is none."""
         return None
 
 
 class GeneralLagrangianNetwork(LagrangianNetwork):
     """A Lagrangian L(q, v) that need not be quadratic in v.
 
-    T̂ = L(q, v) − L(q, 0) and V̂ = −L(q, 0) have the motions of L. `mass_matrix`, `coriolis_matrix` and `gravity` are
-    those at rest; `torque` and `acceleration` are exact: with Ĉ the Christoffel matrix of ∂²L/∂v² at frozen v,
-    M̂(q, v) a + Ĉ w + ĝ(q, v), where ĝ holds the rest of the Euler–Lagrange bias (docs/theory.md §6).
+    T̂ = L(q, v) − L(q, 0) and V̂ = −L(q, 0), so that L = T̂ − V̂. `mass_matrix`, `coriolis_matrix` and `gravity` are taken
+    at v = 0. `torque` and `acceleration` are exact: the torque is M̂(q, v) a + Ĉ w + ĝ(q, v), with Ĉ the Christoffel
+    matrix of ∂²L/∂v² at frozen v and ĝ the rest of the Euler–Lagrange equation (docs/theory.md §6).
     """
 
     quadratic = False
@@ -137,13 +137,13 @@ class GeneralLagrangianNetwork(LagrangianNetwork):
         return columns.movedim(0, -1)
 
     def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors) -> Vectors:
-        """d/dt ∂L/∂v − ∂L/∂q + Ĉ (w − v) [N·m]; much cheaper when w is the very tensor v."""
+        """d/dt ∂L/∂v − ∂L/∂q + Ĉ (w − v) [N·m]; much cheaper when w is the same object as v."""
         rate = derivative(self.momentum, (q, v), (v, a))
         exact = rate - grad(lambda x: self.lagrangian(x, v).sum())(q)
         return exact if w is v else exact + self._frozen_coriolis(q, v, w - v)
 
     def _frozen_coriolis(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Ĉ u with the Christoffel matrix of q ↦ ∂²L/∂v²(q, v), v frozen in it."""
+        """Ĉ u with the Christoffel matrix of q ↦ ∂²L/∂v²(q, v) at frozen v."""
 
         def times(x: Tensor, direction: Tensor) -> Tensor:
             return derivative(lambda s: self.momentum(x, s), (v,), (direction,))
@@ -156,19 +156,19 @@ class GeneralLagrangianNetwork(LagrangianNetwork):
 def with_tangent(
     function: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
-    """The function and its directional derivative, differentiable again in both modes."""
-    dense = (tuple(x.contiguous() for x in vectors) for vectors in (at, along))  # as dual numbers are stored
+    """Value and directional derivative, differentiable again in forward and reverse mode."""
+    dense = (tuple(x.contiguous() for x in vectors) for vectors in (at, along))  # dual numbers need equal layouts
     value, tangent = cast(tuple[Tensor, Tensor], jvp(function, *dense))
     return value, tangent
 
 
 def derivative(function: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor, ...]) -> Tensor:
-    """The directional derivative alone."""
+    """The directional derivative."""
     return with_tangent(function, at, along)[1]
 
 
 def along_every_joint(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """Derivatives of the function of (..., n) along every coordinate, stacked first: (n, ..., of the function)."""
+    """Partial derivatives of the function in the n coordinates of x (..., n), along a new first axis."""
     n = x.shape[-1]
     unit = torch.eye(n, dtype=x.dtype, device=x.device).reshape(n, *(1,) * (x.ndim - 1), n)
     many = x.expand(n, *x.shape)

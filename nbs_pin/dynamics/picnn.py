@@ -1,4 +1,4 @@
-"""Partially input-convex networks for the kinetic energy: the paper's, and the quadratic one made from it."""
+"""Partially input-convex networks for the kinetic energy: that of the paper, and one with a quadratic T̂."""
 
 from collections.abc import Sequence
 
@@ -32,11 +32,12 @@ class PICNN(nn.Module):
 
     u_{i+1} = s(W̃ u + b̃), u_0 = x̃;
     y_{i+1} = σ(Wy⁺(y ∘ (Wyu u + by)⁺) + Wx(x ∘ (Wxu u + bx)) + Wu u + b), y_0 = 0, the scalar output linear.
-    Both gate and weights of y must be ≥ 0, or f is not convex: the paper prints neither ⁺ for the gate.
+    Both gate and weights of y must be ≥ 0, or f is not convex; the paper omits the ⁺ of the gate.
 
-    smooth False: ⁺ clips at 0, s = σ = softplus, and all parameters start from the paper's N(0, ν²).
-    smooth True: ⁺ is softplus for the gate and |·| for the weights, so that no neuron is ever dead, and s = tanh;
-    starts at a curvature of order one.
+    Args:
+        smooth: False: ⁺ clips at 0, s = σ = softplus, and the initial parameters are the paper's N(0, ν²).
+            True: ⁺ is softplus for the gate and |·| for the weights, so that no neuron is dead, s = tanh, σ = softplus,
+            and the initial curvature is of order one.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class PICNN(nn.Module):
         return y[..., 0]
 
     def curvature(self, context: Float[Tensor, "*batch m"], x: Vectors) -> Scalars:
-        """d²/ds² of f(x̃, sx) at s = 0: one pass forward with both derivatives ẏ and ÿ of every neuron.
+        """d²/ds² f(x̃, sx) at s = 0, by one forward pass with the derivatives ẏ and ÿ of every neuron.
 
         ẏ = σ'(a) ȧ and ÿ = σ''(a) ȧ² + σ'(a) ä.
         """
@@ -89,7 +90,7 @@ class PICNN(nn.Module):
         return dda[..., 0]
 
     def _contexts(self, u: Tensor) -> list[Tensor]:
-        """The context u of every layer."""
+        """Context u of every layer."""
         found = [u]
         for i in range(self.depth - 1):
             a = self._linear("wt", i, found[-1], "bt")
@@ -121,12 +122,10 @@ class PICNN(nn.Module):
 @known_code
 @storable(("widths",), arrays=stored_scales, sequence=tuple)
 class PaperPicnn(GeneralLagrangianNetwork):
-    """The paper's L = T̂(q, v) − V̂(q): a PICNN of (q, v), convex in v, and an FCNN, both of softplus.
+    """The paper's L = T̂(q, v) − V̂(q): T̂ by a PICNN convex in v, V̂ by an FCNN, both with softplus.
 
-    T̂ is not quadratic, so M̂ depends on v; convex is not strictly convex, so ½ε‖v‖² is added and gates are clipped
-    (docs/theory.md §6). Source: paper, sections II-B and V-B; starts from its ν formula.
-
-    Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
+    T̂ is not quadratic, so M̂ depends on v. Unlike in the paper, gates are clipped and ½ε‖v‖² is added: ∂²T̂/∂v² ⪰ εI
+    (docs/theory.md §6). Source: paper, sections II-B and V-B. Arguments and errors as in `CholeskyNetwork`.
     """
 
     fit_widths = (16, 16, 16)
@@ -162,8 +161,8 @@ class PaperPicnn(GeneralLagrangianNetwork):
 
     def structure_claims(self) -> ModelClaims:
         """∂²T̂/∂v² ⪰ εI, but T̂ is not quadratic; raises CertificateRefused unless ε > 0."""
-        positive = floored(float(self.scales.epsilon), "∂²T̂/∂v² of a PICNN convex in v, gates clipped, and εI")
-        because = "T̂ is not quadratic in v, so V̇ has a term ½z2ᵀ(∂M̂/∂v v̇)z2 that nothing bounds"
+        positive = floored(float(self.scales.epsilon), "∂²T̂/∂v² of a PICNN convex in v with clipped gates, plus εI,")
+        because = "T̂ is not quadratic in v, so V̇ has a term ½z2ᵀ(∂M̂/∂v v̇)z2 without a bound"
         return ModelClaims(positive, Claim(SKEW, np.inf, "", Label.EMPIRICAL, because))
 
 
@@ -172,8 +171,7 @@ class PaperPicnn(GeneralLagrangianNetwork):
 class HomogenisedPicnn(LagrangianNetwork):
     """M̂(q) = R ∂²f/∂v²(q, 0) R + εI ⪰ εI of a smooth PICNN f, and V̂ of a tanh network: T̂ is exactly quadratic.
 
-    What the paper's network becomes when its M̂ must not depend on v (docs/theory.md §6).
-    Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
+    The paper's network with M̂ independent of v (docs/theory.md §6). Arguments and errors as in `CholeskyNetwork`.
     """
 
     fit_widths = (20, 20)
@@ -202,7 +200,7 @@ class HomogenisedPicnn(LagrangianNetwork):
         return self.convex.widths
 
     def kinetic(self, q: Vectors, v: Vectors) -> Scalars:
-        """T̂(q, v) = ½ vᵀM̂(q)v [J], without M̂."""
+        """T̂(q, v) = ½ vᵀM̂(q)v [J], without forming M̂."""
         curvature = self.convex.curvature(self.features(q), self.scales.root * v)
         return 0.5 * (curvature + self.scales.epsilon * (v * v).sum(-1))
 
@@ -215,7 +213,7 @@ class HomogenisedPicnn(LagrangianNetwork):
         return self.scales.energy * self.network(self.features(q))[..., 0]
 
     def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors) -> Vectors:
-        """M̂ a + Ĉ(q, v) w + Ĝ [N·m] from T̂ alone; half the work when w is the very tensor v.
+        """M̂ a + Ĉ(q, v) w + Ĝ [N·m] from derivatives of T̂; half the cost when w is the same object as v.
 
         With h(x) = Ĉ(q, x) x: Ĉ(q, v) w = h((v + w)/2) − h((v − w)/2) (docs/theory.md §1).
         """
@@ -226,7 +224,7 @@ class HomogenisedPicnn(LagrangianNetwork):
 
     def structure_claims(self) -> ModelClaims:
         """M̂ = ∂²f/∂v² + εI ⪰ εI of a convex f; raises CertificateRefused unless ε > 0."""
-        return quadratic(floored(float(self.scales.epsilon), "M̂ = ∂²f/∂v² + εI, f convex with its gates clipped"))
+        return quadratic(floored(float(self.scales.epsilon), "M̂ = ∂²f/∂v² + εI with a convex f"))
 
     def _inertial(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """M̂ a + Ĉ(q, v) v = d/dt ∂T̂/∂v − ∂T̂/∂q."""

@@ -1,4 +1,4 @@
-"""The dynamics of a URDF arm through Pinocchio: C++ speed in numpy, analytical first derivatives in torch."""
+"""Dynamics of a URDF arm by Pinocchio, for numpy arrays and for torch tensors, with analytical first derivatives."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ Row: TypeAlias = np.ndarray
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of one state (one batch row) and the products of its Jacobians with an output cotangent."""
+    """A function of one state (one batch row) and its vector-Jacobian product."""
 
     value: Callable[..., Row]
     """value(q, …) -> output."""
@@ -33,10 +33,16 @@ class Quantity:
 @known_code
 @storable(parts=("robot",))
 class PinocchioDynamics(DynamicsProvider):
-    """M, C, G of `robot` by CRBA, Pinocchio's Christoffel Coriolis matrix and RNEA.
+    """M, C and G of `robot` by CRBA, Pinocchio's Christoffel Coriolis matrix and RNEA.
 
-    Joint friction of the URDF and rotor inertia are not part of it (`dynamics.friction` models the former).
-    Tensors are differentiated once, by Pinocchio's analytical derivatives; second derivatives raise.
+    Joint friction of the URDF (`JointFriction`) and rotor inertia are not included. Results for torch tensors can be
+    differentiated once, by Pinocchio's analytical derivatives; second derivatives raise an error.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> nbs.PinocchioDynamics(nbs.load_robot("two_link")).gravity(np.zeros(2)).round(3)
+        array([29.4,  9.8])
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -63,7 +69,7 @@ class PinocchioDynamics(DynamicsProvider):
         return self._evaluate(Quantity(self._mass_matrix, self._mass_matrix_vjp), q=q)
 
     def coriolis_matrix(self, q: Vectors, v: Vectors) -> Matrices:
-        """C(q, v) [N·m·s], the Christoffel one."""
+        """C(q, v) [N·m·s], the Christoffel matrix of M."""
         return self._evaluate(Quantity(self._coriolis_matrix, self._coriolis_matrix_vjp), q=q, v=v)
 
     def gravity(self, q: Vectors) -> Vectors:
@@ -75,10 +81,9 @@ class PinocchioDynamics(DynamicsProvider):
         return self._evaluate(Quantity(self._potential_energy, self._potential_energy_vjp), q=q)
 
     def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
-        """M a_r + C(q, v) v_r + G [N·m] by two RNEA and no matrix.
+        """M a_r + C(q, v) v_r + G [N·m] by two RNEA passes, without a matrix.
 
-        C(q, v) w is bilinear and symmetric in (v, w), so with h(x) = C(q, x) x:
-        C(q, v) v_r = h((v + v_r)/2) − h((v − v_r)/2) (docs/theory.md §1).
+        C(q, v) v_r = h((v + v_r)/2) − h((v − v_r)/2) with h(x) = C(q, x) x (docs/theory.md §1).
         """
         return self._evaluate(Quantity(self._reference_torque, self._reference_torque_vjp), q=q, v=v, v_r=v_r, a_r=a_r)
 
@@ -87,18 +92,18 @@ class PinocchioDynamics(DynamicsProvider):
         return self._evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q=q, v=v, tau=tau)
 
     def packed_tree(self) -> Packed | None:
-        """The arm's joints and bodies; None for a subclass, which may have changed an equation."""
+        """The joints and bodies of the model; None for an unknown subclass, which may change equations."""
         return pack_model(self._model) if is_known(self) else None
 
     def structure_claims(self) -> ModelClaims | None:
-        """Those of a rigid tree; raises CertificateRefused when the model is no longer that of `robot`."""
+        """The claims of a rigid tree; raises CertificateRefused if the model no longer matches `robot`."""
         tree, own = self.packed_tree(), pack_model(self._robot.model)
         if tree is not None and not all(np.array_equal(x, y) for x, y in zip(tree, own, strict=True)):
-            refuse(f"the model is not of {self._robot.name}, the arm it names", "build it again from that arm")
+            refuse(f"the model is no longer that of the arm {self._robot.name}", "construct it again from that arm")
         return rigid_tree_claims(tree)
 
     def _evaluate(self, quantity: Quantity, **arguments: Array) -> Array:
-        """The quantity over leading batch axes, in the kind of the arguments."""
+        """The quantity over leading batch axes, with the array type of the arguments (numpy or torch)."""
         vectors = as_vectors(self.nv, **arguments)
         if is_torch_array(vectors[0]):
             from nbs_pin.dynamics.autograd import differentiable
@@ -108,7 +113,7 @@ class PinocchioDynamics(DynamicsProvider):
             return quantity.value(*vectors)
         return over_rows(quantity.value, *vectors)
 
-    # One state at a time: values.
+    # Values at one state.
 
     def _mass_matrix(self, q: Row) -> Row:
         return pin.crba(self._model, self._data, q)
@@ -129,10 +134,10 @@ class PinocchioDynamics(DynamicsProvider):
     def _forward_dynamics(self, q: Row, v: Row, tau: Row) -> Row:
         return pin.aba(self._model, self._data, q, v, tau)
 
-    # One state at a time: cotangent times Jacobians.
+    # Vector-Jacobian products at one state.
 
     def _mass_matrix_vjp(self, cotangent: Row, q: Row) -> tuple[Row]:
-        # Column j of M is RNEA of the unit acceleration e_j without gravity.
+        # Column j of M is the RNEA torque of the unit acceleration e_j without gravity.
         columns = (self._rnea_derivatives(self._weightless, q, self._zero, e)[0] for e in self._unit)
         return (sum((dq.T @ cotangent[:, j] for j, dq in enumerate(columns)), self._zero),)
 
@@ -168,6 +173,6 @@ class PinocchioDynamics(DynamicsProvider):
 
     def _rnea_derivatives(self, model: pin.Model, q: Row, v: Row, a: Row) -> tuple[Row, Row, Row]:
         """∂τ/∂q, ∂τ/∂v and M at one state."""
-        live = pin.computeRNEADerivatives(model, self._data, q, v, a)  # views into data that the next call overwrites
+        live = pin.computeRNEADerivatives(model, self._data, q, v, a)  # views into data that later calls overwrite
         dq, dv, mass = (np.array(x) for x in live)
         return dq, dv, mass

@@ -1,4 +1,4 @@
-"""A Pinocchio model as a rigid tree for the kernels."""
+"""Conversion of a Pinocchio model to the rigid tree of the kernels."""
 
 import numpy as np
 import pinocchio as pin
@@ -14,15 +14,16 @@ _SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismatic
 def pack_model(model: pin.Model) -> Packed:
     """A Pinocchio model with its gravity and armature as a rigid tree for the kernels of `kernels/trees.py`.
 
-    Raises ArgumentError for a joint that is neither revolute nor prismatic, or whose angle is stored as two numbers.
+    Raises:
+        ArgumentError: If a joint is neither revolute nor prismatic, or stores its angle as two numbers.
     """
     data, links = model.createData(), []
     for i in range(1, model.njoints):
         kind = model.joints[i].shortname()
         if kind not in _TURNING + _SLIDING or model.idx_vs[i] != i - 1:
             raise ArgumentError(
-                f"joint '{model.names[i]}' is a {kind}, expected a revolute or prismatic one with one coordinate;"
-                " lock it, or use a joint whose angle is one unbounded number."
+                f"joint '{model.names[i]}' is a {kind}, expected a revolute or prismatic joint with one coordinate;"
+                " lock it, or replace it by an unbounded revolute joint."
             )
         motion, slides = np.array(data.joints[i].S), kind in _SLIDING
         body, at, axis = model.inertias[i], model.jointPlacements[i], motion[:3] if slides else motion[3:]

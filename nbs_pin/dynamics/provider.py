@@ -1,4 +1,4 @@
-"""The protocol of every dynamics model: four ingredients, from which every equation follows."""
+"""The interface of all dynamics models: M, C, G and V, from which the equations of motion follow."""
 
 from abc import ABC, abstractmethod
 
@@ -11,9 +11,9 @@ from nbs_pin.robots.robot import Robot, configuration_difference
 class DynamicsProvider(ABC):
     """M(q) v̇ + C(q, v) v + G(q) = τ with M ≻ 0, G = +∂V/∂q and C the Christoffel matrix of M (docs/theory.md §1).
 
-    Implementations give the abstract methods; arrays may have leading batch axes, and numpy in gives numpy out,
-    torch in gives differentiable torch out. `reference_torque` and `forward_dynamics` follow from them; an
-    implementation overrides one only when it has a faster route to the same numbers.
+    Subclasses implement the abstract methods. Arrays may have leading batch axes; numpy arrays give numpy arrays, and
+    torch tensors give differentiable tensors. `reference_torque` and `forward_dynamics` follow from these methods; a
+    subclass overrides them only with a faster way to compute the same values.
     """
 
     @property
@@ -23,7 +23,7 @@ class DynamicsProvider(ABC):
 
     @property
     def robot(self) -> Robot | None:
-        """The arm this model describes, or None for a model without a URDF."""
+        """The arm that this model describes, or None for a model without a URDF."""
         return None
 
     @abstractmethod
@@ -47,22 +47,24 @@ class DynamicsProvider(ABC):
         return configuration_difference(q, q_ref, None if self.robot is None else self.robot.continuous)
 
     def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
-        """M(q) a_r + C(q, v) v_r + G(q) [N·m], the one quantity a passivity-based law needs (docs/theory.md §1)."""
+        """M(q) a_r + C(q, v) v_r + G(q) [N·m], all that a passivity-based law needs (docs/theory.md §1)."""
         return matvec(self.mass_matrix(q), a_r) + matvec(self.coriolis_matrix(q, v), v_r) + self.gravity(q)
 
     def packed_tree(self) -> Packed | None:
-        """The model as a rigid tree for the kernels of `kernels/trees.py`, or None when it is none."""
+        """The model as a rigid tree for the kernels (`kernels/trees.py`), or None if it is not a rigid tree."""
         return None
 
     def suits(self, robot: Robot) -> bool:
-        """Whether the model's joints are those of the arm, as far as the model knows its joints."""
+        """Whether the joints of the model match those of the robot, as far as the model states them."""
         return True
 
     def structure_claims(self) -> ModelClaims | None:
-        """What the structure of this very class proves of M and C; None where samples alone can tell.
+        """What the structure of exactly this class proves about M and C; None if only samples can tell.
 
-        Certificates ask it of objects whose code is known (`base/known_code.py`), so a subclass must state its own.
-        Raises CertificateRefused for numbers that give a proof no ground.
+        Certificates use it only for known code (`base/known_code.py`), so a subclass must state its own claims.
+
+        Raises:
+            CertificateRefused: If the numbers of the model invalidate the proof.
         """
         return None
 

@@ -1,8 +1,8 @@
-"""Bodies as pseudo-inertias: the symmetric 4×4 matrices in which physical consistency is positive definiteness.
+"""Pseudo-inertias of bodies: symmetric 4×4 matrices that are positive definite if the body is physically consistent.
 
 A body with mass density ρ(x) ≥ 0 has J = ∫ (x, 1)(x, 1)ᵀ ρ dx = [[Σ, h], [hᵀ, m]] with Σ = ½ tr(I) 1 − I. J is linear
-in the ten parameters that Pinocchio uses, and J ≻ 0 holds for just those that some solid body has, triangle inequality
-included. Source: Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
+in Pinocchio's ten inertial parameters, and J ≻ 0 holds exactly for those of solid bodies, triangle inequality included.
+Source: Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
 identification", RA-L 2018.
 """
 
@@ -16,7 +16,6 @@ PARAMETER_NAMES = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Iz
 
 
 def _basis() -> np.ndarray:
-    """An orthonormal basis of the symmetric 4×4 matrices, shape (10, 4, 4)."""
     basis = np.zeros((10, 4, 4))
     for k, (i, j) in enumerate(itertools.combinations_with_replacement(range(4), 2)):
         basis[k, i, j] = basis[k, j, i] = 1.0 if i == j else np.sqrt(0.5)
@@ -28,7 +27,7 @@ BASIS = _basis()
 
 
 def coordinates(matrix: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 10"]:
-    """The symmetric matrix in `BASIS`: lengths and angles stay what they are."""
+    """Coordinates of the symmetric matrix in `BASIS`, an isometry."""
     return np.einsum("...ij,kij->...k", matrix, BASIS)
 
 
@@ -46,7 +45,7 @@ def inertial_parameters(pseudo_inertia: Float[np.ndarray, "*batch 4 4"]) -> Floa
 
 
 PARAMETERS_OF_COORDINATES = inertial_parameters(BASIS).T
-"""The (10, 10) matrix that takes coordinates of J to inertial parameters."""
+"""Matrix (10, 10) from coordinates of J to inertial parameters."""
 _COORDINATES_OF_PARAMETERS = np.linalg.inv(PARAMETERS_OF_COORDINATES)
 
 

@@ -1,4 +1,4 @@
-"""Models by name: the networks that `fit` trains, and every class that a file of a model may name."""
+"""Registry of models: network families for `fit`, and the classes that a model file may contain."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ NETWORKS: dict[str, Entry] = {
     "picnn": Entry(f"{_DYNAMICS}.picnn:PaperPicnn"),
     "unconstrained": Entry(f"{_DYNAMICS}.unconstrained:UnconstrainedLagrangian"),
 }
-"""Network families by name, with the constructor of `CholeskyNetwork`."""
+"""Network families by name; all take the arguments of `CholeskyNetwork`."""
 PROVIDERS: dict[str, Entry] = {
     "pinocchio": Entry(f"{_DYNAMICS}.pinocchio:PinocchioDynamics"),
     "analytic": Entry(f"{_DYNAMICS}.analytic:AnalyticDynamics"),
@@ -24,20 +24,14 @@ PROVIDERS: dict[str, Entry] = {
     "residual": Entry(f"{_DYNAMICS}.residual:ResidualDynamics"),
     "chain": Entry(f"{_DYNAMICS}.chain:Chain"),
 }
-"""Classes of models, and the rigid tree as a network, which `fit` finds by a search of its own."""
+"""Model classes by name, and the chain network, which `fit` trains by a method of its own."""
 
 
 def make_network(name: str, prismatic: Sequence[bool], seed: int = 0, **options: Any) -> "LagrangianNetwork":
-    """An untrained network of a family.
-
-    Args:
-        name: One of `NETWORKS`.
-        prismatic: For every joint whether it slides.
-        seed: Of the first parameters.
-        options: widths, epsilon, inertia and energy, as in `CholeskyNetwork`.
+    """An untrained network of `NETWORKS`, with the arguments of `CholeskyNetwork`.
 
     Raises:
-        ArgumentError: For an unknown name, or numbers that the network refuses.
+        ArgumentError: If the name is unknown or an argument is invalid.
     """
     network: LagrangianNetwork = entry("network", name, NETWORKS).make(prismatic, seed=seed, **options)
     return network

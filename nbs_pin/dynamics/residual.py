@@ -1,4 +1,4 @@
-"""An arm that is nearly known: a nominal model and what a network learned to correct in it."""
+"""A nominal model with learned corrections of its inertia and potential energy."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from nbs_pin.dynamics.structure import ModelClaims, quadratic
 
 
 class Terms(NamedTuple):
-    """What the torque of an arm follows from at q, over leading batch axes."""
+    """Inertia, its derivatives and gravity at q, with leading batch axes."""
 
     mass: Tensor
     """M (..., n, n) [kg·m²]."""
@@ -40,14 +40,19 @@ def _stored(t: Tensors) -> Mapping[str, Any]:
 @known_code
 @storable(("share", "widths"), parts=("nominal",), arrays=_stored, sequence=tuple)
 class ResidualNetwork(CholeskyNetwork):
-    """M̂ = κM + (1 − κ)FFᵀ with F = chol M(q) + R ΔL(q), and V̂ = V + ΔV(q); M and V of a nominal model.
+    """M̂ = κM + (1 − κ)FFᵀ with F = chol M(q) + R ΔL(q), and V̂ = V + ΔV(q), for M and V of a nominal model.
 
-    M̂ ⪰ κM ≻ 0 for every parameter value, every arm with M̂ ≻ κM is inside the class, and the untrained network, with
-    ΔL = 0 and ΔV = 0, is the nominal model itself. Gradients in q exist once where the nominal model's do.
+    M̂ ⪰ κM ≻ 0 for every parameter value, every M̂ ≻ κM can be represented, and the untrained network, with ΔL = 0 and
+    ΔV = 0, equals the nominal model. It is differentiable once in q where the nominal model is.
 
-    nominal: such as the arm as its URDF states it. prismatic: for every joint whether it slides; None asks the nominal
-    arm, or takes all for revolute. share: κ. inertia, energy: scales as in `CholeskyNetwork`; None takes the nominal
-    inertias and gravity torque. Raises ArgumentError for a share outside (0, 1) or another number of joints.
+    Args:
+        prismatic: Whether each joint is prismatic; None takes those of `nominal.robot`, or only revolute joints.
+        share: κ.
+        inertia: As in `CholeskyNetwork`; None is the diagonal of the nominal M at q = 0.
+        energy: As in `CholeskyNetwork`; None is the largest nominal gravity torque at q = 0.
+
+    Raises:
+        ArgumentError: If share is outside (0, 1) or prismatic has a wrong number of joints.
     """
 
     fit_widths = (24, 24)
@@ -64,7 +69,7 @@ class ResidualNetwork(CholeskyNetwork):
         seed: int = 0,
     ) -> None:
         if not 0.0 < share < 1.0:
-            raise ArgumentError(f"share is {share}; give a number between 0 and 1, the least share of the nominal M.")
+            raise ArgumentError(f"share is {share}; give a number between 0 and 1, the share of M that M̂ keeps.")
         slides = _slides(nominal) if prismatic is None else list(prismatic)
         if len(slides) != nominal.nv:
             raise ArgumentError(f"prismatic has {len(slides)} values, expected {nominal.nv}; give one per joint.")
@@ -77,7 +82,7 @@ class ResidualNetwork(CholeskyNetwork):
             nn.init.zeros_(weight)
 
     def terms(self, q: Vectors, nominal: Terms | None = None) -> Terms:
-        """M̂, its rates and Ĝ; nominal: `nominal_terms` of the same q, where they are known already."""
+        """M̂, ∂M̂/∂q and Ĝ; `nominal` takes `nominal_terms` of the same q computed before."""
         given = nominal_terms(self.nominal, q) if nominal is None else nominal
         factor = torch.linalg.cholesky(given.mass)
         x = self.features(q)
@@ -96,7 +101,7 @@ class ResidualNetwork(CholeskyNetwork):
         return self._mixed(mass, torch.linalg.cholesky(mass) + self._correction(self.network(self.features(q))))
 
     def mass_rates(self, q: Vectors) -> Float[Tensor, "n *batch n n"]:
-        """∂M̂/∂q_k, stacked over k first."""
+        """∂M̂/∂q_k, with k as the first axis."""
         return self.terms(q).rates.movedim(-3, 0)
 
     def potential(self, q: Vectors) -> Scalars:
@@ -108,21 +113,21 @@ class ResidualNetwork(CholeskyNetwork):
         return self.terms(q).gravity
 
     def torque(self, q: Vectors, v: Vectors, w: Vectors, a: Vectors, nominal: Terms | None = None) -> Vectors:
-        """M̂ a + Ĉ(q, v) w + Ĝ [N·m]; nominal: as in `terms`, which spares a training most of the time."""
+        """M̂ a + Ĉ(q, v) w + Ĝ [N·m]; `nominal` as in `terms`, which saves most of the time in training."""
         mass, rates, gravity = self.terms(q, nominal)
         along_v, along_w = (torch.einsum("...kij,...k->...ij", rates, x) for x in (v, w))
         slope = torch.einsum("...kij,...i,...j->...k", rates, v, w)
         return matvec(mass, a) + 0.5 * (matvec(along_v, w) + matvec(along_w, v) - slope) + gravity
 
     def structure_claims(self) -> ModelClaims | None:
-        """M̂ ⪰ κM, with what the nominal model claims of M; raises CertificateRefused for κ outside (0, 1)."""
+        """M̂ ⪰ κM with the nominal model's claim about M; raises CertificateRefused if κ is outside (0, 1)."""
         if not 0.0 < self.share < 1.0:
             refuse(f"the residual keeps a share κ = {self.share} of M", "κ must lie in (0, 1) for M̂ ⪰ κM ≻ 0")
         inner = None if foreign_code(self.nominal) else self.nominal.structure_claims()
         if inner is None or not np.isfinite(inner.skew.value):
             return None
         m = inner.positive
-        because = f"M̂ ⪰ κM with κ = {self.share:g}, and of the nominal model: {m.because}"
+        because = f"M̂ ⪰ κM with κ = {self.share:g}, and for the nominal model: {m.because}"
         return quadratic(Claim(m.name, self.share * m.value, m.unit, m.label, because))
 
     def _correction(self, output: Tensor) -> Tensor:
@@ -136,10 +141,9 @@ class ResidualNetwork(CholeskyNetwork):
 @known_code
 @storable(("report",), parts=("network", "friction"))
 class ResidualDynamics(LagrangianDynamics):
-    """A nominal model with what a `ResidualNetwork` learned to correct in it; a model like any other.
+    """A nominal model corrected by a `ResidualNetwork`, which is copied and frozen with its nominal model.
 
-    network: copied and frozen, its nominal model with it; untrained, it is the nominal model. friction, report: as in
-    `LagrangianDynamics`. Raises ArgumentError when the friction is for another number of joints.
+    Arguments and errors as in `LagrangianDynamics`.
     """
 
     def __init__(self, network: ResidualNetwork, friction: JointFriction | None = None, report: Any = None) -> None:
@@ -153,14 +157,14 @@ class ResidualDynamics(LagrangianDynamics):
 
 
 def nominal_terms(dynamics: DynamicsProvider, q: Vectors) -> Terms:
-    """M, its rates and G of any model: ∂M/∂q_k = C(q, e_k) + C(q, e_k)ᵀ, because Ṁ − 2C is skew."""
+    """M, ∂M/∂q and G of any model, with ∂M/∂q_k = C(q, e_k) + C(q, e_k)ᵀ because Ṁ − 2C is skew."""
     unit = torch.eye(dynamics.nv, dtype=q.dtype, device=q.device)
     coriolis = torch.stack([dynamics.coriolis_matrix(q, e.expand(q.shape)) for e in unit], dim=-3)
     return Terms(dynamics.mass_matrix(q), coriolis + coriolis.mT, dynamics.gravity(q))
 
 
 def _factor_rates(factor: Tensor, rates: Tensor) -> Tensor:
-    """∂L/∂q_k = L Φ(L⁻¹ ∂_kM L⁻ᵀ) of M = LLᵀ, where Φ keeps what is below the diagonal and half of the diagonal."""
+    """∂L/∂q_k = L Φ(L⁻¹ ∂_kM L⁻ᵀ) of M = LLᵀ, where Φ takes the lower triangle with half the diagonal."""
     lower = factor[..., None, :, :]
     inner = torch.linalg.solve_triangular(lower, rates, upper=False)
     inner = torch.linalg.solve_triangular(lower, inner.mT, upper=False)

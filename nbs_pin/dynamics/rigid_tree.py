@@ -1,4 +1,4 @@
-"""A rigid tree as the inertia bounds read it: placements, bodies, travel, and what each joint can change."""
+"""Rigid trees for the inertia bounds: placements, bodies and travel of the joints."""
 
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -14,37 +14,34 @@ from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY, FIRST, MASS, SECON
 from nbs_pin.robots.robot import Robot
 
 Arm: TypeAlias = "Robot | Packed | RigidTree"
-"""A robot, or any rigid tree as `kernels/tree_layout.py` packs it (a chain network's too), or what is read of it."""
+"""A robot, a rigid tree packed by `kernels/tree_layout.py` (for instance of a chain network), or a `RigidTree`."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidTree:
-    """Joint i moves body i about or along the z axis of the body's frame; −1 is the base, parents come first."""
+    """Joint i moves body i about or along the z axis of frame i; parents come before children, and −1 is the base."""
 
     parents: Int[np.ndarray, " n"]
     prismatic: Bool[np.ndarray, " n"]
     rotation: Float[np.ndarray, "n 3 3"]
-    """Of frame i in its parent's at q_i = 0."""
+    """Rotation of frame i in its parent's frame at q_i = 0."""
     position: Float[np.ndarray, "n 3"]
-    """Of frame i's origin in its parent's frame at q_i = 0 [m]."""
+    """Origin of frame i in its parent's frame at q_i = 0 [m]."""
     mass: JointArray
-    """[kg]."""
+    """Mass of each body [kg]."""
     centre: Float[np.ndarray, "n 3"]
     """Centre of mass in frame i [m]."""
     inertia: Float[np.ndarray, "n 3 3"]
-    """About the centre of mass, in frame i [kg·m²]."""
+    """Inertia about the centre of mass, in frame i [kg·m²]."""
     armature: JointArray
-    """Inertia of the rotor, on the diagonal of M [kg·m², kg]."""
+    """Rotor inertia, added to the diagonal of M [kg·m², kg]."""
     lower: JointArray
     upper: JointArray
-    """Travel of a prismatic joint [m]; joints that turn are let turn fully."""
+    """Travel of a prismatic joint [m]; revolute joints may turn fully."""
 
     @classmethod
     def of(cls, arm: Arm) -> "RigidTree":
-        """The tree of an arm; a packed one states no travel.
-
-        Raises ArgumentError for a joint that neither turns nor slides.
-        """
+        """The tree of an arm, without travel limits for a packed tree; raises ArgumentError as `pack_model` does."""
         if isinstance(arm, RigidTree):
             return arm
         packed = arm if isinstance(arm, Packed) else pack_model(arm.model)
@@ -70,7 +67,7 @@ class RigidTree:
         return len(self.parents)
 
     def path(self, i: int) -> list[int]:
-        """Joint i and the joints that move it, i first."""
+        """Joint i and its ancestors, i first."""
         joints = [i]
         while self.parents[joints[-1]] >= 0:
             joints.append(int(self.parents[joints[-1]]))
@@ -78,40 +75,40 @@ class RigidTree:
 
     @property
     def absent(self) -> Bool[np.ndarray, " n"]:
-        """Joints that M does not depend on: one on the base, and sliding ones that no joint turns."""
+        """Joints that M does not depend on: those on the base, and prismatic ones without a revolute ancestor."""
         first = self.parents < 0
         fixed = [all(self.prismatic[j] for j in self.path(i)) for i in range(self.nv)]
         return first | np.array(fixed)
 
     @property
     def endless(self) -> Int[np.ndarray, " k"]:
-        """Prismatic joints whose travel M depends on and that state no end of it."""
+        """Prismatic joints that M depends on and whose travel is unbounded."""
         travel = np.isfinite(self.lower) & np.isfinite(self.upper)
         return np.flatnonzero(self.prismatic & ~self.absent & ~travel)
 
     def stops(self, i: int) -> tuple[float, ...]:
-        """The ends of a prismatic joint's travel [m], between which every energy is convex; 0 where M is the same."""
+        """Ends of the travel of a prismatic joint [m], between which energies are convex; 0 if it is `absent`."""
         return (0.0,) if self.absent[i] else (float(self.lower[i]), float(self.upper[i]))
 
     @property
     def physical(self) -> bool:
-        """Whether every body has mass ≥ 0 and inertia ⪰ 0, to rounding; learned ones need not."""
+        """Whether every body has mass ≥ 0 and inertia ⪰ 0, up to rounding; learned bodies may not."""
         least = least_eigenvalues(self.inertia) + 2.0 * self._rounding
         return bool((self.mass >= 0.0).all() and (least >= 0.0).all())
 
     @property
     def least_inertia(self) -> JointArray:
-        """At most λ_min of each body's inertia about its centre of mass [kg·m²], and at least 0."""
+        """Lower bound of λ_min of each body's inertia about its centre of mass [kg·m²], at least 0."""
         return np.maximum(least_eigenvalues(self.inertia) - self._rounding, 0.0)
 
     @property
     def _rounding(self) -> JointArray:
-        """An allowance for the inertias' digits: m c cᵀ was added and taken away again."""
+        """Allowance for rounding of the inertias, to which m c cᵀ was added and subtracted again."""
         size = np.linalg.norm(self.inertia, axis=(1, 2)) + self.mass * (self.centre**2).sum(1)
         return 64.0 * np.finfo(float).eps * size
 
     def placed(self, i: int, q: Float[np.ndarray, " samples"]) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (samples, 3, 3) and position (samples, 3) [m] of frame i in its parent's, at each q_i."""
+        """Rotation (samples, 3, 3) and position (samples, 3) [m] of frame i in its parent's frame, at each q_i."""
         if self.prismatic[i]:
             rotation = np.broadcast_to(self.rotation[i], (len(q), 3, 3))
             return rotation, self.position[i] + q[:, None] * self.rotation[i, :, 2]
@@ -123,7 +120,7 @@ class RigidTree:
         return self.rotation[i] @ turn, np.broadcast_to(self.position[i], (len(q), 3))
 
     def spatial_inertia(self, i: int) -> Float[np.ndarray, "6 6"]:
-        """Twice the kinetic energy of body i as a form of its frame's twist (v, ω), in that frame."""
+        """Spatial inertia of body i in its frame: twice its kinetic energy as a form in the twist (v, ω)."""
         to_centre = np.hstack([np.eye(3), -cross(self.centre[i])])
         form = self.mass[i] * to_centre.T @ to_centre
         form[3:, 3:] += self.inertia[i]

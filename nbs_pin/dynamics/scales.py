@@ -1,4 +1,4 @@
-"""What one unit of a network means in kg·m² and in joules."""
+"""Units of the network outputs in kg·m² and J."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,11 +15,15 @@ from nbs_pin.base.tensors import positive_scale
 
 @known_code
 class Scales(nn.Module):
-    """T̂ = T(q, Rv) + ½ε‖v‖² and V̂ = e V(q): of order one inside, of the arm's order outside.
+    """T̂ = T(q, Rv) + ½ε‖v‖² and V̂ = e V(q), with network outputs T and V of order one.
 
-    epsilon: ε [kg·m²], a floor under every eigenvalue of M̂. inertia: R² (n,) [kg·m²], such as the deviation of the
-    torque over that of the acceleration. energy: e [J]; None and 1 change nothing. Raises ArgumentError unless all are
-    finite and positive.
+    Args:
+        epsilon: ε [kg·m²], a lower bound of the eigenvalues of M̂.
+        inertia: R², (n,) [kg·m²], for instance the standard deviation of τ over that of v̇; None is 1.
+        energy: e [J].
+
+    Raises:
+        ArgumentError: If a number is not positive and finite.
     """
 
     root: torch.Tensor
@@ -45,6 +49,6 @@ class Scales(nn.Module):
 
 
 def stored_scales(t: Tensors) -> Mapping[str, Any]:
-    """The arguments of a network that its tensors hold (`base/storable.py`)."""
+    """Constructor arguments of a network that are read from its tensors (`base/storable.py`)."""
     numbers = {name: float(t[f"scales.{name}"]) for name in ("epsilon", "energy")}
     return numbers | {"prismatic": t["features.prismatic"].tolist(), "inertia": t["scales.inertia"].tolist()}

@@ -1,4 +1,4 @@
-"""Softplus networks with the start that the paper gives its Lagrangian networks."""
+"""Softplus networks with the initialisation of the paper's Lagrangian networks."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -12,15 +12,15 @@ from nbs_pin.base.known_code import known_code
 
 
 def softplus(x: Float[torch.Tensor, "*shape"]) -> Float[torch.Tensor, "*shape"]:
-    """log(1 + eˣ) and its derivatives to the last digit everywhere; torch's own takes x for it from 20 on."""
-    return nn.functional.softplus(x, threshold=40.0)  # beyond 40 the difference is below the last digit
+    """log(1 + eˣ), accurate for all x together with its derivatives; torch's default replaces it by x above 20."""
+    return nn.functional.softplus(x, threshold=40.0)  # above 40 the difference is below rounding
 
 
 def paper_spread(layer: int, sizes: Sequence[int]) -> float:
-    """ν of a layer's parameters, N(0, ν²): (1/√n)·2.2 for the first layer, 0.58 i for hidden layer i, n for the last.
+    """ν of a layer's initial parameters N(0, ν²): √n ν is 2.2 in the first layer, 0.58 i in layer i, n in the last.
 
-    sizes: the number n of neurons of every layer, without the input. Source: paper, section II-B, after Cranmer et al.
-    2020, where i counts from 1 behind the first layer.
+    `sizes` are the numbers n of neurons of all layers, without the input, and i is 0 in the first layer.
+    Source: paper, section II-B, after Cranmer et al. 2020.
     """
     n, last = sizes[layer], layer == len(sizes) - 1
     return (n if last else 0.58 * layer if layer else 2.2) / n**0.5
@@ -28,9 +28,9 @@ def paper_spread(layer: int, sizes: Sequence[int]) -> float:
 
 @known_code
 class SoftplusNetwork(nn.Module):
-    """A scalar function by hidden layers of softplus and a linear output; parameters w0, b0, … in float64.
+    """Scalar network with softplus hidden layers and a linear output, in float64.
 
-    Starts from N(0, ν²), biases included (`paper_spread`), drawn from `generator`.
+    `generator` draws the initial weights and biases from N(0, ν²) (`paper_spread`).
     """
 
     def __init__(self, inputs: int, widths: Sequence[int], generator: torch.Generator) -> None:

@@ -1,4 +1,4 @@
-"""Tanh networks with their tangents and gradients written out, so that training needs one reverse pass alone."""
+"""Tanh networks with explicit tangents and gradients, so that training needs a single reverse pass."""
 
 import math
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ from torch import nn
 from nbs_pin.base.known_code import known_code
 
 Tape: TypeAlias = list[torch.Tensor]
-"""Slopes of the hidden layers, as `pull` needs them."""
+"""Slopes of the hidden layers, for `pull`."""
 
 
 @known_code
 class TanhNetwork(nn.Module):
-    """Hidden layers of tanh, linear output; parameters w0, b0, w1, b1, … in float64.
+    """Network with tanh hidden layers and a linear output; float64 parameters w0, b0, w1, b1 and so on.
 
-    sizes: of the input, of every hidden layer and of the output. Starts from N(0, 1/inputs of the layer) without bias,
-    drawn from `generator`; the output layer from a tenth of that.
+    `sizes` are those of input, hidden layers and output. `generator` draws the initial weights of a layer from
+    N(0, 1/inputs), those of the output layer a tenth as large; biases are zero.
     """
 
     def __init__(self, sizes: Sequence[int], generator: torch.Generator) -> None:
@@ -47,7 +47,7 @@ class TanhNetwork(nn.Module):
     def push(
         self, x: Float[torch.Tensor, "*batch m"], tangents: Sequence[Float[torch.Tensor, "*batch m"]]
     ) -> tuple[Float[torch.Tensor, "*batch k"], list[Float[torch.Tensor, "*batch k"]], Tape]:
-        """The output at x, its derivatives along the tangents, and what `pull` needs."""
+        """The output at x, its derivatives along the tangents, and the tape for `pull`."""
         *hidden, (weight, bias) = self.layers()
         slopes = []
         for w, b in hidden:
@@ -57,7 +57,7 @@ class TanhNetwork(nn.Module):
         return nn.functional.linear(x, weight, bias), [nn.functional.linear(dx, weight) for dx in tangents], slopes
 
     def pull(self, tape: Tape, gradient: Float[torch.Tensor, "*batch k"]) -> Float[torch.Tensor, "*batch m"]:
-        """The gradient in the input that belongs to one in the output."""
+        """The gradient in the input for a gradient in the output, with the tape of `push`."""
         *hidden, (weight, _) = self.layers()
         gradient = gradient @ weight
         for (w, _), slope in zip(reversed(hidden), reversed(tape), strict=True):

@@ -1,4 +1,4 @@
-"""A Lagrangian without structure, the baseline: nothing makes its inertia positive definite."""
+"""A Lagrangian network without structure, as a baseline: its inertia need not be positive definite."""
 
 from collections.abc import Sequence
 
@@ -18,10 +18,10 @@ from nbs_pin.dynamics.structure import ModelClaims
 @known_code
 @storable(("widths",), arrays=stored_scales, sequence=tuple)
 class UnconstrainedLagrangian(GeneralLagrangianNetwork):
-    """L(q, v) = f(x(q), Rv) by one softplus network and ½ε‖v‖²; ∂²L/∂v² may be indefinite or singular.
+    """L(q, v) = e f(x(q), Rv) + ½ε‖v‖² with one softplus network f; ∂²L/∂v² may be indefinite or singular.
 
-    Source: Cranmer et al. 2020, "Lagrangian Neural Networks", with sine and cosine of angles, and the paper's start.
-    Arguments as in `CholeskyNetwork`. Raises ArgumentError when there are no joints, or ε or a scale is not positive.
+    Source: Cranmer et al. 2020, "Lagrangian Neural Networks", with sine and cosine of angles, and the initialisation of
+    the paper (`paper_spread`). Arguments and errors as in `CholeskyNetwork`.
     """
 
     fit_widths = (32, 32)
@@ -54,8 +54,6 @@ class UnconstrainedLagrangian(GeneralLagrangianNetwork):
         return s.energy * value + 0.5 * s.epsilon * (v * v).sum(-1)
 
     def structure_claims(self) -> ModelClaims:
-        """Raises CertificateRefused: nothing makes ∂²L/∂v² positive definite."""
-        refuse(
-            "nothing makes the inertia of an UnconstrainedLagrangian positive definite",
-            "learn a 'chain', 'cholesky' or 'homogenised' model",
-        )
+        """Raises CertificateRefused, because ∂²L/∂v² need not be positive definite."""
+        fault = "the inertia of an UnconstrainedLagrangian need not be positive definite"
+        refuse(fault, "learn a 'chain', 'cholesky' or 'homogenised' model")

@@ -1,1 +1,1 @@
-"""Models from data."""
+"""Models of arms from measured motions: data collection, log files, least squares and network fits."""

@@ -1,10 +1,9 @@
-"""The chain network from data: geometry by many descents from random trees, then the bodies by convex least squares.
+"""Fit of the chain network: geometry by descents from random trees, then bodies by convex least squares.
 
-1. From a random tree, Levenberg–Marquardt over placements, bodies and friction on a few hundred samples, bodies being
-   any symmetric matrices, in which torque is linear. Of all descents the lowest counts.
-2. The same once more on all samples, each joint weighted by the residual it was left with.
-3. For that geometry, the bodies that can exist and explain the data best, as for an arm whose geometry is known
-   (`identification.explain`).
+1. Levenberg–Marquardt from random trees over placements, bodies and friction, on a few hundred samples. A body may be
+   any symmetric matrix, since the torque is linear in it. The descents of lowest cost are kept.
+2. The same on all samples, then once more with every joint weighted by its residual.
+3. With this geometry fixed, the physically consistent bodies that explain the data best (`identify.explain`).
 4. Placements and these bodies together, then once more with axes at right angles where the data allow it.
 """
 
@@ -34,49 +33,49 @@ from nbs_pin.identification.tree_search import Measurements, TreeEstimate
 from nbs_pin.kernels.threads import cores
 
 _FEW = 400
-"""Samples that the search looks at."""
+"""Samples used in the search."""
 _EXACT = 1e-16
-"""Weighted residual below which a descent has found the arm."""
+"""Cost of a descent below which it explains the data to rounding."""
 _USUAL = 8
-"""Random trees that show which torques are usual."""
+"""Random trees from which the typical size of a torque is taken."""
 _ONE_AT_A_TIME = threading.Lock()
 _AXIS = 4
-"""Numbers that place the axis of a joint."""
+"""Parameters that determine the axis of a joint, a line in space."""
 _TRIES, _REACHED = 4, 2.0
-"""Trees that physical bodies are sought for, until their residual is at most so many times that of any bodies."""
+"""Most trees for which physical bodies are sought; ratio of their cost to that of arbitrary bodies that suffices."""
 _WAVE = 8
-"""Descents between two looks at the results."""
+"""Descents between two checks of the termination criterion."""
 _SAME, _FAR = 0.02, 0.1
-"""Descents whose costs differ by less than this share met in one minimum; one this far below the usual is no chance."""
+"""Relative difference of cost within one minimum; ratio to the median cost below which finding it twice suffices."""
 _UNLIKELY, _LIKELY = 9.0, 3.0
-"""Squared residuals, in units of the noise, that right angles may cost: once, and for each."""
+"""Increase of the sum of squares, in units of the noise, that right angles may cause: once, and for each angle."""
 _ERRORS = 6.0, 3.0
-"""Standard errors within which an angle may be right, first the first. Where the torque is even in a tilt t, as in
-a plane, noise makes t² and not t: t² of three standard errors is t of six, as its own error is that of t² over 2t."""
+"""Standard errors within which an angle may be a right one, tried in this order. If the torque is even in a tilt t, as
+in a plane, noise acts on t²: where t² is three standard errors, t is six, as the error of t is that of t² over 2t."""
 _LEAST = 1e-9
-"""Least residual that a joint is credited with, as a share of its torque."""
+"""Lower bound of the residual by which a joint is weighted, as a share of its torque."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChainFit:
-    """A chain network, and how it was found."""
+    """A fitted chain network and the record of its fit."""
 
     network: Chain
     friction: JointFriction | None
-    """Viscous and Coulomb friction, if they were to be learned."""
+    """Viscous and Coulomb friction, None unless it was to be fitted."""
     history: Float[np.ndarray, " steps"]
-    """Torque nMSE after every step of the descent that won."""
+    """Torque nMSE at the start and after every step of the search's descent to this tree."""
     evaluations: int
-    """Steps of all descents."""
+    """Steps of all descents of the search."""
     costs: Float[np.ndarray, " starts"]
-    """Torque nMSE where each descent of the search ended."""
+    """Torque nMSE at the end of each descent of the search."""
     stopped: str
-    """"converged": one tree explained the data, or the best minimum was met often enough, and physical bodies reach it.
-    "starts": neither. "interrupted": Ctrl-C ended the search."""
+    """"converged": a tree explained the data or the best minimum was found often enough, and physical bodies reach it.
+    "starts": one of these failed. "interrupted": Ctrl-C ended the search."""
     bodies: IdentificationReport
-    """How the bodies were found, for the placements of the search."""
+    """Report on the bodies, for the placements found by the search."""
     seconds: float
-    """What it took [s]."""
+    """Duration of the fit [s]."""
 
 
 def fit_chain(
@@ -92,16 +91,23 @@ def fit_chain(
     right_angles: bool = True,
     progress: bool = False,
 ) -> ChainFit:
-    """The rigid tree that moves as the data do; of the arm only the order and the kinds of its joints are given.
+    """Fit a rigid tree; of the arm only the order and kinds of its joints are given.
 
-    friction: also find viscous and Coulomb coefficients ≥ 0, for the speed `transition` [rad/s] at which they turn.
-    rotor_inertia: also find the inertias ≥ 0 of rotors behind gears, which an arm has and a tree of bodies has not.
-    regularisation: see `identify`. starts: most random trees to descend from; a search ends as soon as one explains the
-    data to rounding, or the best minimum has been met often enough. epsilon: ε of the network [kg·m²]. right_angles:
-    axes of neighbouring joints that the data do not tell from parallel or perpendicular become so, as most arms are
-    built, which spares part of what unknown geometry costs under noise. progress: show a bar at a terminal. Ctrl-C ends
-    the search and goes on with the best tree so far, if there is one.
-    Raises ArgumentError for data without torque, which arms of every scale explain, and as `identify` does.
+    Args:
+        data: Samples with torque.
+        seed: Seed of the random trees.
+        friction: Also find viscous and Coulomb coefficients ≥ 0.
+        rotor_inertia: Also find inertias ≥ 0 of rotors behind gears, which a tree of bodies cannot represent.
+        transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
+        regularisation: γ, as in `identify`.
+        starts: Most random trees; fewer if one explains the data to rounding or enough find the best minimum.
+        epsilon: ε of the network [kg·m²].
+        right_angles: Make axes of neighbouring joints parallel or perpendicular where the data do not contradict it, as
+            in most arms. This reduces the error that noise causes when the geometry is unknown.
+        progress: Show a progress bar. Ctrl-C ends the search and continues with the best tree so far, if there is one.
+
+    Raises:
+        ArgumentError: If the data have no torque, which arms of every scale explain, or as for `identify`.
     """
     began = time.perf_counter()
     positive("transition", transition, "rad/s")
@@ -109,21 +115,21 @@ def fit_chain(
     if not (isinstance(starts, int) and starts >= 1):
         raise ArgumentError(f"starts is {starts}, expected a whole number ≥ 1 of random trees; 64 is usual.")
     if not data.tau.any():
-        raise ArgumentError(f"{data!r} has no torque: arms of every scale move so; record one with motors on.")
+        raise ArgumentError(f"{data!r} has no torque: arms of every scale move alike; record one with motors on.")
     network = Chain(data.parents.tolist(), data.prismatic.tolist(), epsilon)
     scalars = Scalars(friction, rotor_inertia, transition)
     measured, layout = _measured(data, scalars), _layout(data.parents, data.prismatic)
-    handy, rng = _in_handy_units(measured, layout), np.random.default_rng(seed)
-    # BLAS threads below the threads of the search would only wait for each other; the limit is the whole process's.
+    scaled, rng = _in_units_of_random_trees(measured, layout), np.random.default_rng(seed)
+    # BLAS threads inside the threads of the search would only compete; the limit applies to the whole process.
     with _ONE_AT_A_TIME, threadpool_limits(1, "blas"):
-        descents, interrupted = _search(handy, layout, starts, rng, progress)
+        descents, interrupted = _search(scaled, layout, starts, rng, progress)
         tries: list[_Try] = []
         for descent in sorted(descents, key=_cost)[:_TRIES]:
-            polished = _polished(descent.at, handy)
+            polished = _polished(descent.at, scaled)
             bodies = explain(TreeGeometry(polished.at), data, scalars, regularisation, others=_AXIS * data.nv)
             physical = _physical(polished.at, bodies, measured, regularisation, right_angles)
             cost = physical.whole().cost(measured)
-            tries.append(_Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(handy) + _EXACT))
+            tries.append(_Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(scaled) + _EXACT))
             if tries[-1].reached:
                 break
     best = min(tries, key=lambda found: found.cost)
@@ -150,18 +156,18 @@ class _Try(NamedTuple):
     bodies: Bodies
     physical: PhysicalTree
     reached: bool
-    """Whether they explain the data about as well as any bodies."""
+    """Whether they explain the data about as well as arbitrary symmetric bodies."""
 
 
 @dataclass(frozen=True, eq=False)
 class TreeGeometry:
-    """The placements of a guess, as `identification` asks for them."""
+    """The placements of a tree estimate, as a `regressor.Geometry`."""
 
     guess: TreeEstimate
 
     @property
     def names(self) -> Sequence[str]:
-        """Numbers: data know no names."""
+        """Joint numbers, as the data have no names."""
         return [f"joint {i + 1}" for i in range(len(self.guess.positions))]
 
     @property
@@ -177,7 +183,7 @@ class TreeGeometry:
 
 
 def _measured(data: Dataset, scalars: Scalars) -> Measurements:
-    """The data with every joint weighted by the spread of its torque, at least a thousandth of the largest."""
+    """The data, every joint scaled by its torque's standard deviation, at least 1e-3 of the largest RMS torque."""
     least = 1e-3 * np.sqrt(np.square(data.tau).mean(axis=0).max())
     scale = np.maximum(data.tau.std(axis=0), least)
     kinds = scalars.factors(data.v, data.a)
@@ -185,11 +191,10 @@ def _measured(data: Dataset, scalars: Scalars) -> Measurements:
     return Measurements(q, v, a, tau, scale, kinds)
 
 
-def _in_handy_units(data: Measurements, layout: np.ndarray) -> Measurements:
-    """The torques in the unit in which random trees of 1 kg make such torques.
+def _in_units_of_random_trees(data: Measurements, layout: np.ndarray) -> Measurements:
+    """The torques in units of the typical torque of random trees, whose bodies are of about 1 kg.
 
-    Descents scale placements and bodies alike, so both should be about one. The bodies that are found in this unit are
-    not looked at: only their geometry is.
+    Placements and bodies share one damping, so both should be of order one. Of the result only the geometry is used.
     """
     rng, still = np.random.default_rng(0), replace(data, tau=np.zeros_like(data.tau))
     trees = [TreeEstimate.of(random_tree(len(layout) // 2, rng), layout, len(data.kinds)) for _ in range(_USUAL)]
@@ -199,7 +204,7 @@ def _in_handy_units(data: Measurements, layout: np.ndarray) -> Measurements:
 
 
 def _layout(parents: Int[np.ndarray, " n"], prismatic: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " layout"]:
-    """The tree layout of the kernels."""
+    """The layout array of the tree kernels."""
     return np.concatenate([[len(parents)], np.column_stack([parents, prismatic]).ravel()]).astype(np.int64)
 
 
@@ -210,10 +215,7 @@ def _cost(descent: Descent[TreeEstimate]) -> float:
 def _search(
     data: Measurements, layout: np.ndarray, starts: int, rng: np.random.Generator, progress: bool
 ) -> tuple[list[Descent[TreeEstimate]], bool]:
-    """Descents from random trees on a few samples, until one is good enough or the best has been met often enough.
-
-    Also whether Ctrl-C ended it, which it does once there is a tree to go on with.
-    """
+    """Descents from random trees on a few samples until `_settled`, and whether Ctrl-C ended them after some."""
     few = data.some(np.sort(rng.permutation(len(data.q))[:_FEW]))
     descents: list[Descent[TreeEstimate]] = []
 
@@ -240,10 +242,10 @@ def _search(
 
 
 def _settled(costs: np.ndarray) -> bool:
-    """Whether more descents are worth their time.
+    """Whether the search may end.
 
-    Enough is one that explains the data to rounding; or the best minimum met twice where it lies far below the usual
-    one; or, after two waves, met by a quarter of all.
+    It may if one descent explains the data to rounding, if two found the best minimum far below the median cost, or,
+    after two waves, if a quarter found it.
     """
     best = costs.min()
     met = int((costs <= (1.0 + _SAME) * best).sum())
@@ -255,7 +257,7 @@ def _settled(costs: np.ndarray) -> bool:
 
 
 def _polished(guess: TreeEstimate, data: Measurements) -> Descent[TreeEstimate]:
-    """The descent on all samples, then again with every joint weighted by what it was left with."""
+    """The descent on all samples, then once more with every joint weighted by its residual."""
     even = levenberg_marquardt(guess, lambda x: x.normal(data), lambda x: x.cost(data), TreeEstimate.moved)
     left = np.sqrt(np.mean(np.square(even.at.residual(data)), axis=0))
     fair = replace(data, scale=np.maximum(left, _LEAST * data.scale))
@@ -265,7 +267,7 @@ def _polished(guess: TreeEstimate, data: Measurements) -> Descent[TreeEstimate]:
 def _physical(
     guess: TreeEstimate, bodies: Bodies, data: Measurements, strength: float, right_angles: bool
 ) -> PhysicalTree:
-    """The descent over placements and physical bodies together, then again with the angles that it leaves likely."""
+    """The descent over placements and physical bodies together, then once more with the likely right angles."""
     fair = replace(data, scale=bodies.report.noise)
 
     def descend(start: PhysicalTree) -> Descent[PhysicalTree]:
@@ -285,7 +287,7 @@ def _physical(
 
 
 def _write(tree: PhysicalTree, network: Chain, rotor_inertia: bool) -> None:
-    """The tree into the parameters of the network."""
+    """Copy the tree into the parameters of the network."""
     with torch.no_grad():
         for name, value in tree.guess.tree(_triangular(tree.factors))._asdict().items():
             getattr(network, name).copy_(torch.from_numpy(value))
@@ -294,5 +296,5 @@ def _write(tree: PhysicalTree, network: Chain, rotor_inertia: bool) -> None:
 
 
 def _triangular(factors: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
-    """Lower triangular factors of the same FFᵀ, which need not be positive definite after rounding: FᵀQ = R, L = Rᵀ."""
+    """Lower triangular L with LLᵀ = FFᵀ, from Fᵀ = QR as L = Rᵀ; FFᵀ may be singular after rounding."""
     return np.asarray(np.linalg.qr(factors.swapaxes(1, 2), mode="r")).swapaxes(1, 2)

@@ -1,4 +1,4 @@
-"""Data to learn from, collected in MuJoCo: motions that excite an arm, motions that do not, and states at random."""
+"""Collection of identification data in MuJoCo: exciting motions, typical motions, a free swing and random states."""
 
 import math
 from collections.abc import Callable
@@ -26,11 +26,11 @@ from nbs_pin.simulation.mujoco_plant import MujocoPlant
 from nbs_pin.simulation.simulate import simulate
 
 Recipe: TypeAlias = Literal["excited", "reference", "passive", "uniform"]
-"""What `collect` knows."""
+"""Recipes of `collect`."""
 Acceleration: TypeAlias = Literal["simulator", "differentiated"]
-"""Where v̇ comes from."""
+"""Sources of v̇."""
 RECORD_STEP = 1e-3
-"""Control period, plant step and distance of the samples that derivatives are taken from [s]."""
+"""Control period, plant step and spacing of the samples that are differentiated [s]."""
 _TIMED = ("excited", "reference")
 _TRAJECTORIES = 20
 
@@ -49,30 +49,37 @@ def collect(
     speed: float = 2.0,
     progress: bool = False,
 ) -> Dataset:
-    """Samples of the arm in MuJoCo, as an experimenter would record them.
+    """Collect samples of the arm's motion in MuJoCo, as they would be recorded in an experiment.
 
-    recipe:
-      "excited"    random sums of sines in torque, 0.2 to 1.5 Hz, about a soft PD with gravity compensation; many
-                   trajectories of `duration` [s] that start anywhere in the joint ranges, torques inside the limits
-      "reference"  PD+ along `Sinusoid.for_robot` of random frequency and phase: data of an arm at its work
-      "passive"    one swing from rest at zero with no torque, a sample every 1 ms: the paper's data, which cannot tell
-                   M, G from c·M, c·G (docs/theory.md §6)
-      "uniform"    independent states: q uniform in the ranges, a turn at most, |v| ≤ `speed`, random torques inside the
-                   limits; no arm can be measured so, but nothing is left unidentifiable
-    samples: how many. seed: of everything random; the same seed gives the same data.
-    noise: what encoders and torque sensors do to the record.
-    acceleration: v̇ as the "simulator" knows it or "differentiated" from v (Savitzky–Golay); None is "simulator" unless
-    encoders round, which give both v and v̇ by differentiation. A derivative sees the torques held before and after its
-    instant, so τ is then their mean.
-    friction: True lets the friction of the URDF act, a `JointFriction` another (its transition is not used: MuJoCo's
-    joints stick). τ stays what the motors applied.
-    sampling: time between samples [s], a whole number of ms; None is 0.001 for "passive" and otherwise from 0.01 to
-    0.05, so that few samples still come from 20 trajectories: neighbours in time say the same.
-    speed: about how fast an excited joint moves [rad/s]; peaks stay near the velocity limit.
-    progress: show a progress bar when it takes longer than 2 s at a terminal.
-    Torque limits are the arm's; a joint without one is given what its heaviest posture needs, and 20 rad/s² on top.
-    Raises ArgumentError for an unknown recipe or settings that do not fit it, RobotError for an arm that MuJoCo cannot
-    build, and SimulationDiverged when the arm leaves the finite numbers.
+    - "excited": random multisine torques, 0.2 to 1.5 Hz, about a soft PD, from anywhere in the joint ranges
+    - "reference": PD+ along `Sinusoid.for_robot` of random frequency and phase, as in typical use of an arm
+    - "passive": one swing from rest at q = 0 without torque, a sample every 1 ms: the paper's data, which cannot
+      distinguish M, G from c·M, c·G (docs/theory.md §6)
+    - "uniform": independent random q (one turn at most), v and τ within limits; not measurable, but fully identifiable
+
+    Args:
+        robot: The arm. A joint without torque limit gets one: its largest gravity torque plus that of 20 rad/s².
+        recipe: One of the above.
+        samples: Number of samples.
+        seed: Random seed; the same seed gives the same data.
+        noise: Errors of encoders and torque sensors. None takes exact ones.
+        acceleration: Source of v̇, "simulator" or "differentiated" from v (Savitzky–Golay); τ is then the mean of the
+            torques held before and after. None takes "simulator"; quantised encoders give v and v̇ as derivatives of q.
+        friction: True simulates that of the URDF, a `JointFriction` another (MuJoCo has no transition); τ includes it.
+        sampling: Sampling time [s], whole ms. None takes 0.001 for "passive", else 0.01 to 0.05, for 20 trajectories.
+        duration: Longest duration of an "excited" or "reference" trajectory [s].
+        speed: Bound of |v| in "uniform" [rad/s]; typical |v| in "excited", with peaks near the velocity limit.
+        progress: Show a progress bar at a terminal if the collection takes longer than 2 s.
+
+    Raises:
+        ArgumentError: If the recipe is unknown or a setting does not fit it.
+        RobotError: If MuJoCo cannot build the arm.
+        SimulationDiverged: If the simulated state is no longer finite.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.collect(nbs.load_robot("two_link"), "uniform", samples=100)
+        Dataset(100 samples of two_link, 100 trajectories, 2 joints)
     """
     noise = noise or Noise()
     _check(recipe, samples, speed, noise, acceleration)
@@ -100,13 +107,12 @@ def collect(
         "robot": {"source": robot.source, "sha256": robot.sha256, "options": robot.options},
     }
     tau = tau + noise.torque * generator.standard_normal(tau.shape)
-    return Dataset(
-        q, v, a, tau, t, np.repeat(np.arange(len(counts)), counts), robot.parents, robot.prismatic, robot.name, about
-    )
+    trajectory = np.repeat(np.arange(len(counts)), counts)
+    return Dataset(q, v, a, tau, t, trajectory, robot.parents, robot.prismatic, robot.name, about)
 
 
 class _Idle(MemorylessController):
-    """No torque at all."""
+    """Zero torque."""
 
     def __init__(self, nv: int) -> None:
         self._nv = nv
@@ -122,7 +128,7 @@ class _Idle(MemorylessController):
 
 
 class _Record(NamedTuple):
-    """States `RECORD_STEP` apart, the torque held from each to the next, and the acceleration it begins with."""
+    """States `RECORD_STEP` apart, the torque held from each to the next, and the acceleration at its start."""
 
     t: np.ndarray
     q: np.ndarray
@@ -133,13 +139,13 @@ class _Record(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Bench:
-    """The arm on the bench: what every trajectory of a collection shares."""
+    """The test bench: what all trajectories of a collection share."""
 
     robot: Robot
     plant: MujocoPlant
     law: Controller
     motion: Callable[[np.random.Generator], DesiredMotion]
-    """Draws what the law aims at in one trajectory."""
+    """Draws the reference of one trajectory."""
     friction: JointFriction | None
     limit: np.ndarray
     """Largest torques (n,) [N·m]."""
@@ -169,18 +175,15 @@ def _bench(recipe: str, robot: Robot, friction: JointFriction | None, speed: flo
 
 @dataclass(frozen=True)
 class _Instruments:
-    """How a record is read."""
+    """Sampling, noise and differentiation of a record."""
 
     stride: int
-    """Records from one sample to the next."""
+    """Rows of the record per sample."""
     noise: Noise
     differentiated: bool
 
     def read(self, bench: _Bench, generator: np.random.Generator, count: int) -> tuple[np.ndarray, ...]:
-        """t, q, v, v̇ and τ of `count` samples of one trajectory.
-
-        A derivative at the end of a record is a poor one: half a window more is recorded there, and left out.
-        """
+        """t, q, v, v̇ and τ of `count` samples, half a window away from the ends of the record if differentiated."""
         window = QUANTISED_WINDOW if self.noise.encoder else CLEAN_WINDOW
         margin = window // 2 if self.differentiated else 0
         record = bench.record(generator, (count - 1) * self.stride + 1 + 2 * margin)
@@ -196,7 +199,7 @@ class _Instruments:
 
 
 def _states(bench: _Bench, samples: int, speed: float, generator: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """t, q, v, v̇ and τ of independent states; torques are drawn as accelerations, which suit heavy and light joints."""
+    """t, q, v, v̇ and τ of independent states; torques follow from random v̇, which suits heavy and light joints."""
     shape = samples, bench.robot.nv
     lower, upper = configuration_box(bench.robot)
     q = lower + (upper - lower) * generator.random(shape)
@@ -210,18 +213,18 @@ def _states(bench: _Bench, samples: int, speed: float, generator: np.random.Gene
 
 
 def _interval(recipe: str, samples: int, sampling: float | None, duration: float) -> float:
-    """Time between samples [s]: the one asked for, or the usual one."""
+    """Time between samples [s]: `sampling`, or the default of the recipe."""
     positive("duration", duration, "s")
     if sampling is None:
         spread = round(_TRAJECTORIES * duration / samples / RECORD_STEP)
         sampling = RECORD_STEP * (1 if recipe == "passive" else min(max(spread, 10), 50))
     if duration < sampling and recipe in _TIMED:
-        raise ArgumentError(f"a trajectory of {duration} s has no two samples {sampling:g} s apart; make it longer.")
+        raise ArgumentError(f"duration is {duration} s, expected at least sampling = {sampling:g} s; make it longer.")
     return sampling
 
 
 def _shares(samples: int, longest: int) -> list[int]:
-    """How many samples each trajectory gives: nearly equal shares of at most `longest`, two or more if possible."""
+    """Samples of each trajectory: nearly equal, at most `longest`, for two or more trajectories if possible."""
     count = min(max(math.ceil(samples / max(longest, 1)), 2), samples)
     return np.diff(np.linspace(0, samples, count + 1).astype(int)).tolist()
 
@@ -235,12 +238,8 @@ def _check(recipe: str, samples: int, speed: float, noise: Noise, acceleration: 
         raise ArgumentError(f"samples is {samples}, expected a whole number ≥ 1; correct it.")
     positive("speed", speed, "rad/s")
     if noise.encoder > 0.0 and acceleration == "simulator":
-        raise ArgumentError(
-            "rounded encoders were asked for with the simulator's acceleration, which no arm with such encoders knows; "
-            "leave acceleration out."
-        )
+        raise ArgumentError("acceleration 'simulator' excludes rounded encoders; leave acceleration out.")
     if recipe == "uniform" and (noise.encoder > 0.0 or acceleration == "differentiated"):
         raise ArgumentError(
-            "the recipe 'uniform' has single states and nothing to differentiate; give another recipe, or torque noise "
-            "alone."
+            "recipe 'uniform' has single states and nothing to differentiate; give another recipe or only torque noise."
         )

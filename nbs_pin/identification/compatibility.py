@@ -1,4 +1,4 @@
-"""Whether data are of the arm that they are used for, or of the one that other data are of."""
+"""Checks that data belong to a given arm, or to the same arm as other data."""
 
 from typing import NamedTuple
 
@@ -9,31 +9,31 @@ from nbs_pin.robots.robot import Robot
 
 
 def arm_fault(data: Dataset, robot: Robot) -> str:
-    """Why the data cannot be of this arm, for a refusal, or an empty string.
+    """Why the data cannot belong to this arm, for an error message, or an empty string.
 
-    Their trees of joints must be the same. Their descriptions need not: the nominal arm of "residual" and "identified"
-    is wrong by design, so a description from a file may differ in masses and lengths, and so may an arm of the data's
-    own name. Two arms of the catalogue by different names, with different fingerprints (`Robot.sha256`, in which other
-    effort limits do not count), are a mistake. Data that name no arm are judged by their tree.
+    The joint trees must be equal. Masses and lengths need not be if the arm is from a file or has the data's own name:
+    the nominal arm of "residual" and "identified" is inaccurate by design. Two catalogue arms of different names and
+    fingerprints (`Robot.sha256`, which ignores effort limits) do not match. Data that name no arm are judged by their
+    joint tree.
     """
     parents, prismatic = robot.parents, robot.prismatic
     if robot.nv != data.nv:
-        return f"the data have {data.nv} joints and {robot.name} {robot.nv}; give the arm they are of"
+        return f"the data have {data.nv} joints and {robot.name} {robot.nv}; give the arm they were recorded on"
     if not (np.array_equal(data.parents, parents) and np.array_equal(data.prismatic, prismatic)):
         return (
             f"the joints of the data are {_joints(data.parents, data.prismatic)} and those of {robot.name} "
-            f"{_joints(parents, prismatic)}; give the arm they are of, also to load_log"
+            f"{_joints(parents, prismatic)}; give the arm they were recorded on, also to load_log"
         )
     said, given = _Arm.of_data(data), _Arm(robot.name, robot.source, robot.sha256)
     if said.in_catalogue and given.in_catalogue and said.differs(given):
-        return f"the data are of {said.name}, not of {robot.name}; give the arm they are of"
+        return f"the data are of {said.name}, not of {robot.name}; give the arm they were recorded on"
     return ""
 
 
 def other_data_fault(data: Dataset, other: Dataset, name: str) -> str:
-    """Why the other data, called by that name, are not of the arm of these, or an empty string.
+    """Why `other`, called `name` in the message, does not belong to the arm of `data`, or an empty string.
 
-    Trees of joints must be the same; where both say of which arm they are, its name or its fingerprint must be too.
+    The joint trees must be equal; if both name their arm, the name or the fingerprint must be equal too.
     """
     if other.nv != data.nv:
         return f"{name} has {other.nv} joints and the data {data.nv}; give data of one arm"
@@ -47,7 +47,7 @@ def other_data_fault(data: Dataset, other: Dataset, name: str) -> str:
 
 
 class _Arm(NamedTuple):
-    """What is known of an arm; texts are empty where nothing is."""
+    """What is known of an arm; unknown entries are empty."""
 
     name: str
     source: str
@@ -61,18 +61,18 @@ class _Arm(NamedTuple):
 
     @property
     def in_catalogue(self) -> bool:
-        """An arm of a file has the path as its source."""
+        """Whether the arm is from the catalogue; the source of an arm from a file is its path."""
         return self.source == self.name
 
     def differs(self, other: "_Arm") -> bool:
-        """By name and by fingerprint, all of which are known."""
+        """Whether names and fingerprints are known and both differ."""
         known = self.name and other.name and self.sha256 and other.sha256
         return bool(known) and self.name != other.name and self.sha256 != other.sha256
 
 
 def _joints(parents: np.ndarray, prismatic: np.ndarray) -> str:
-    """A tree of joints in words: what each is and what it hangs on."""
-    kinds = ("sliding" if slides else "turning" for slides in prismatic)
+    """A joint tree in words: the kind and the parent of each joint."""
+    kinds = ("prismatic" if slides else "revolute" for slides in prismatic)
     return ", ".join(
         f"{kind} on {f'joint {parent}' if parent else 'the base'}" for kind, parent in zip(kinds, parents, strict=True)
     )

@@ -1,4 +1,4 @@
-"""Measurements motions to learn from: states, accelerations and torques, sorted into trajectories."""
+"""Datasets: measured states, accelerations and torques of an arm, sorted into trajectories."""
 
 import json
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 
 DATASET_FORMAT = "nbs_pin dataset 1"
-"""What the `format` entry of a data file says."""
+"""Value of the `format` entry of a data file."""
 _STATES = ("q", "v", "a", "tau")
 _KINDS: dict[tuple[str, ...], type] = {
     (*_STATES, "t"): np.float64,
@@ -26,13 +26,23 @@ _KINDS: dict[tuple[str, ...], type] = {
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Samples of an arm in motion; row k of every array belongs to one instant.
+    """Samples of an arm in motion; row k of every array belongs to the same instant.
 
-    The samples of a trajectory are contiguous and in the order of time. Samples of one trajectory resemble each other,
-    so only whole trajectories are held out (`split`), and a claim counts them, not samples (docs/theory.md §6).
-    Lists and numbers of other kinds become arrays of float64, int64 and bool.
-    Raises ArgumentError for what is no array of such numbers, arrays that do not fit each other, numbers that are not
-    finite, a trajectory that is interrupted or runs backwards, and a tree whose parents do not come first.
+    The samples of a trajectory are contiguous and in the order of time. They are correlated, so `split` holds out whole
+    trajectories, and statistical claims count trajectories, not samples (docs/theory.md §6). Lists and arrays of other
+    types are converted to float64, int64 and bool.
+
+    Raises:
+        ArgumentError: If an array is not numeric, shapes do not match, a number is not finite, a trajectory is
+            interrupted or its time does not increase, or a joint comes before its parent.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> t = np.linspace(0.0, 1.0, 50)
+        >>> q, v, a = (x[:, None] for x in (np.sin(t), np.cos(t), -np.sin(t)))
+        >>> nbs.Dataset(q, v, a, 2.0 * a, t, trajectory=np.arange(50) // 25, parents=[0], prismatic=[False])
+        Dataset(50 samples, 2 trajectories, 1 joints)
     """
 
     q: Float[np.ndarray, "samples n"]
@@ -42,19 +52,19 @@ class Dataset:
     a: Float[np.ndarray, "samples n"]
     """Acceleration [rad/s²]."""
     tau: Float[np.ndarray, "samples n"]
-    """Torque that the motors applied [N·m]: what friction took is still in it."""
+    """Motor torque [N·m], including the part that overcomes friction."""
     t: Float[np.ndarray, " samples"]
     """Time within the trajectory [s]."""
     trajectory: Int[np.ndarray, " samples"]
-    """Number of the trajectory that the sample is of."""
+    """Number of the trajectory of each sample."""
     parents: Int[np.ndarray, " n"]
-    """Tree of joints: 0 where the parent is the base, i + 1 where it is joint i; parents come first."""
+    """Joint tree: 0 if the parent is the base, i + 1 if it is joint i; parents come first."""
     prismatic: Bool[np.ndarray, " n"]
-    """True for joints that slide; their q is in [m], their torque a force [N]."""
+    """True for prismatic joints, whose q is in [m] and whose torque is a force [N]."""
     robot: str = ""
-    """Name of the arm, for messages."""
+    """Name of the arm; empty if unknown."""
     about: Mapping[str, Any] = field(default_factory=dict)
-    """How the data came to be (recipe, seed, noise, friction, …), as JSON can store it."""
+    """Origin of the data (recipe, seed, noise, friction, …), JSON-serialisable."""
 
     def __post_init__(self) -> None:
         for names, kind in _KINDS.items():
@@ -87,30 +97,30 @@ class Dataset:
         return int(np.unique(self.trajectory).size)
 
     def split(self, share: float = 0.2, seed: int = 0) -> tuple["Dataset", "Dataset"]:
-        """Whole trajectories to learn from, and about `share` of them, at least one, held out; drawn with the seed.
+        """Split by whole trajectories into training data and held-out data, about `share` and at least one; at random.
 
-        Raises ArgumentError for a share outside (0, 1) and for one trajectory only, of which nothing can be held out.
+        Raises:
+            ArgumentError: If share is outside (0, 1) or there is only one trajectory.
         """
         if not 0.0 < share < 1.0:
             raise ArgumentError(f"share is {share}, expected a number between 0 and 1; 0.2 is usual.")
         ids = np.unique(self.trajectory)
         if ids.size < 2:
-            raise ArgumentError(
-                f"{self!r} cannot be split: samples of one trajectory resemble each other; collect several."
-            )
+            raise ArgumentError(f"{self!r} cannot be split: it has only one trajectory; collect several.")
         count = int(np.clip(round(share * ids.size), 1, ids.size - 1))
         held_out = np.isin(self.trajectory, np.random.default_rng(seed).permutation(ids)[:count])
         return self.take(~held_out), self.take(held_out)
 
     def take(self, rows: Any) -> "Dataset":
-        """The samples that numpy's index `rows` selects (a slice, a mask, or numbers in increasing order)."""
+        """The samples selected by the numpy index `rows` (a slice, a mask, or increasing indices)."""
         index = np.arange(len(self))[rows]
         return replace(self, **{name: getattr(self, name)[index] for name in (*_STATES, "t", "trajectory")})
 
     def save(self, path: str | Path) -> None:
-        """Write an npz file; missing folders are made, an older file is replaced whole or left alone.
+        """Write an npz file atomically; missing folders are created.
 
-        Raises ArgumentError when `about` holds something JSON cannot say.
+        Raises:
+            ArgumentError: If `about` cannot be stored as JSON.
         """
         try:
             about = json.dumps(dict(self.about), allow_nan=False)
@@ -121,10 +131,11 @@ class Dataset:
 
 
 def load_dataset(path: str | Path) -> Dataset:
-    """The data in the npz file that `Dataset.save` wrote; logs from elsewhere come through `load_log`.
+    """Load an npz file written by `Dataset.save`; `load_log` reads other logs.
 
-    Raises FileNotFoundError for no file and FileFormatError for one that is damaged, of another kind, lacks an array or
-    holds arrays that make no dataset.
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        FileFormatError: If it is damaged, of another format, lacks an array, or its arrays are not a valid dataset.
     """
     data = read_npz(path)
     require(data, path, {"format": "U"})
@@ -144,22 +155,22 @@ def load_dataset(path: str | Path) -> Dataset:
 
 
 def trajectory_slices(trajectory: Int[np.ndarray, " samples"]) -> list[slice]:
-    """The stretch of samples that each trajectory takes, in order."""
+    """The rows of each trajectory, in order."""
     cuts = np.flatnonzero(np.diff(trajectory)) + 1
     bounds = [0, *cuts.tolist(), len(trajectory)]
     return [slice(begin, end) for begin, end in pairwise(bounds) if end > begin]
 
 
 def _fault(data: Dataset) -> str:
-    """What is wrong with a dataset and what to do, or an empty string."""
+    """What is wrong with a dataset and how to correct it, or an empty string."""
     arrays = {name: getattr(data, name) for name in (*_STATES, "t", "trajectory", "parents", "prismatic")}
     return _shape_fault(arrays) or _number_fault(arrays) or _order_fault(data) or _tree_fault(data)
 
 
 def _array(name: str, value: Any, kind: type) -> np.ndarray:
-    """The values as an array of that kind, itself where it is one; nothing is rounded to a whole number or a bool."""
+    """The values as an array of that type, uncopied if it is one; nothing is rounded to a whole number or a bool."""
     numbers = floats(f"the dataset's {name}", value)
-    with np.errstate(invalid="ignore"):  # NaN as a whole number is refused below
+    with np.errstate(invalid="ignore"):  # NaN cast to an integer is refused below
         array: np.ndarray = np.asarray(value).astype(kind, copy=False)
     if kind is not np.float64 and not np.array_equal(array, numbers):
         expected = "whole numbers" if kind is np.int64 else "true or false for every joint"

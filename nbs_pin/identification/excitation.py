@@ -1,4 +1,4 @@
-"""Motions and states that make an arm show its dynamics, inside its ranges, speeds and torques."""
+"""Exciting motions for identification, within joint ranges, velocity limits and torque limits."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +15,9 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import Sinusoid
 from nbs_pin.robots.robot import Robot
 
-_BAND = (0.2, 1.5)  # [Hz]; what the window of a quantised record lets through without loss
+_BAND = (0.2, 1.5)  # [Hz]; passes the differentiation window of a quantised record unattenuated
 _TONES = 6
-_LOOP = 6.0  # [rad/s]; soft, so that the torques move the arm, and the arm itself
+_LOOP = 6.0  # [rad/s]; low, so that the exciting torques move the arm
 _DAMPING = 1.4  # 2ζ
 _HEADROOM = 20.0  # [rad/s²]
 
@@ -27,16 +27,16 @@ class Multisine:
     """q = offset + Σ_k amplitude_k sin(frequency_k t + phase_k), per joint; arrays of shape (tones, n)."""
 
     amplitude: Float[np.ndarray, "tones n"]
-    """[rad]."""
+    """Amplitudes [rad]."""
     frequency: Float[np.ndarray, "tones n"]
-    """[rad/s]."""
+    """Angular frequencies [rad/s]."""
     phase: Float[np.ndarray, "tones n"]
-    """[rad]."""
+    """Phases [rad]."""
     offset: JointArray
-    """[rad]."""
+    """Mean configuration [rad]."""
 
     def __call__(self, t: Any) -> Reference:
-        """Motion at t [s]."""
+        """Reference at t [s]."""
         A, w = self.amplitude, self.frequency
         angle = w * np.asarray(t, dtype=float)[..., None, None] + self.phase
         sine, cosine = np.sin(angle), np.cos(angle)
@@ -45,23 +45,23 @@ class Multisine:
 
 
 def soft_pd(robot: Robot, friction: JointFriction | None = None, *, period: float) -> PD:
-    """The PD with gravity compensation that torques excite the arm about: 6 rad/s, what a sampled loop can damp.
+    """The PD with gravity compensation about which the arm is excited, of 6 rad/s, its damping limited by the period.
 
-    Aiming it at a motion x adds the torque K_p x + K_d ẋ to a PD that holds the arm: sines give sines. friction: fed
-    forward at ẋ. period [s].
+    The reference x adds the torque K_p x + K_d ẋ to a PD that holds the arm, so sines in x are sines in torque.
+    Friction is fed forward at ẋ; period [s].
     """
     model = PinocchioDynamics(robot)
-    # A light joint is thrown about by its neighbours' accelerations: it gets gains for all the inertia in its row of M.
+    # Accelerations of its neighbours disturb a light joint, so its gains follow the sum over its row of |M|.
     inertia = np.abs(model.mass_matrix(sample_configurations(robot))).sum(axis=-1).max(axis=0)
     kd = np.minimum(_DAMPING * _LOOP * inertia, 0.25 * effective_inertia(robot, model) / period)
     return PD(model, feedforward="gravity", kp=_LOOP * kd / _DAMPING, kd=kd, friction=friction)
 
 
 def excitation(robot: Robot, generator: np.random.Generator, speed: float) -> Multisine:
-    """What `soft_pd` is aimed at: sines of 0.2 to 1.5 Hz with about equal speeds, somewhere in the joint ranges.
+    """A random reference of `soft_pd`: sines of 0.2 to 1.5 Hz with about equal speeds, within the joint ranges.
 
-    Their RMS speed is 0.6·`speed` [rad/s], at most 0.35 of the velocity limit, so that peaks stay near it; the sum of
-    their amplitudes keeps the aim inside the range.
+    The RMS speed is 0.6·`speed` [rad/s], at most 0.35 of the velocity limit, so that peaks stay near it; the sum of the
+    amplitudes keeps the reference within the ranges.
     """
     n, (lower, upper), band = robot.nv, configuration_box(robot), np.log(_BAND)
     frequency = 2.0 * np.pi * np.exp(generator.uniform(band[0], band[1], (_TONES, n)))
@@ -75,19 +75,19 @@ def excitation(robot: Robot, generator: np.random.Generator, speed: float) -> Mu
 
 
 def work(robot: Robot, generator: np.random.Generator) -> Sinusoid:
-    """A motion of an arm at its work: `Sinusoid.for_robot` at 0.5 to 4 rad/s, any phase."""
+    """A typical motion in use: `Sinusoid.for_robot` with random frequency from 0.5 to 4 rad/s and random phase."""
     frequency = float(np.exp(generator.uniform(np.log(0.5), np.log(4.0))))
     usual = Sinusoid.for_robot(robot, frequency)
     return Sinusoid(usual.amplitude, usual.frequency, generator.uniform(-np.pi, np.pi, robot.nv), usual.offset)
 
 
 def configuration_box(robot: Robot) -> tuple[JointArray, JointArray]:
-    """(lower, upper) of the configurations to learn from [rad, m]: the joint ranges, of turning joints one turn."""
+    """(lower, upper) of the sampled configurations [rad, m]: the joint ranges, at most one turn of a revolute joint."""
     return robot.one_turn_range
 
 
 def torque_limits(robot: Robot) -> JointArray:
-    """Largest torques of an experiment [N·m]: the arm's own, else what gravity asks at most and 20 rad/s² on top."""
+    """Torque limits of an experiment [N·m]: the arm's own, else the largest gravity torque plus that of 20 rad/s²."""
     if np.isfinite(robot.effort_limit).all():
         return robot.effort_limit
     model = PinocchioDynamics(robot)

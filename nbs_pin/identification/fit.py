@@ -1,4 +1,4 @@
-"""`fit`: a model of an arm from measured motions, by the name of its kind."""
+"""`fit`: a model of an arm from measured motions, chosen by name."""
 
 import time
 from typing import Any
@@ -17,7 +17,7 @@ from nbs_pin.identification.registry import MODELS
 from nbs_pin.robots.robot import Robot
 
 _USELESS = 0.9
-"""Share of the torque's variance left unexplained beyond which a model says nothing."""
+"""Torque nMSE above which a model is reported as useless."""
 HELD_OUT = 0.2
 """Share of the trajectories that `fit` holds out by default."""
 
@@ -33,17 +33,30 @@ def fit(
     progress: bool = False,
     **settings: Any,
 ) -> DynamicsProvider:
-    """A model of the arm that explains the data; its `report` is a `FitReport`, its `friction` what was learned of it.
+    """Fit a model of the arm to the data; its `report` is a `FitReport`, its `friction` the learned friction.
 
-    model: one of `identification.registry.MODELS`. seed: of first parameters, batches, and what is held out. robot: the arm that the model is
-    for; networks take limits and drawings from it, "residual" its nominal model and "identified" its geometry.
-    held_out: trajectories that are not learned from, a dataset or a share of the data; None takes `HELD_OUT` where
-    there are two trajectories at least, 0 nothing. They choose the iteration of a network. friction: learn viscous and
-    Coulomb friction too, which is no part of M, C, G. progress: show a bar.
-    settings: loss, optimiser and iterations of a network (`fit_network`) and its widths; what `identify` takes.
-    Ctrl-C ends the fit of a network and keeps the best. Raises ArgumentError for an unknown model, settings that are
-    none of its own, a missing robot or one that the data are not of (`compatibility.py`; its masses and lengths may be
-    wrong), held_out of another arm, and data without torque unless the loss is that of the acceleration.
+    Args:
+        data: Samples with torque, or without it for a network with loss "acceleration".
+        model: One of `identification.registry.MODELS`.
+        seed: Seed of initial parameters, batches and the choice of held-out trajectories.
+        robot: The arm; its masses and lengths may be inaccurate. "residual" needs its nominal model, "identified" its
+            geometry; the other models take limits and drawings from it.
+        held_out: Trajectories not trained on, as a dataset or a share of the data, 0 for none. They select the iterate
+            of a network. None takes `HELD_OUT` if there are at least two trajectories.
+        friction: Also learn viscous and Coulomb friction, which is not part of M, C, G.
+        progress: Show a progress bar. Ctrl-C ends the fit of a network and keeps the best iterate.
+        **settings: Options of the model, see `fit_network`, `fit_chain` and `identify`; widths of a network.
+
+    Raises:
+        ArgumentError: If the model or a setting is unknown, the robot is missing, data, robot and held_out are not of
+            one arm (`compatibility.py`), or the data have no torque and the loss is not "acceleration".
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> data = nbs.collect(robot, "uniform", samples=100)
+        >>> nbs.fit(data, "identified", robot=robot).report.test_nmse < 1e-9
+        True
     """
     fitter = entry("model", model, MODELS).load()
     fault = "" if robot is None else arm_fault(data, robot)
@@ -72,7 +85,7 @@ def fit(
 
 
 def split_data(data: Dataset, held_out: Dataset | float | None = None, seed: int = 0) -> tuple[Dataset, Dataset | None]:
-    """What is learned from, and what is held out for `fit` with these arguments; raises as `fit` does."""
+    """The training data and the held-out data of `fit` with these arguments; raises as `fit` does."""
     if isinstance(held_out, Dataset):
         fault = other_data_fault(data, held_out, "held_out")
         if fault:
@@ -83,12 +96,10 @@ def split_data(data: Dataset, held_out: Dataset | float | None = None, seed: int
 
 
 def _useless(model: DynamicsProvider, data: Dataset, friction: JointFriction | None) -> tuple[str, ...]:
-    """What to say of a fit that explains next to nothing: torque that is noise, or does not change."""
+    """A remark on a fit that explains hardly anything, as the torque is noise or constant."""
     nmse = torque_nmse(model, data, friction)
     if np.isnan(nmse) and data.tau.any():
-        return ("everything: the torque never varies, so nothing was learned of how it does",)
+        return ("everything: the torque is constant, so its dependence on the motion is unknown",)
     if nmse > _USELESS and data.tau.any():
-        return (
-            f"everything: {nmse:.0%} of the torque's variance is unexplained, as if it were noise or another arm's",
-        )
+        return (f"everything: {nmse:.0%} of the torque's variance is unexplained; it may be noise or of another arm",)
     return ()

@@ -1,4 +1,4 @@
-"""What is said of a fit, whatever was fitted."""
+"""The report of a fit, common to all models."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,37 +15,37 @@ _VARIES = 1e-12
 
 @dataclass(frozen=True)
 class FitReport:
-    """How a model was fitted; `report` of what `fit` returns."""
+    """How a model was fitted: the `report` of a model returned by `fit`."""
 
     model: str
     seed: int
     samples: int
-    """Learned from, without those held out."""
+    """Training samples, without those held out."""
     seconds: float
-    """What it took [s]."""
+    """Duration of the fit [s]."""
     evaluations: int
-    """Passes over the data, derivatives included; 0 where none are counted."""
+    """Passes over the data, derivatives included; steps of the optimiser for "chain" and "identified"."""
     parameters: int
-    """Numbers that were learned."""
+    """Number of learned parameters."""
     history: tuple[float, ...]
-    """Normalised mean squared residual: untrained, and after every iteration."""
+    """Normalised mean squared residual, before training and after every iteration."""
     held_out: tuple[float, ...]
-    """The same on what was held out; empty where it chose nothing."""
+    """The same on the held-out data; empty if they did not select the iteration."""
     train_nmse: float
-    """Mean over joints of mean squared torque error over torque variance (`torque_nmse`)."""
+    """Mean over joints of mean squared torque error over torque variance (`torque_nmse`), on the training data."""
     test_nmse: float | None
-    """The same on what was held out, None where nothing was; optimistic for a network, whose iteration it chose."""
+    """The same on the held-out data, None without; optimistic for a network, whose iteration these selected."""
     stopped: str
-    """Why it ended: "converged", "iterations", "held out" (no better there any more), "interrupted", or, of a chain,
-    "starts": no other random tree met the best minimum, or no physical bodies reach it; give more data or starts."""
+    """Why it ended: "converged", "iterations", "held out" (no improvement there), "interrupted", or, for a chain,
+    "starts": no other random tree found the best minimum, or no physical bodies reach it; give more data or starts."""
     unidentifiable: tuple[str, ...]
-    """What the data leave open, the worst first."""
+    """What the data do not determine, the worst first."""
     details: Mapping[str, Any] = field(default_factory=dict)
-    """What only this kind of model has to say, as JSON can store it."""
+    """Further results of this kind of model, JSON-serialisable."""
 
 
 def torque_errors(model: DynamicsProvider, data: Dataset, friction: JointFriction | None = None) -> np.ndarray:
-    """Torque of the model, friction included, less the torque measured, (samples, n) [N·m]."""
+    """Torque of the model, friction included, minus the measured torque, (samples, n) [N·m]."""
     torque = model.reference_torque(data.q, data.v, data.v, data.a)
     return torque - data.tau if friction is None else torque + friction.torque(data.v) - data.tau
 
@@ -53,7 +53,7 @@ def torque_errors(model: DynamicsProvider, data: Dataset, friction: JointFrictio
 def torque_nmse(model: DynamicsProvider, data: Dataset, friction: JointFriction | None = None) -> float:
     """Mean over joints of mean squared torque error over torque variance; joints whose torque is constant are left out.
 
-    friction: learned beside the model. NaN where no torque varies.
+    The model's torque includes the given friction. NaN if no torque varies.
     """
     squares, variance = np.square(torque_errors(model, data, friction)).mean(axis=0), data.tau.var(axis=0)
     varies = variance > _VARIES * max(variance.max(), np.square(data.tau).max())

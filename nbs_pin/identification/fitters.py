@@ -1,4 +1,4 @@
-"""How each kind of model is fitted; `registry.py` gives them their names."""
+"""The fitters of each kind of model; `registry.py` names them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ from nbs_pin.robots.robot import Robot
 
 @dataclass(frozen=True, eq=False)
 class FitTask:
-    """What every fitter is given."""
+    """Arguments of a fitter."""
 
     model: str
     data: Dataset
@@ -37,10 +37,10 @@ class FitTask:
     friction: bool
     progress: bool
     settings: Mapping[str, Any]
-    """Further settings that were given, each of which some fitter knows."""
+    """Further keyword arguments of `fit`, not yet checked."""
 
     def known(self, *names: str) -> dict[str, Any]:
-        """The settings; raises ArgumentError for one that is not among the names."""
+        """The settings; raises ArgumentError if one is not among the names."""
         for name, value in self.settings.items():
             if name not in names:
                 known = f"takes {', '.join(names)}" if names else "takes none"
@@ -50,10 +50,10 @@ class FitTask:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What every fitter returns."""
+    """Result of a fitter."""
 
     assemble: Callable[[FitReport | None], DynamicsProvider]
-    """The model with its report."""
+    """Builds the model with its report."""
     friction: JointFriction | None
     parameters: int
     history: tuple[float, ...] = ()
@@ -65,7 +65,7 @@ class Fitted:
 
 
 def fit_family(task: FitTask) -> Fitted:
-    """A network by name (`dynamics/registry.py`), in the units that the data suggest."""
+    """Fit a network family (`dynamics/registry.py`), scaled to the magnitudes of the data."""
     settings = task.known("loss", "optimiser", "iterations", "transition", "widths", "epsilon")
     options: dict[str, Any] = {name: settings.pop(name) for name in ("widths", "epsilon") if name in settings}
     torque, rate = (deviation_of(x) for x in (task.data.tau, task.data.a))
@@ -86,7 +86,7 @@ def fit_family(task: FitTask) -> Fitted:
 
 
 def fit_rigid_tree(task: FitTask) -> Fitted:
-    """A rigid tree, of which the data give only the order of the joints."""
+    """Fit a rigid tree of which only the joint tree of the data is known."""
     settings = task.known("rotor_inertia", "transition", "regularisation", "starts", "epsilon", "right_angles")
     names = () if task.robot is None else task.robot.joint_names
     found = fit_chain(task.data, task.seed, friction=task.friction, progress=task.progress, **settings)
@@ -109,7 +109,7 @@ def fit_rigid_tree(task: FitTask) -> Fitted:
 
 
 def fit_residual(task: FitTask) -> Fitted:
-    """What the arm's nominal model lacks."""
+    """Fit a network that corrects the arm's nominal model."""
     settings = task.known("optimiser", "iterations", "transition", "widths", "share")
     options: dict[str, Any] = {"widths": ResidualNetwork.fit_widths}
     options |= {name: settings.pop(name) for name in ("widths", "share") if name in settings}
@@ -146,7 +146,7 @@ def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport 
 
 
 def fit_identified(task: FitTask) -> Fitted:
-    """Inertial parameters of the arm's own geometry."""
+    """Identify inertial parameters for the arm's geometry."""
     settings = task.known("rotor_inertia", "transition", "regularisation")
     found = identify(task.data, _needed(task), friction=task.friction, **settings)
     numbers, report = found.parameters.size, found.report
@@ -166,5 +166,5 @@ def fit_identified(task: FitTask) -> Fitted:
 
 def _needed(task: FitTask) -> Robot:
     if task.robot is None:
-        raise ArgumentError(f"model '{task.model}' is built on the arm's URDF; give robot=nbs.load_robot(…).")
+        raise ArgumentError(f"model '{task.model}' needs the arm's URDF; give robot=nbs.load_robot(…).")
     return task.robot

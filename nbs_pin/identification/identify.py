@@ -1,7 +1,7 @@
-"""Inertias and friction of an arm whose geometry is known, from its motions.
+"""Identification of the inertial parameters and friction of an arm whose geometry is known.
 
-The torque is linear in them (`regressor`). Only some directions of the inertial parameters, the base parameters, reach
-it; the others are free, and are chosen such that every body could exist (`consistent_fit`).
+The torque is linear in them (`regressor`) and depends only on some directions, the base parameters. The others are
+chosen such that every body is physically consistent (`consistent_fit`).
 """
 
 import time
@@ -32,37 +32,37 @@ from nbs_pin.identification.regressor import (
 from nbs_pin.robots.robot import Robot
 
 _EXACT = 1e-11
-"""Least noise that data are credited with, as a share of the largest torque: above rounding, below any sensor."""
+"""Lower bound of the estimated noise, as a share of the largest torque: above rounding, below any sensor."""
 _NEGLIGIBLE = 1e-6
-"""Share of the largest singular value below which a direction is none that the arm's torque depends on."""
+"""Share of the largest singular value below which the torque counts as independent of a direction."""
 _RANDOM_STATES = 80
-"""Random states that show which directions the torque depends on: six equations for each of a joint's 13 unknowns."""
+"""Random states that determine the base directions: six equations for each of a joint's 13 unknowns."""
 _ROUNDS = 6
-"""How often noise and weighted least squares are found from one another."""
+"""Iterations of the reweighted least squares that estimate the noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class IdentificationReport:
-    """How an arm was identified, and what its data cannot say."""
+    """How an arm was identified, and which parameters the data do not determine."""
 
     samples: int
     """Number of samples."""
     seconds: float
-    """What it took [s]."""
+    """Duration of the fit [s]."""
     noise: JointArray
-    """Estimated standard deviation of the torque residual per joint [N·m]: the weights are its inverse."""
+    """Estimated standard deviation of the torque residual per joint [N·m], the inverse of its weight."""
     train_nmse: float
-    """Mean squared residual over torque variance, its mean over the joints whose torque varies."""
+    """Mean squared residual over torque variance, averaged over the joints whose torque varies."""
     base_parameters: int
-    """Directions in the parameters that the arm's torque can depend on, friction included."""
+    """Number of parameter directions that the arm's torque can depend on, friction included."""
     excited: int
-    """How many of them the data say better than what was expected before any data."""
+    """How many of them the data determine better than the prior."""
     condition: float
-    """Largest over smallest singular value of the weighted regressor on the base parameters, in expected units."""
+    """Largest over smallest singular value of the weighted regressor on the base parameters, in units of the prior."""
     unidentifiable: tuple[str, ...]
-    """The other directions, least excited first: combinations of parameters that stay about as expected."""
+    """The other directions, least excited first: parameter combinations that stay near their prior values."""
     steps: int
-    """Newton steps."""
+    """Number of Newton steps."""
 
 
 def identify(
@@ -74,19 +74,31 @@ def identify(
     transition: float = 0.01,
     regularisation: float = 0.3,
 ) -> IdentifiedDynamics:
-    """The arm with those inertias, and friction if wanted, that explain the data best among all that can exist.
+    """Find the physically consistent inertial parameters that explain the data best; `report` tells how well.
 
-    Geometry and gravity are the robot's; its inertias are not looked at. Least squares weighted by each joint's noise,
-    which is estimated from the residual, then the same over physically consistent bodies (`consistent_fit`). Clean data
-    give M, C and G to rounding.
+    Geometry and gravity are the robot's; its inertias are not used. Least squares weighted by each joint's noise, which
+    is estimated from the residual, is followed by the same over physically consistent bodies (`consistent_fit`). Clean
+    data give M, C and G to rounding.
 
-    friction: also find viscous and Coulomb coefficients ≥ 0 of every joint (`IdentifiedDynamics.friction`), for the
-    speed `transition` [rad/s] at which `JointFriction` turns. rotor_inertia: also find rotor inertias ≥ 0, which no
-    URDF states. regularisation: γ, how many measurements the expected inertias are worth (homogeneous balls along the
-    links, tapering, of masses that make torques of the recorded size); it matters where the data say little. `report`
-    of the result is an `IdentificationReport`. Raises ArgumentError for data of another arm, for fewer than two
-    equations per base parameter, for an arm that neither moves nor carries weight, and for data without torque, which
-    inertias of every scale explain.
+    Args:
+        data: Samples with torque, at least two equations per base parameter.
+        robot: The arm of the data.
+        friction: Also find viscous and Coulomb coefficients ≥ 0 of every joint (`IdentifiedDynamics.friction`).
+        rotor_inertia: Also find rotor inertias ≥ 0, which a URDF does not state.
+        transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
+        regularisation: γ, the number of measurements that the prior is worth: homogeneous balls along the links,
+            lighter towards the tip, with masses that give torques of the recorded size; it matters if data are scarce.
+
+    Raises:
+        ArgumentError: If the data have another joint tree, fewer than two equations per base parameter or no torque,
+            which inertias of every scale explain, or if the arm neither moves nor carries weight.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> report = nbs.identify(nbs.collect(robot, "uniform", samples=100), robot).report
+        >>> report.base_parameters, report.excited, report.unidentifiable
+        (6, 6, ())
     """
     positive("transition", transition, "rad/s")
     positive("regularisation", regularisation, "measurements")
@@ -99,26 +111,26 @@ def identify(
 
 
 class Bodies(NamedTuple):
-    """What moves an arm of known geometry as its data say."""
+    """Bodies, friction and rotors that explain the data of an arm of known geometry."""
 
     factors: Float[np.ndarray, "n 4 4"]
     """Lower triangular L of the pseudo-inertias LLᵀ ≻ 0."""
     scalars: Float[np.ndarray, "kinds n"]
     """The unknowns of `Scalars`, all > 0."""
     expected: Expected
-    """What was expected of them."""
+    """Their prior values."""
     report: IdentificationReport
 
     def friction(self, scalars: Scalars) -> JointFriction | None:
-        """The friction among the scalars, if there was any to find."""
+        """The friction among the scalars, None if it was not fitted."""
         return JointFriction(self.scalars[0], self.scalars[1], scalars.transition) if scalars.friction else None
 
 
 def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation: float, others: int = 0) -> Bodies:
     """The physically consistent bodies, friction and rotors that explain the data best, for that geometry.
 
-    others: numbers of the geometry that were fitted to the same data, which count where the noise is estimated.
-    Raises ArgumentError as `identify` does.
+    `others` is the number of geometric parameters fitted to the same data, for the degrees of freedom of the noise.
+    Errors are those of `identify`.
     """
     start = time.perf_counter()
     triangles = joint_triangles(geometry, data, scalars)
@@ -145,22 +157,18 @@ def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation:
 
 
 def _check_arm(data: Dataset, robot: Robot) -> None:
-    """Raise ArgumentError unless the data have the joints of the robot, and torque."""
+    """Raise ArgumentError unless the data have the joints of the robot and some torque."""
     parents, prismatic = robot.parents, robot.prismatic
     if not (np.array_equal(parents, data.parents) and np.array_equal(prismatic, data.prismatic)):
-        raise ArgumentError(
-            f"{data!r} does not fit {robot!r}: number, kinds or order of the joints differ; give the arm they are of."
-        )
+        raise ArgumentError(f"{data!r} is not of {robot!r}: number, kinds or order of the joints differ; give its arm.")
     if not data.tau.any():
-        raise ArgumentError(
-            f"{data!r} has no torque: inertias of every scale explain such a motion; record one with motors on."
-        )
+        raise ArgumentError(f"{data!r} has no torque: inertias of every scale explain such a motion; record torques.")
 
 
 def _base_directions(
     geometry: Geometry, data: Dataset, scalars: Scalars, expected: Expected
 ) -> Float[np.ndarray, "unknowns base"]:
-    """An orthonormal basis of the directions that the torque can depend on, from random states as fast as the data."""
+    """An orthonormal basis of the directions that the torque can depend on, from random states at the data's speeds."""
     rng, size = np.random.default_rng(0), (_RANDOM_STATES, data.nv)
     speed, rate = (max(float(np.abs(x).max()), 1.0) for x in (data.v, data.a))
     v, a, order = speed * rng.normal(size=size), rate * rng.normal(size=size), np.arange(_RANDOM_STATES)
@@ -173,10 +181,7 @@ def _base_directions(
 
 
 def _noise(equations: np.ndarray, base: int, samples: int) -> JointArray:
-    """Standard deviation of the residual per joint [N·m], from the least squares that it weights in turn.
-
-    Raises ArgumentError for fewer than two equations per unknown, whose residual says nothing.
-    """
+    """Standard deviation of the residual per joint [N·m], from iteratively reweighted least squares."""
     n = len(equations)
     if samples * n < 2 * base:
         raise ArgumentError(
@@ -193,23 +198,20 @@ def _noise(equations: np.ndarray, base: int, samples: int) -> JointArray:
 
 
 def _weighted(equations: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Design and target of all joints in units of the noise, as one triangle."""
+    """Design and target of all joints in units of the noise, compressed by one QR decomposition."""
     rows = (equations / noise[:, None, None]).reshape(-1, equations.shape[-1])
     compressed = triangle(rows)
     return compressed[:, :-1], compressed[:, -1]
 
 
 def _unexcited(design: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The base directions that the data say less of than was expected before, the least first; all singular values.
-
-    A direction with singular value 1 has a standard error as large as what is expected of it.
-    """
+    """The base directions with a standard error above their prior value, the largest first; all singular values."""
     _, values, directions = np.linalg.svd(design @ base)
     return (base @ directions[values <= 1.0].T).T[::-1], values
 
 
 def _direction(direction: np.ndarray, expected: Expected, names: list[str]) -> str:
-    """The direction's largest parts, each parameter in units of what its body may have of it."""
+    """The largest components of a direction in words, each parameter in units of its body's scale."""
     n = len(expected.bodies)
     matrices = in_factors(np.eye(10 * n), expected.bodies).reshape(n, 10, 10 * n)
     moved = matrices @ direction[: 10 * n] @ PARAMETERS_OF_COORDINATES.T
@@ -223,7 +225,7 @@ def _direction(direction: np.ndarray, expected: Expected, names: list[str]) -> s
 
 
 def _nmse(equations: np.ndarray, fit: ConsistentFit, data: Dataset) -> float:
-    """Mean squared residual over variance, mean over the joints whose torque varies."""
+    """Mean squared residual over variance, averaged over the joints whose torque varies."""
     bodies = coordinates(fit.factors @ fit.factors.swapaxes(1, 2)).ravel()
     squares = np.square(equations @ np.concatenate([bodies, fit.scalars, [-1.0]])).sum(axis=1) / len(data)
     variance = data.tau.var(axis=0)

@@ -1,4 +1,4 @@
-"""Least squares by Levenberg–Marquardt, on parameters that move by steps rather than add up."""
+"""Levenberg–Marquardt least squares for points on a manifold, which a function moves by a step."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Normal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Descent(Generic[T]):
-    """Where a descent ended."""
+    """End point and record of a descent."""
 
     at: T
     cost: float
@@ -41,14 +41,14 @@ def levenberg_marquardt(
     patience: int = 10,
     stall: float = 0.01,
 ) -> Descent[T]:
-    """Descend from `start`, where a point x may be anything that `moved(x, δ)` takes a step on.
+    """Descend from `start`; a point x may be of any type on which `moved(x, δ)` takes a step.
 
-    (H + λD) δ = g with D = diag H + 0.1 max(diag H): Marquardt's scaling, kept from zero so that a direction that
-    the data hardly see does not move. Pure scaling lets such directions run to where two of them are invisible
-    together, and convergence stops there. λ follows the ratio of actual to predicted gain (Nielsen 1999).
+    (H + λD) δ = g with D = diag H + 0.1 max(diag H): Marquardt's scaling, bounded below so that directions which the
+    data hardly determine do not move. With diag H alone they drift to where two of them are unobservable together, and
+    convergence stops. λ follows the ratio of actual to predicted decrease (Nielsen 1999).
 
-    Ends at a cost of `tolerance`, after `iterations` steps, when `patience` steps gained less than the share `stall`,
-    or when no step gains anything.
+    Ends at a cost of `tolerance`, after `iterations` steps, if the cost fell by less than the share `stall` in
+    `patience` steps, or if no step decreases it.
     """
     x, at, damping, growth = start, normal(start), 1e-2, 2.0
     history = [at.cost]
@@ -58,7 +58,7 @@ def levenberg_marquardt(
         there = moved(x, step)
         gain = at.cost - cost(there)
         predicted = step @ (2.0 * at.gradient - at.hessian @ step)
-        if not gain > 0.0 < predicted:  # not a number counts as no gain
+        if not gain > 0.0 < predicted:  # NaN counts as no decrease
             damping, growth = damping * growth, 2.0 * growth
             if damping > _STRONGEST:
                 break

@@ -1,4 +1,4 @@
-"""The columns of a log, from CSV or NPZ, in the order of an arm's joints."""
+"""The columns of a CSV or NPZ log, in the joint order of an arm."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ _NEEDED = "log t, q and tau (and v and a if known)"
 
 
 class Columns(NamedTuple):
-    """What a log holds, None for what it leaves out; angles as they are logged."""
+    """The columns of a log, None where not logged; angles in the unit of the log."""
 
     t: Float[np.ndarray, " rows"]
     q: Float[np.ndarray, "rows n"]
@@ -22,14 +22,11 @@ class Columns(NamedTuple):
     v: Float[np.ndarray, "rows n"] | None
     a: Float[np.ndarray, "rows n"] | None
     trajectory: Int[np.ndarray, " rows"]
-    """Number of the trajectory, 0 where the log numbers none."""
+    """Number of the trajectory; 0 if the log has no numbers."""
 
 
 def columns_of_csv(path: Path, joint_names: Sequence[str] | None) -> Columns:
-    """The columns of a CSV file: `t`, `trajectory`, and `q_NAME` or `q1` and so on per joint.
-
-    joint_names: in the order wanted; None takes the file's. Raises FileFormatError naming column or row, and remedy.
-    """
+    """The columns of a CSV file (see `load_log`), joints in the order of `joint_names`; None keeps the file's."""
     header, table = read_csv(path)
     columns = {kind: joint_columns(header, kind) for kind in QUANTITIES}
     joints = list(columns["q"]) or ["1"]
@@ -43,10 +40,7 @@ def columns_of_csv(path: Path, joint_names: Sequence[str] | None) -> Columns:
 
 
 def columns_of_arrays(path: Path, stored: dict[str, np.ndarray], joint_names: Sequence[str] | None) -> Columns:
-    """The columns of an NPZ file: `t` and `trajectory` (rows,), `q`, `tau`, `v`, `a` (rows, n), `joint_names` (n,).
-
-    joint_names: in the order wanted; None takes the file's. Raises FileFormatError naming key and remedy.
-    """
+    """The columns of an NPZ file (see `load_log`), joints in the order of `joint_names`; None keeps the file's."""
     arrays = {name: stored[name] for name in ("t", "trajectory", *QUANTITIES) if name in stored}
     absent = [name for name in ("t", "q", "tau") if name not in arrays]
     if absent:
@@ -57,16 +51,16 @@ def columns_of_arrays(path: Path, stored: dict[str, np.ndarray], joint_names: Se
         if x.dtype.kind not in "fiu" or len(shape) != 2 or 0 in shape or x.shape != wanted:
             raise FileFormatError(
                 f"{path}: '{name}' is {x.dtype} of shape {x.shape} beside q of shape {shape}, expected numbers, "
-                "(rows,) for t and trajectory and (rows, joints) for the others; write them so."
+                "(rows,) for t and trajectory and (rows, joints) for the others; correct it."
             )
     found = [str(name) for name in np.ravel(stored.get("joint_names", np.arange(1, shape[1] + 1)))]
     if len(found) != shape[1]:
-        raise FileFormatError(f"{path}: {len(found)} joint_names for {shape[1]} columns of q; match them.")
+        raise FileFormatError(f"{path}: {len(found)} joint_names for {shape[1]} columns of q; give one per column.")
     return _columns(path, arrays, found, joint_names)
 
 
 def _columns(path: Path, arrays: dict[str, np.ndarray], found: list[str], joint_names: Sequence[str] | None) -> Columns:
-    """The columns with their joints in order and trajectories numbered."""
+    """The columns with joints in the requested order and trajectories numbered."""
     order = joint_order(path, found, joint_names)
     numbers = arrays.get("trajectory", np.zeros(len(arrays["t"])))
     if not np.array_equal(numbers, np.round(numbers)):

@@ -1,4 +1,4 @@
-"""Logs from elsewhere as datasets, with units and derivatives checked against each other."""
+"""Logs of other systems as datasets, with units and derivatives checked for consistency."""
 
 import warnings
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ from nbs_pin.identification.log_files import Columns, columns_of_arrays, columns
 from nbs_pin.identification.measurement import ORDER, derivative
 from nbs_pin.robots.robot import Robot
 
-_SPAN = 0.05  # [s] over which derivatives are integrated for comparison, so that the noise of sensors averages out
-_DISAGREES = 0.3  # share of the RMS change that a stated derivative may miss
-_STILL = 1e-3  # [rad, rad/s]; a joint that changes less is not judged
-_TURNS = 4.0 * np.pi  # [rad]; radians of an arm seldom reach it, degrees soon do
-_OFTEN = 0.05  # share of the samples that tells degrees from an outlier
-_EVEN = 1e-3  # share of a step by which evenly spaced samples may be off
+_SPAN = 0.05  # [s]; interval over which derivatives are integrated for comparison, to average sensor noise
+_DISAGREES = 0.3  # largest RMS error of a logged derivative, as a share of the RMS change
+_STILL = 1e-3  # [rad, rad/s]; joints that change less are not checked
+_TURNS = 4.0 * np.pi  # [rad]; rarely reached by angles in radians, soon by degrees
+_OFTEN = 0.05  # share of samples that distinguishes degrees from outliers
+_EVEN = 1e-3  # tolerance of even spacing, as a share of the step
 
 
 def load_log(
@@ -32,20 +32,38 @@ def load_log(
     window: float = 0.1,
     prismatic: Sequence[bool] | None = None,
 ) -> Dataset:
-    """The measurements in a CSV or NPZ file, joints in the order of the arm.
+    """Load the measurements in a CSV or NPZ file, joints in the order of the arm.
 
     CSV: a header with `t` [s], per joint `q_NAME` [rad], `tau_NAME` [N·m] and, if logged, `v_NAME` [rad/s] and
     `a_NAME` [rad/s²] (NAME a joint's name; or q1 … qn, tau1 … taun in the arm's order), and `trajectory`, a whole
-    number, where there are several. NPZ: arrays `t` (rows,), `q`, `tau`, `v`, `a` (rows, n), `trajectory` (rows,) and
+    number, if there are several. NPZ: arrays `t` (rows,), `q`, `tau`, `v`, `a` (rows, n), `trajectory` (rows,) and
     `joint_names` (n,) likewise; a recorded run and a dataset are such files.
-    What is not logged is differentiated over `window` [s] (Savitzky–Golay), for which samples must be evenly spaced;
-    half a window is then left out at both ends of each trajectory.
-    degrees: True converts angles, False believes that they are radians, None refuses what looks like degrees.
-    robot: gives names, tree and ranges of the joints; without it, a serial arm of which `prismatic` says what slides.
-    Warns of a single trajectory and of a log without torque, from which no model can be had (docs/theory.md §6).
-    Raises FileNotFoundError for no file and FileFormatError naming file, row or column and remedy for a missing column,
-    a number that is none, time that does not increase, v that is not dq/dt, a that is not dv/dt, degrees, and a dataset
-    of another arm than `robot` (`compatibility.py`).
+    Quantities not logged are computed by differentiation (Savitzky–Golay); samples must then be evenly spaced, and half
+    a window is dropped at both ends of each trajectory. Warns if the log has only one trajectory, or no torque, without
+    which no model can be identified (docs/theory.md §6). A saved dataset is returned as it is.
+
+    Args:
+        path: The file, *.csv or *.npz.
+        robot: Gives names, tree and ranges of the joints. None assumes a serial arm.
+        degrees: True converts angles, False takes them as radians, None refuses values that look like degrees.
+        window: Width of the differentiation window [s].
+        prismatic: Which joints of a serial arm are prismatic. None takes all as revolute.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        FileFormatError: If a column is missing, an entry is not a number, time does not increase, v is not dq/dt, a is
+            not dv/dt, angles look like degrees, or a dataset is of another arm than `robot`.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> t = np.arange(0.0, 2.0, 0.01)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     table = np.column_stack([t, t >= 1.0, np.sin(t), -np.sin(t)])
+        ...     np.savetxt(f"{folder}/log.csv", table, delimiter=",", header="t,trajectory,q1,tau1", comments="")
+        ...     nbs.load_log(f"{folder}/log.csv")
+        Dataset(180 samples, 2 trajectories, 1 joints)
     """
     path = Path(path)
     names = None if robot is None else robot.joint_names
@@ -67,7 +85,7 @@ def load_log(
 
 
 def _of_arm(path: Path, data: Dataset, robot: Robot | None) -> Dataset:
-    """The data, once they may be of the arm."""
+    """The data, checked to be of the arm."""
     fault = "" if robot is None else arm_fault(data, robot)
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
@@ -75,7 +93,7 @@ def _of_arm(path: Path, data: Dataset, robot: Robot | None) -> Dataset:
 
 
 def _serial(n: int, prismatic: Sequence[bool] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The tree of joints in a row."""
+    """Parents and kinds of the joints of a serial arm."""
     slides = np.zeros(n, dtype=bool) if prismatic is None else np.array(list(prismatic), dtype=bool)
     if slides.shape != (n,):
         raise ArgumentError(f"prismatic has {slides.size} entries and the log {n} joints; give one for each.")
@@ -85,10 +103,10 @@ def _serial(n: int, prismatic: Sequence[bool] | None) -> tuple[np.ndarray, np.nd
 def _in_radians(
     path: Path, columns: Columns, prismatic: Bool[np.ndarray, " n"], degrees: bool | None, robot: Robot | None
 ) -> Columns:
-    """The columns with every angle in radians; sliding joints stay as they are."""
+    """The columns with every angle in radians; prismatic joints are not changed."""
     if degrees is None:
         beyond = np.abs(columns.q) > _TURNS
-        if robot is not None:  # a joint with a range gives degrees away sooner
+        if robot is not None:  # joint ranges reveal degrees sooner
             beyond |= (columns.q < robot.lower - np.pi) | (columns.q > robot.upper + np.pi)
         far = beyond.mean(axis=0) > _OFTEN
         if (far & ~prismatic).any():
@@ -105,7 +123,7 @@ def _in_radians(
 
 
 def _dataset(path: Path, columns: Columns, tree: tuple[np.ndarray, np.ndarray], window: float, robot: str) -> Dataset:
-    """The samples, with v and a differentiated where the log has none."""
+    """The samples, with v and a differentiated if they are not logged."""
     derived = [name for name in "va" if getattr(columns, name) is None]
     blank = np.zeros_like(columns.q)
     v, a = (blank if x is None else x for x in (columns.v, columns.a))
@@ -123,7 +141,7 @@ def _dataset(path: Path, columns: Columns, tree: tuple[np.ndarray, np.ndarray], 
 
 
 class _Stretch(NamedTuple):
-    """One trajectory with both derivatives, and the rows that are half a window away from its ends."""
+    """One trajectory with both derivatives, and the rows at least half a window away from its ends."""
 
     v: np.ndarray
     a: np.ndarray
@@ -134,9 +152,7 @@ class _Stretch(NamedTuple):
         at, steps = f"{path}: from row {rows.start + 1}", np.diff(columns.t[rows])
         step = float(np.median(steps)) if steps.size else 1.0
         if np.abs(steps - step).max(initial=0.0) > _EVEN * step:
-            raise FileFormatError(
-                f"{at}, samples are not evenly spaced, so they cannot be differentiated; log v and a, or resample them."
-            )
+            raise FileFormatError(f"{at}, samples to differentiate are not evenly spaced; log v and a, or resample.")
         half = max(round(0.5 * window / step), ORDER // 2 + 1)
         length = 2 * half + 1
         if rows.stop - rows.start < length:
@@ -153,7 +169,7 @@ class _Stretch(NamedTuple):
 
 
 def _check_derivatives(path: Path, data: Dataset) -> None:
-    """Raise FileFormatError where v is not dq/dt or a is not dv/dt."""
+    """Raise FileFormatError if v is not dq/dt or a is not dv/dt."""
     for name, of in (("v", "q"), ("a", "v")):
         change, stated = _changes(data, getattr(data, of), getattr(data, name))
         size = _rms(np.vstack((change, stated)))
@@ -164,14 +180,14 @@ def _check_derivatives(path: Path, data: Dataset) -> None:
             ratio = float(change[:, joint] @ said / max(said @ said, np.finfo(float).tiny))
             raise FileFormatError(
                 f"{path}: {name} of joint {joint + 1} is not the derivative of {of}, which changes {ratio:.3g} times "
-                f"as much as {name} says; {_remedy(ratio, name, of)}."
+                f"as much as {name} states; {_remedy(ratio, name, of)}."
             )
 
 
 def _changes(
     data: Dataset, x: Float[np.ndarray, "samples n"], rate: Float[np.ndarray, "samples n"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How much x changes over `_SPAN`, and the integral of its stated rate (trapezoids), of all trajectories."""
+    """Changes of x over `_SPAN`, and integrals of its stated rate (trapezoidal rule), of all trajectories."""
     changes, integrals = [np.zeros((1, data.nv))], [np.zeros((1, data.nv))]
     for rows in trajectory_slices(data.trajectory):
         t, y, dy = data.t[rows], x[rows], rate[rows]
@@ -186,7 +202,7 @@ def _changes(
 
 def _remedy(ratio: float, name: str, of: str) -> str:
     known = {np.pi / 180.0: f"convert {name} from degrees", 180.0 / np.pi: f"convert {of} from degrees"}
-    known[-1.0] = f"one of their signs is turned round, so correct {name}"
+    known[-1.0] = f"one of their signs is wrong, so correct {name}"
     near = [remedy for factor, remedy in known.items() if abs(ratio / factor - 1.0) < 0.1]
     return near[0] if near else f"correct its unit or the order of the columns, or leave {name} out"
 
@@ -194,13 +210,12 @@ def _remedy(ratio: float, name: str, of: str) -> str:
 def _warn(path: Path, data: Dataset) -> None:
     if data.trajectories == 1:
         warnings.warn(
-            f"{path} is one trajectory: nothing can be held out, and what fits it may fit no other; log several, "
-            "numbered in a column 'trajectory'.",
+            f"{path} has only one trajectory, so none can be held out; log several, numbered in a column 'trajectory'.",
             stacklevel=3,
         )
     if not data.tau.any():
         warnings.warn(
-            f"{path} has no torque but zero, which cannot tell a model from its multiples; log motions under torque.",
+            f"{path} has only zero torque, which leaves the scale of a model undetermined; log motions with motors on.",
             stacklevel=3,
         )
 

@@ -1,4 +1,4 @@
-"""What a measurement does to a motion: encoder steps, torque noise, and derivatives from sampled numbers."""
+"""Effects of a measurement on a motion: encoder quantisation, torque noise, and derivatives of sampled signals."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,17 @@ from jaxtyping import Bool, Float
 from nbs_pin.base.exceptions import ArgumentError
 
 CLEAN_WINDOW, QUANTISED_WINDOW = 11, 101
-"""Samples that a derivative is taken over: of numbers that are exact, and of those an encoder rounds."""
+"""Window lengths of a derivative [samples], for exact and for quantised signals."""
 ORDER = 5
 """Degree of the polynomial fitted to each window."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Errors of the instruments: encoders that round, and a torque measurement with white Gaussian noise."""
+    """Sensor errors: quantised encoders, and white Gaussian noise of the torque measurement."""
 
     encoder: float = 0.0
-    """Step of the encoders as a share of a turn (or of 1 m on a sliding joint), such as 2**-16; 0 for none."""
+    """Encoder step as a share of a turn (of 1 m for a prismatic joint), such as 2**-16; 0 for none."""
     torque: float = 0.0
     """Standard deviation of the torque noise [N·m]."""
 
@@ -33,7 +33,7 @@ class Noise:
 def quantised(
     q: Float[np.ndarray, "samples n"], encoder: float, prismatic: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, "samples n"]:
-    """Q rounded to whole steps of the encoder [rad, m]; 0 leaves it as it is."""
+    """q rounded to whole encoder steps [rad, m]; unchanged if `encoder` is 0."""
     if encoder == 0.0:
         return q
     step = encoder * np.where(prismatic, 1.0, 2.0 * np.pi)
@@ -45,8 +45,10 @@ def derivative(
 ) -> Float[np.ndarray, "samples n"]:
     """The first or second derivative of samples `step` [s] apart (Savitzky and Golay 1964).
 
-    A polynomial of degree `ORDER` is fitted to `window` samples (odd) about each, or at either end to the last window.
-    Raises ArgumentError when there are fewer samples than that.
+    A polynomial of degree `ORDER` is fitted to `window` samples (odd) about each, at the ends to the last full window.
+
+    Raises:
+        ArgumentError: If there are fewer samples than `window`.
     """
     from scipy.signal import savgol_filter
 

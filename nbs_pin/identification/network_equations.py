@@ -1,4 +1,4 @@
-"""What a Lagrangian network leaves unexplained of measured motions, and how that changes with its parameters."""
+"""Residuals of a Lagrangian network on measured motions, and their derivatives with respect to its parameters."""
 
 import math
 from collections.abc import Iterator
@@ -19,33 +19,30 @@ from nbs_pin.dynamics.residual import ResidualNetwork, Terms, nominal_terms
 from nbs_pin.identification.datasets import Dataset
 
 Loss: TypeAlias = Literal["torque", "acceleration"]
-"""τ̂ − τ, cheap and well conditioned; or v̇ that τ produces less v̇ measured, the paper's, which needs M̂⁻¹."""
+"""τ̂ − τ, cheap and well conditioned; or predicted minus measured v̇, as in the paper, which needs M̂⁻¹."""
 Theta: TypeAlias = Float[torch.Tensor, " parameters"]
-_LARGEST_BLOCK = 2**22  # numbers of a Jacobian at a time, 32 MiB
-_STRIPS = 6  # of a symmetric matrix, of which only what is right of the diagonal is computed
+_LARGEST_BLOCK = 2**22  # entries of a Jacobian block, 32 MiB
+_STRIPS = 6  # of JᵀJ, each computed from the diagonal to the right
 _FLAT = 1e-6
 FIRST_FRICTION = 0.1
-"""Friction to begin with, as a share of the torque's deviation at a speed of one deviation."""
+"""Initial friction at a speed of one standard deviation, as a share of the torque's standard deviation."""
 
 
 class Equation(nn.Module):
-    """The residual of one sample: network and friction as one module, so that both are learned together.
-
-    Friction is d²v + c² tanh(v/transition), so that its coefficients are never negative.
-    """
+    """The residual of one sample, with friction d²v + c² tanh(v/transition), whose coefficients cannot be negative."""
 
     def __init__(
         self, network: LagrangianNetwork, loss: Loss, friction: Float[torch.Tensor, "2 n"] | None, transition: float
     ) -> None:
         super().__init__()
         if loss == "acceleration" and isinstance(network, ResidualNetwork):
-            raise ArgumentError("loss 'acceleration' needs derivatives that a nominal model has not; take 'torque'.")
+            raise ArgumentError("loss 'acceleration' needs derivatives that a nominal model lacks; use loss='torque'.")
         self.network, self.loss, self.transition = network, loss, transition
         self.roots = None if friction is None else nn.Parameter(friction.sqrt())
 
     @classmethod
     def fitted(cls, network: LagrangianNetwork, friction: JointFriction | None, loss: Loss) -> "Equation":
-        """Of a network and a friction that are known."""
+        """The equation of a fitted network and its friction."""
         if friction is None:
             return cls(network, loss, None, 1.0)
         coefficients = torch.from_numpy(np.stack([friction.viscous, friction.coulomb]))
@@ -54,7 +51,7 @@ class Equation(nn.Module):
     def forward(
         self, q: torch.Tensor, v: torch.Tensor, a: torch.Tensor, tau: torch.Tensor, *nominal: torch.Tensor
     ) -> torch.Tensor:
-        """Torque [N·m] or acceleration [rad/s²] that is not explained."""
+        """Residual of the torque [N·m] or acceleration [rad/s²], predicted minus measured."""
         net = tau if self.roots is None else tau - self.friction_torque(v)
         if self.loss == "acceleration":
             return self.network.acceleration(q, v, net) - a
@@ -63,12 +60,12 @@ class Equation(nn.Module):
         return self.network.torque(q, v, v, a) - net
 
     def friction_torque(self, v: torch.Tensor) -> torch.Tensor:
-        """What friction takes [N·m]."""
+        """Friction torque [N·m]."""
         viscous, coulomb = cast(torch.Tensor, self.roots).square()
         return viscous * v + coulomb * torch.tanh(v / self.transition)
 
     def friction(self) -> JointFriction | None:
-        """The friction that was learned."""
+        """The fitted friction, None without."""
         if self.roots is None:
             return None
         viscous, coulomb = self.roots.detach().square().numpy(force=True)
@@ -77,17 +74,17 @@ class Equation(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Residuals of all samples, each joint's in units of its deviation, as functions of one vector of parameters."""
+    """Residuals of all samples in units of each joint's standard deviation, as functions of one parameter vector."""
 
     equation: Equation
     columns: tuple[torch.Tensor, ...]
-    """q, v, a, τ and whatever else a residual needs, one row per sample."""
+    """q, v, a, τ and the terms of a nominal model, if there is one; one row per sample."""
     unit: Float[torch.Tensor, " n"]
     """Standard deviation of the measured torque or acceleration [N·m or rad/s²]."""
 
     @classmethod
     def of(cls, equation: Equation, data: Dataset, unit: Float[torch.Tensor, " n"] | None = None) -> "Equations":
-        """Those of a dataset; unit: another one's, so that both can be compared."""
+        """The equations of a dataset; `unit` of another dataset makes the costs of both comparable."""
         q, v, a, tau = (torch.from_numpy(x) for x in (data.q, data.v, data.a, data.tau))
         network = equation.network
         nominal = nominal_terms(network.nominal, q) if isinstance(network, ResidualNetwork) else ()
@@ -98,23 +95,23 @@ class Equations:
 
     @property
     def theta(self) -> Theta:
-        """The parameters that the module has now."""
+        """The current parameters of the module."""
         return torch.cat([p.detach().reshape(-1) for p in self.equation.parameters()])
 
     def write(self, theta: Theta) -> None:
-        """Give the module these parameters."""
+        """Set the parameters of the module."""
         with torch.no_grad():
             for p, part in zip(self.equation.parameters(), self._parts(theta).values(), strict=True):
                 p.copy_(part)
 
     def residual(self, theta: Theta, rows: Int[torch.Tensor, " m"] | None = None) -> Float[torch.Tensor, "m n"]:
-        """Residuals of the samples numbered `rows`, all for None; differentiable in theta."""
+        """Residuals of the samples `rows`, of all for None; differentiable in theta."""
         chosen = self.columns if rows is None else tuple(x[rows] for x in self.columns)
         value: torch.Tensor = functional_call(self.equation, self._parts(theta), chosen)
         return value / self.unit
 
     def cost(self, theta: Theta, rows: Int[torch.Tensor, " m"] | None = None) -> float:
-        """Mean square of the residuals, the normalised mean squared error; inf where it is no number."""
+        """Mean square of the residuals, the normalised mean squared error; inf if it is not finite."""
         with torch.no_grad():
             value = float(self.residual(theta, rows).square().mean())
         return value if math.isfinite(value) else math.inf
@@ -147,14 +144,14 @@ class Equations:
         return matrix.triu() + matrix.triu(1).T, slope
 
     def _parts(self, theta: Theta) -> dict[str, torch.Tensor]:
-        """The vector as named parameters."""
+        """The parameter vector split into named parameters."""
         named = dict(self.equation.named_parameters())
         pieces = torch.split(theta, [p.numel() for p in named.values()])
         return {name: x.reshape(p.shape) for (name, p), x in zip(named.items(), pieces, strict=True)}
 
 
 def deviation(x: Float[torch.Tensor, "m n"], given: torch.Tensor | None = None) -> Float[torch.Tensor, " n"]:
-    """Standard deviation of every column, that of the largest where one hardly varies; 1 where none does."""
+    """Standard deviation of every column; the largest one for columns that hardly vary, 1 if none varies."""
     if given is not None:
         return given
     spread = (x - x.mean(0)).square().mean(0).sqrt()
@@ -168,7 +165,7 @@ def deviation_of(x: Float[np.ndarray, "m n"]) -> JointArray:
 
 
 def first_friction(data: Dataset) -> Float[torch.Tensor, "2 n"]:
-    """Viscous and Coulomb coefficients to begin with."""
+    """Initial viscous and Coulomb coefficients."""
     torque, speed = (deviation(torch.from_numpy(x)) for x in (data.tau, data.v))
     return 0.5 * FIRST_FRICTION * torch.stack([torque / speed, torque])
 

@@ -1,4 +1,4 @@
-"""How Lagrangian networks are fitted: Levenberg–Marquardt where they are small, Adam and L-BFGS where they are not."""
+"""Fit of Lagrangian networks: Levenberg–Marquardt for small ones, Adam and L-BFGS for large ones."""
 
 import copy
 import math
@@ -17,42 +17,41 @@ from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.network_equations import Equation, Equations, Loss, Theta, first_friction
 
 FitOptimiser: TypeAlias = Literal["lm", "adam", "lbfgs"]
-"""Levenberg–Marquardt, first on a random part of the samples, then on all; Adam on small batches, its step falling
-along a cosine; or L-BFGS on all samples after a quarter of the iterations with Adam.
-
-While its normal equations are small, one iteration of "lm" is worth hundreds of the others (docs/theory.md §6)."""
+"""Levenberg–Marquardt, first on a random subset of the samples, then on all; Adam on minibatches with cosine decay of
+the step; or L-BFGS on all samples after a quarter of the iterations with Adam. While the normal equations are small,
+one iteration of "lm" gains as much as hundreds of the others (docs/theory.md §6)."""
 ITERATIONS: dict[str, int] = {"lm": 30, "adam": 300, "lbfgs": 400}
-"""Iterations of each unless others are asked for: steps of LM and L-BFGS, passes over the data of Adam."""
+"""Default number of iterations: steps of LM and L-BFGS, passes over the data of Adam."""
 LARGEST_FOR_LM = 3500
-"""Parameters beyond which "lm" is no longer the default: its work per sample grows with their square."""
-_COARSE_EQUATIONS, _COARSE_STEPS, _COARSE_ENOUGH = 5, 25, 3e-3  # residuals per parameter, steps, nMSE
-_STARTS, _STUCK = 3, 0.05  # a start that ends its coarse part above this nMSE leads nowhere
-_PATIENCE, _SLOW = 0.2, 0.03  # a share of the iterations, and the least gain in so many of them
-_BATCH, _BATCHES, _RATE, _LBFGS_SHARE = 256, 16, 3e-3, 0.75  # samples of a batch at most, batches at least
+"""Largest number of parameters for which "lm" is the default: its work per sample grows with their square."""
+_COARSE_EQUATIONS, _COARSE_STEPS, _COARSE_ENOUGH = 5, 25, 3e-3  # residuals per parameter, steps, sufficient nMSE
+_STARTS, _STUCK = 3, 0.05  # most starts; nMSE after the coarse part above which another is tried
+_PATIENCE, _SLOW = 0.2, 0.03  # share of the iterations, and the least relative decrease in them
+_BATCH, _BATCHES, _RATE, _LBFGS_SHARE = 256, 16, 3e-3, 0.75  # largest batch, fewest batches, learning rate, share
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e8
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkFit:
-    """A fitted network and how it came about."""
+    """A fitted network and the record of its fit."""
 
     network: LagrangianNetwork
     friction: JointFriction | None
     parameters: int
-    """Numbers that were learned."""
+    """Number of fitted parameters."""
     history: list[float]
-    """Normalised mean squared residual of the samples learned from: untrained, and after every iteration."""
+    """Normalised mean squared residual of the training data, before training and after every iteration."""
     held_out: list[float]
-    """The same of the samples held out, empty when there are none; the network is that of the least."""
+    """The same of the held-out data, empty without; the network is that of its minimum."""
     evaluations: int
     """How often the residuals of a sample were computed or differentiated, divided by the number of samples."""
     stopped: str
-    """"converged", "iterations", "held out" (no better any more) or "interrupted"."""
+    """"converged", "iterations", "held out" (no improvement there) or "interrupted"."""
 
 
 @dataclass(eq=False)
 class _Search:
-    """One start: the best parameters so far, and what they are judged by."""
+    """One start: the best parameters so far, and the costs by which they are chosen."""
 
     equations: Equations
     held_out: Equations | None
@@ -64,7 +63,7 @@ class _Search:
     work: float = 0.0
 
     def record(self, theta: Theta) -> float:
-        """Take note of an iteration; returns its cost."""
+        """Record an iterate; returns its training cost."""
         self.train.append(self.equations.cost(theta))
         self.work += 1.0
         judged = self.train[-1]
@@ -77,11 +76,11 @@ class _Search:
         return self.train[-1]
 
     def label(self) -> str:
-        """What the progress bar says."""
+        """Text of the progress bar."""
         return f"fitting, nMSE {self.train[-1]:.2e}"
 
     def run(self, steps: Iterator[Theta], count: int, progress: bool, enough: float = 0.0) -> str:
-        """Take up to `count` steps, until one costs no more than `enough`; returns why it ended."""
+        """Take up to `count` steps, until the cost is at most `enough`; returns why it ended."""
         patience = max(3, round(_PATIENCE * count))
         try:
             for _ in tracked(range(count), self.label, progress):
@@ -112,19 +111,27 @@ def fit_network(
     transition: float = 0.01,
     progress: bool = False,
 ) -> NetworkFit:
-    """The network with the least mean of (residual/deviation)² over samples and joints.
+    """Minimise the mean of (residual/deviation)² over samples and joints; Ctrl-C ends it and keeps the best.
 
-    make: an untrained network for a seed; "lm" begins anew with the next one, twice at most, when a start leads
-    nowhere. held_out: samples that choose the iteration, which keeps a wide network from learning noise; None takes the
-    best on the data. loss, optimiser, iterations: see `Loss`, `FitOptimiser` and `ITERATIONS`; None takes "lm" up to
-    `LARGEST_FOR_LM` parameters and "lbfgs" beyond. friction: learn viscous and Coulomb friction beside it, with the
-    `transition` of `JointFriction` [rad/s]. Ctrl-C ends it and keeps the best. Raises ArgumentError for an unknown name
-    or a number out of range, and for data without torque unless the loss is that of the acceleration.
+    Args:
+        make: Returns an untrained network for a seed. "lm" tries up to two more seeds if a start makes no progress.
+        data: Training samples.
+        held_out: Samples that select the iterate, so that a wide network does not fit noise. None selects by `data`.
+        seed: Seed of the first network, the subset and the batches.
+        loss: See `Loss`.
+        optimiser: See `FitOptimiser`. None takes "lm" up to `LARGEST_FOR_LM` parameters, "lbfgs" above.
+        iterations: None takes those of `ITERATIONS`.
+        friction: Also fit viscous and Coulomb friction.
+        transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
+        progress: Show a progress bar.
+
+    Raises:
+        ArgumentError: If a name is unknown, a number is out of range, or a loss of torque is given data without torque.
     """
     if loss not in get_args(Loss):
         raise ArgumentError(f"loss '{loss}' is unknown; choose one of {', '.join(get_args(Loss))}.")
     if loss == "torque" and not data.tau.any():
-        raise ArgumentError("the data have no torque, which M̂ = 0 explains; record some, or take loss='acceleration'.")
+        raise ArgumentError("the data have no torque, which M̂ = 0 explains; record some, or use loss='acceleration'.")
 
     def begin(start: int) -> _Search:
         begun = first_friction(data) if friction else None
@@ -157,7 +164,7 @@ def fit_network(
 def _marquardt_starts(
     begin: Callable[[int], _Search], found: _Search, seed: int, count: int, progress: bool
 ) -> tuple[_Search, str]:
-    """Levenberg–Marquardt from up to three starts on a part of the samples, and from the best one on all."""
+    """Levenberg–Marquardt from up to three starts on a subset of the samples, then from the best one on all."""
     samples, joints = len(found.equations), len(found.equations.unit)
     part = min(samples, -(-_COARSE_EQUATIONS * len(found.best) // joints))
     rows = torch.randperm(samples, generator=torch.Generator().manual_seed(seed))[:part].sort().values
@@ -178,7 +185,7 @@ def _marquardt_starts(
 
 
 def _marquardt(search: _Search, theta: Theta, rows: Int[torch.Tensor, " m"], damping: float = 1e-3) -> Iterator[Theta]:
-    """Steps −(JᵀJ + λI)⁻¹Jᵀr, λ in units of the mean diagonal: down when a step lowers the cost, up until one does."""
+    """Steps −(JᵀJ + λI)⁻¹Jᵀr, λ in units of the mean diagonal: reduced after a decrease of the cost, else increased."""
     equations, share = search.equations, len(rows) / len(search.equations)
     cost = equations.cost(theta, rows)
     while damping < _MOST_DAMPING:
@@ -200,7 +207,7 @@ def _marquardt(search: _Search, theta: Theta, rows: Int[torch.Tensor, " m"], dam
 
 
 def _adam(search: _Search, theta: Theta, epochs: int, seed: int) -> Iterator[Theta]:
-    """Passes over the samples in small batches."""
+    """Passes of Adam over the samples in minibatches."""
     equations, generator = search.equations, torch.Generator().manual_seed(seed)
     moving, batch = theta.clone().requires_grad_(True), min(_BATCH, -(-len(equations) // _BATCHES))
     optimiser = torch.optim.Adam([moving], lr=_RATE)
@@ -216,7 +223,7 @@ def _adam(search: _Search, theta: Theta, epochs: int, seed: int) -> Iterator[The
 
 
 def _adam_then_lbfgs(search: _Search, adam: Iterator[Theta]) -> Iterator[Theta]:
-    """L-BFGS with a strong Wolfe line search, from where Adam ends, as long as it lowers the cost."""
+    """L-BFGS with a strong Wolfe line search from the end of Adam, as long as the parameters change."""
     theta = search.best
     for theta in adam:
         yield theta

@@ -1,9 +1,9 @@
-"""A rigid tree whose bodies exist, as a point of a descent: the last step of learning a chain.
+"""A rigid tree with physically consistent bodies, as a point of a descent: the last step of the chain fit.
 
-Placements and bodies together minimise the squared residuals, in units of the noise, plus what `consistent_fit` adds:
-2γ Σᵢ (tr Xᵢ − log det Xᵢ) + 2γ Σₖ (yₖ − log yₖ), for bodies and friction in units of what is expected. The bodies step
-along X = L exp(S) Lᵀ and y exp(s), where they stay positive; the added term counts with the Hessian 2γ, which it has
-along L(1 + S)Lᵀ and y(1 + s).
+Placements and bodies together minimise the squared residuals, in units of the noise, plus the prior of
+`consistent_fit`, 2γ Σᵢ (tr Xᵢ − log det Xᵢ) + 2γ Σₖ (yₖ − log yₖ), for bodies and friction in units of their expected
+values. Steps along X = L exp(S) Lᵀ and y exp(s) keep them positive; the Hessian of the prior is approximated by 2γ, its
+value along L(1 + S)Lᵀ and y(1 + s).
 """
 
 from dataclasses import dataclass, replace
@@ -23,25 +23,25 @@ FREE, PARALLEL, RIGHT = 0, 1, 2
 
 @dataclass(frozen=True, eq=False)
 class PhysicalTree:
-    """Placements from `guess`, whose own bodies and friction are not looked at, and physical bodies and friction."""
+    """The placements of `guess`, whose bodies and friction are not used, with physical bodies and friction."""
 
     guess: TreeEstimate
     factors: Float[np.ndarray, "n 4 4"]
-    """L of the pseudo-inertias LLᵀ, in any order of columns."""
+    """Square roots L of the pseudo-inertias LLᵀ, not necessarily triangular."""
     drag: Float[np.ndarray, "kinds n"]
     """Friction coefficients and rotor inertias > 0."""
     expected: Expected
     strength: float
     """γ."""
     angles: tuple[int, ...] = ()
-    """FREE, PARALLEL or RIGHT: what the axis of each joint is held to make with its parent's; empty holds none."""
+    """FREE, PARALLEL or RIGHT: constraint between the axis of each joint and its parent's; empty if all are free."""
 
     def whole(self) -> TreeEstimate:
-        """The tree that the kernels see."""
+        """The tree estimate with these bodies and friction."""
         return replace(self.guess, bodies=self.factors @ self.factors.swapaxes(1, 2), drag=self.drag)
 
     def cost(self, data: Measurements) -> float:
-        """The objective per residual."""
+        """The objective divided by the number of residuals."""
         local, share = self._in_units(), self.drag / self._usual()
         _, logarithm = np.linalg.slogdet(local)
         divergence = np.square(local).sum() - 2.0 * logarithm.sum() - 4.0 * len(local)
@@ -49,7 +49,7 @@ class PhysicalTree:
         return self.whole().cost(data) + 2.0 * self.strength * float(divergence) / data.q.size
 
     def normal(self, data: Measurements) -> Normal:
-        """The same with its normal equations in the steps of `moved`."""
+        """The cost and its normal equations in the steps of `moved`."""
         plain, chart, free = self.whole().normal(data), self._chart(), self._free()
         local, weight = self._in_units(), self.strength / data.q.size
         bodies = coordinates(local.swapaxes(1, 2) @ local - np.eye(4))
@@ -60,7 +60,7 @@ class PhysicalTree:
         return Normal(self.cost(data), free.T @ gradient, free.T @ hessian @ free)
 
     def moved(self, step: Float[np.ndarray, " parameters"]) -> "PhysicalTree":
-        """The tree a step away, in the order of `TreeEstimate.moved` without the directions that `angles` forbid."""
+        """The tree after a step, in the order of `TreeEstimate.moved` without those that `angles` constrain."""
         n, whole = len(self.factors), self._free() @ step
         inner = 3 + JOINT * n - PLACE
         bodies = np.concatenate([np.zeros(PLACE), whole[3:inner]]).reshape(n, JOINT)[:, PLACE:]
@@ -73,19 +73,16 @@ class PhysicalTree:
         )
 
     def at_right_angles(self, data: Measurements, errors: float) -> "PhysicalTree":
-        """The tree with every axis parallel or perpendicular to its parent's that is so within as many standard errors.
-
-        They are from the curvature at this tree, which should be a minimum.
-        """
+        """The tree with axes held at 0° or 90° to their parents' that are so within `errors` standard errors."""
         tree = replace(self, angles=())
-        information = data.q.size * tree.normal(data).hessian
+        information = data.q.size * tree.normal(data).hessian  # of standard errors if the tree is a minimum
         covariance = np.linalg.pinv(information, hermitian=True)
         angles = [FREE]
         for i, rotation in enumerate(self.guess.rotations[1:], start=1):
             parallel = abs(rotation[2, 2]) > np.sqrt(0.5)
             rows = [0, 1] if parallel else [2]
             at = JOINT * i + 3 - PLACE
-            slope = np.column_stack([-rotation[rows, 1], rotation[rows, 0]])  # of column z with a turn about x and y
+            slope = np.column_stack([-rotation[rows, 1], rotation[rows, 0]])  # of column z in rotations about x and y
             spread = slope @ covariance[at : at + 2, at : at + 2] @ slope.T
             off = rotation[rows, 2]
             near = off @ np.linalg.solve(spread, off) < errors**2
@@ -100,19 +97,19 @@ class PhysicalTree:
         return self.expected.scalars.reshape(self.drag.shape)
 
     def _step(self, bodies: np.ndarray, drag: np.ndarray) -> np.ndarray:
-        """Parts of a step in one vector, zero for gravity and placements; joint 0 has no place."""
+        """The parts of a step in one vector, zero for gravity and placements; joint 0 has no placement."""
         joints = np.hstack([np.zeros((len(bodies), PLACE)), bodies])
         return np.concatenate([np.zeros(3), joints.ravel()[PLACE:], drag.ravel()])
 
     def _free(self) -> np.ndarray:
-        """The directions of a step that keep the angles."""
+        """A basis of the steps that satisfy `angles`."""
         size = 3 + JOINT * len(self.factors) - PLACE + self.drag.size
         columns, keep = np.eye(size), np.ones(size, dtype=bool)
         for i in np.flatnonzero(self.angles):
             at = JOINT * i + 3 - PLACE
             if self.angles[i] == PARALLEL:
                 keep[at : at + 2] = False
-            else:  # turning about the parent's axis, which is the third row, leaves a right angle right
+            else:  # a rotation about the parent's axis, the third row, keeps a right angle
                 columns[at : at + 2, at] = self.guess.rotations[i, 2, :2]
                 keep[at + 1] = False
         return columns[:, keep]
@@ -131,7 +128,7 @@ class PhysicalTree:
 
 
 def _held(rotations: Float[np.ndarray, "n 3 3"], angles: tuple[int, ...]) -> Float[np.ndarray, "n 3 3"]:
-    """The rotations, turned by as little as puts their z axes along or across the parent's."""
+    """The rotations, turned by the least angle that makes their z axes parallel or perpendicular to the parent's."""
     held = rotations.copy()
     for i in np.flatnonzero(angles):
         z = rotations[i, :, 2]

@@ -1,4 +1,4 @@
-"""Models that `fit` makes, by name."""
+"""The models that `fit` can make, by name."""
 
 from nbs_pin.base.registry import Entry
 from nbs_pin.dynamics.registry import NETWORKS
@@ -10,5 +10,5 @@ MODELS: dict[str, Entry] = {
     "residual": Entry(f"{_FITTERS}:fit_residual"),
     "identified": Entry(f"{_FITTERS}:fit_identified"),
 }
-"""Rigid trees and networks, which need no description of the arm; a network that corrects the arm's nominal model; and
-inertias put into its URDF's geometry."""
+"""Rigid trees and networks, which need no URDF; a network that corrects the nominal model of a URDF; and inertial
+parameters for the geometry of a URDF."""

@@ -1,9 +1,9 @@
-"""The equations of motion of an arm as they depend on its unknowns, linearly: inertias, friction and rotors.
+"""The equations of motion of an arm, linear in its unknowns: inertias, friction and rotors.
 
     τ = Y(q, v, v̇) π + viscous·v + coulomb·tanh(v / transition) + rotor·v̇
 
-π are the coordinates of the bodies' pseudo-inertias, and Y depends on the geometry alone: `Geometry` is what the fit
-needs to know of it, `RobotGeometry` that of a URDF through Pinocchio's regressor.
+π are the coordinates of the bodies' pseudo-inertias. Y depends on the geometry alone: `Geometry` is what the fit needs
+of it, `RobotGeometry` that of a URDF, with Pinocchio's regressor.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,22 +24,22 @@ from nbs_pin.robots.robot import Robot
 _CHUNK = 1_000
 """Samples whose regressors are held in memory at once."""
 _FRICTION_SHARE = 0.05
-"""Expected share of friction, and of the rotors' inertia, in the torque."""
+"""Expected share of friction, and of rotor inertia, in the torque."""
 _STILL = 0.1
-"""A joint slower than this share of the fastest is expected to have the friction of one that moves so fast."""
+"""Least speed for the expected friction of a joint, as a share of the fastest joint's."""
 
 
 @runtime_checkable
 class Geometry(Protocol):
-    """Where the joints of an arm are, without a word about its masses."""
+    """The geometry of an arm, without its masses."""
 
     @property
     def names(self) -> Sequence[str]:
-        """What to call its n joints."""
+        """Names of its n joints."""
 
     @property
     def places(self) -> tuple[Sequence[int], Float[np.ndarray, "n 3"]]:
-        """Parents of the joints, 0 for the base and i + 1 for joint i, and positions in their frames [m]."""
+        """Parents of the joints, 0 for the base and i + 1 for joint i, and positions in the parents' frames [m]."""
 
     def regressor(
         self, q: Float[np.ndarray, "rows n"], v: Float[np.ndarray, "rows n"], a: Float[np.ndarray, "rows n"]
@@ -49,7 +49,7 @@ class Geometry(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RobotGeometry:
-    """The geometry that a URDF states."""
+    """The geometry of a URDF."""
 
     robot: Robot
 
@@ -67,7 +67,7 @@ class RobotGeometry:
     def regressor(
         self, q: Float[np.ndarray, "rows n"], v: Float[np.ndarray, "rows n"], a: Float[np.ndarray, "rows n"]
     ) -> Float[np.ndarray, "rows n unknowns"]:
-        """Y by Pinocchio, whose regressor knows no armature."""
+        """Y by Pinocchio, without armature."""
         model, scratch, n = self.robot.model, self.robot.model.createData(), self.robot.nv
         rows = np.array(
             [pin.computeJointTorqueRegressor(model, scratch, *state) for state in zip(q, v, a, strict=True)]
@@ -77,22 +77,22 @@ class RobotGeometry:
 
 @dataclass(frozen=True)
 class Scalars:
-    """Which unknowns every joint has beside the inertia of its body: those of friction, then the rotor's inertia."""
+    """The unknowns of every joint besides the inertia of its body: those of friction, then the rotor inertia."""
 
     friction: bool
     rotor_inertia: bool
     transition: float
-    """Speed at which Coulomb friction turns [rad/s]."""
+    """Speed scale of the Coulomb friction [rad/s]."""
 
     def factors(
         self, v: Float[np.ndarray, "samples n"], a: Float[np.ndarray, "samples n"]
     ) -> Float[np.ndarray, "kinds samples n"]:
-        """What each kind is multiplied by in the torque of its joint."""
+        """Factor of each kind in the torque of its joint: v, tanh(v/transition), v̇."""
         kinds = [v, np.tanh(v / self.transition)] if self.friction else []
         return np.array([*kinds, *([a] if self.rotor_inertia else [])]).reshape(-1, *v.shape)
 
     def names(self, joints: Sequence[str]) -> list[str]:
-        """A name for every unknown of the arm, those of the bodies first."""
+        """Names of all unknowns of the arm, those of the bodies first."""
         kinds = (["viscous", "coulomb"] if self.friction else []) + (["rotor"] if self.rotor_inertia else [])
         bodies = [f"{parameter}({joint})" for joint in joints for parameter in PARAMETER_NAMES]
         return bodies + [f"{kind}({joint})" for kind in kinds for joint in joints]
@@ -100,7 +100,7 @@ class Scalars:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What is expected of each unknown before any data: the units of the fit."""
+    """Expected values of the unknowns before any data: the units of the fit."""
 
     bodies: Float[np.ndarray, "n 4 4"]
     """Lower triangular factors of pseudo-inertias."""
@@ -116,10 +116,7 @@ class Expected:
 
 
 def joint_triangles(geometry: Geometry, data: Dataset, scalars: Scalars) -> Float[np.ndarray, "n rows columns"]:
-    """The equations of each joint, the torque in the last column, as the triangle of their QR decomposition.
-
-    It is all that least squares needs of them: whatever the number of samples, one row per unknown and one more.
-    """
+    """R of each joint's QR-decomposed equations, torque last: the same least squares problem in fewer rows."""
     triangles = np.zeros((data.nv, 0, len(scalars.names(geometry.names)) + 1))
     for rows in _rows(geometry, data, scalars):
         triangles = triangle(np.concatenate([triangles, rows], axis=1))
@@ -127,23 +124,24 @@ def joint_triangles(geometry: Geometry, data: Dataset, scalars: Scalars) -> Floa
 
 
 def triangle(rows: Float[np.ndarray, "*batch rows columns"]) -> Float[np.ndarray, "*batch fewer columns"]:
-    """R of the QR decomposition: fewer rows that say the same to least squares."""
+    """R of the QR decomposition: fewer rows of the same least squares problem."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def expectation(
     geometry: Geometry, data: Dataset, scalars: Scalars, triangles: Float[np.ndarray, "n rows columns"]
 ) -> Expected:
-    """Balls along the links, of masses that make torques of the recorded size; a small share of these is friction.
+    """Balls along the links, with masses that give torques of the recorded size; a small share of these is friction.
 
-    Raises ArgumentError when no inertia plays a part in the motion: an arm that stays at rest without gravity.
+    Raises:
+        ArgumentError: If the torque depends on no inertia, as at rest without gravity.
     """
     factors, n = np.linalg.cholesky(_balls(*geometry.places)), data.nv
     size = torque_size(triangles, len(data))
     balls = coordinates(factors @ factors.swapaxes(1, 2)).ravel()
     torque = np.linalg.norm(triangles[:, :, : 10 * n] @ balls, axis=1) / np.sqrt(len(data))
     if not torque.any():
-        raise ArgumentError(f"{data!r} neither moves nor carries weight, expected motions; record some.")
+        raise ArgumentError(f"the arm of {data!r} neither moves nor carries weight; record motions.")
     scale = np.sqrt(n / np.square(torque / size).sum())
     speed = np.sqrt(np.square(scalars.factors(data.v, data.a)).mean(axis=1))
     least = _STILL * speed.max(axis=-1, keepdims=True, initial=1e-9)
@@ -151,7 +149,7 @@ def expectation(
 
 
 def torque_size(triangles: Float[np.ndarray, "n rows columns"], samples: int) -> JointArray:
-    """Root mean square torque per joint [N·m], those that hardly have one raised to a millionth of the largest."""
+    """Root mean square torque per joint [N·m], at least a millionth of the largest."""
     size = np.linalg.norm(triangles[:, :, -1], axis=1) / np.sqrt(samples)
     return np.maximum(size, 1e-6 * size.max())
 
@@ -166,10 +164,7 @@ def _rows(geometry: Geometry, data: Dataset, scalars: Scalars) -> Iterator[np.nd
 
 
 def _balls(parents: Sequence[int], places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]:
-    """Pseudo-inertias of homogeneous balls, each midway between its joint and the next ones.
-
-    Arms taper: the masses [kg] are as the numbers of joints, counted from each ball to the tip.
-    """
+    """Pseudo-inertias of balls midway between a joint and the next, of as many kg as joints from there to the tip."""
     n, lengths = len(places), np.linalg.norm(places, axis=1)
     usual = float(lengths[lengths > 1e-6].mean()) if (lengths > 1e-6).any() else 0.1
     balls, mass = np.zeros((n, 4, 4)), np.ones(n)

@@ -1,4 +1,4 @@
-"""A rigid tree while its geometry is sought: what it predicts, how that depends on it, and a step away from it."""
+"""A rigid tree during the search for its geometry: its torque, the derivatives, and steps of its parameters."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -22,24 +22,24 @@ from nbs_pin.kernels.trees import tree_torques
 R = TypeVar("R")
 _CHUNK = 512
 PLACE, JOINT = 6, 16
-"""Parameters of a placement, and of a joint: placement and body."""
+"""Numbers of parameters of a placement, and of a joint: placement and body."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Rows of states and torques, and how much a residual of each joint counts."""
+    """Rows of states and torques, with a scale of the residuals of each joint."""
 
     q: Float[np.ndarray, "rows n"]
     v: Float[np.ndarray, "rows n"]
     a: Float[np.ndarray, "rows n"]
     tau: Float[np.ndarray, "rows n"]
     scale: JointArray
-    """Torque that counts as one [N·m]."""
+    """Unit of the residuals [N·m]."""
     kinds: Float[np.ndarray, "kinds rows n"]
-    """What the torque of a joint is linear in beside the bodies (`regressor.Scalars`): v, its sign, v̇."""
+    """Factors of the joints' scalar unknowns (`regressor.Scalars`): v, tanh(v/transition), v̇."""
 
     def some(self, rows: np.ndarray) -> "Measurements":
-        """Those rows."""
+        """The given rows."""
         states = {name: np.ascontiguousarray(getattr(self, name)[rows]) for name in ("q", "v", "a", "tau")}
         return replace(self, **states, kinds=self.kinds[:, rows])
 
@@ -48,9 +48,9 @@ class Measurements:
 class TreeEstimate:
     """Placements and bodies of a tree, and friction.
 
-    Bodies are any symmetric matrices here, as torque is linear in them: bounds that keep them physical make bad minima
-    to get stuck in, and `identification` finds physical ones for the same geometry. Joint 0 lies in the base frame,
-    which gravity is free to turn.
+    A body may be any symmetric matrix, in which the torque is linear: constraints that keep bodies physical add bad
+    local minima, and `identify.explain` finds physical ones for the same geometry. Joint 0 lies in the base frame, in
+    which gravity has any direction.
     """
 
     layout: Int[np.ndarray, " layout"]
@@ -59,13 +59,13 @@ class TreeEstimate:
     rotations: Float[np.ndarray, "n 3 3"]
     positions: Float[np.ndarray, "n 3"]
     bodies: Float[np.ndarray, "n 4 4"]
-    """Pseudo-inertias [[Σ m xxᵀ, Σ m x], [·, m]]."""
+    """Pseudo-inertias [[Σ m xxᵀ, Σ m x], [·, Σ m]]."""
     drag: Float[np.ndarray, "kinds n"]
-    """Coefficients of `Measurements.kinds`: of friction, and rotor inertias."""
+    """Coefficients of `Measurements.kinds`: friction and rotor inertias."""
 
     @classmethod
     def of(cls, tree: Tree, layout: np.ndarray, kinds: int) -> "TreeEstimate":
-        """A tree without friction; the base frame becomes that of joint 0 at q = 0."""
+        """A tree without friction, in the frame of joint 0 at q = 0 as the base frame."""
         rotations, positions = Rotation.from_rotvec(tree.turns).as_matrix(), tree.positions.copy()
         base, at_base = rotations[0].copy(), layout[1::2] == 0
         rotations[at_base] = base.T @ rotations[at_base]
@@ -78,14 +78,14 @@ class TreeEstimate:
         return Tree(Rotation.from_matrix(self.rotations).as_rotvec(), self.positions, factors, -self.down)
 
     def packed(self) -> Packed:
-        """For the kernels."""
+        """Layout and weights for the kernels."""
         weights = [self.down]
         for rotation, position, body in zip(self.rotations, self.positions, _moments(self.bodies), strict=True):
             weights += [rotation.ravel(), position, body, np.zeros(1)]
         return Packed(self.layout, np.concatenate(weights))
 
     def residual(self, data: Measurements) -> Float[np.ndarray, "rows n"]:
-        """Torque [N·m] that is left to explain."""
+        """Torque residual, measured minus predicted [N·m]."""
         tree, tau = self.packed(), np.empty(data.q.shape)
 
         def evaluate(part: slice) -> None:
@@ -100,7 +100,7 @@ class TreeEstimate:
         return float(np.mean(np.square(self.residual(data) / data.scale)))
 
     def normal(self, data: Measurements) -> Normal:
-        """The same with its normal equations in the parameters that `moved` takes steps of."""
+        """The cost and its normal equations in the steps of `moved`."""
 
         def evaluate(part: slice) -> tuple[float, np.ndarray, np.ndarray]:
             kinds = data.kinds[:, part]
@@ -125,7 +125,7 @@ class TreeEstimate:
         return (bodies @ _MOMENTS).reshape(*q.shape, 10 * n)
 
     def moved(self, step: Float[np.ndarray, " parameters"]) -> "TreeEstimate":
-        """The guess a step away: gravity, the body of joint 0, placement and body of each other joint, friction."""
+        """The estimate after a step: gravity, the body of joint 0, placement and body of each other joint, friction."""
         n = len(self.bodies)
         inner = 3 + JOINT * n - PLACE
         joints = np.concatenate([np.zeros(PLACE), step[3:inner]]).reshape(n, JOINT)
@@ -142,14 +142,14 @@ class TreeEstimate:
         return np.einsum("kj,ksj->sj", self.drag, kinds)
 
     def _derivatives(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Torques (rows, n) and what they depend on, (rows, n, 3 + 17n)."""
+        """Torques (rows, n) and their derivatives, (rows, n, 3 + 17n)."""
         tree, tau = self.packed(), np.empty(q.shape)
         table = np.empty((*q.shape, 3 + COLUMNS * len(self.bodies)))
         tree_derivatives(q, v, a, *tree, np.empty(tree_workspace(tree)), tau, table)
         return tau, table
 
     def _chart(self) -> np.ndarray:
-        """Derivative of what the kernels see, and friction, with respect to the parameters."""
+        """Derivative of the kernels' parameters and of friction with respect to the steps of `moved`."""
         n, kinds = self.drag.T.shape
         inner, free = 3 + COLUMNS * n, 3 + JOINT * n - PLACE
         joint = np.zeros((COLUMNS, JOINT))
@@ -162,7 +162,7 @@ class TreeEstimate:
 
 
 def _moments(bodies: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 10"]:
-    """M, h, E (xx, xy, xz, yy, yz, zz) of pseudo-inertias, as the kernels take them."""
+    """m, h, E (xx, xy, xz, yy, yz, zz) of pseudo-inertias, as the kernels take them."""
     rows, columns = (3, 0, 1, 2, 0, 0, 0, 1, 1, 2), (3, 3, 3, 3, 0, 1, 2, 1, 2, 2)
     return bodies[..., rows, columns]
 
@@ -172,7 +172,7 @@ _MOMENTS = _moments(BASIS).T
 
 
 def _by_chunks(function: Callable[[slice], R], rows: int) -> list[R]:
-    """The results of `function` for slices of at most 512 rows, in order, over the cores."""
+    """The results of `function` for slices of at most 512 rows, in order, computed on all cores."""
     slices = [slice(k, min(k + _CHUNK, rows)) for k in range(0, rows, _CHUNK)]
     if len(slices) == 1:
         return [function(slices[0])]

@@ -1,4 +1,4 @@
-"""What data leave open of a learned model: how much less certain its torque is elsewhere than where it was measured."""
+"""What data do not determine of a fitted model: terms of its torque that are uncertain away from the data."""
 
 from collections.abc import Sequence
 
@@ -12,10 +12,10 @@ from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.network_equations import Equation, Equations, Loss
 
 MOST_ROWS = 3000
-"""Samples that speak for the data, evenly picked."""
+"""Most samples that represent the data, evenly spaced."""
 _STATES, _PRIOR = 100, 1e-9
-_WORTH_SAYING = 100.0
-_STILL = 0.1  # rad/s, rad/s²; where data move less, this is what they are asked about
+_WORTH_SAYING = 100.0  # ratio of standard deviations above which a term is named
+_STILL = 0.1  # [rad/s, rad/s²]; least standard deviation of the other states
 _TERMS = ("inertia", "Coriolis torque", "gravity")
 
 
@@ -28,16 +28,13 @@ def unidentifiable(
     names: Sequence[str] = (),
     seed: int = 0,
 ) -> tuple[str, ...]:
-    """Sentences on terms of the torque, joint by joint, that the data leave open, the least certain first.
+    """Terms of the torque of each joint that the data do not determine, in words, the least certain first.
 
     With Σ = (JᵀJ + prior)⁻¹ of the fit's residuals, J_e Σ J_eᵀ is the covariance of a term at other states, where its
-    Jacobian is J_e: directions of small singular values of J count as far as the torque depends on them, and those that
-    change no torque do not. A term is named where, root mean square over all configurations at the data's speeds
-    and accelerations, it is more than 100 times as uncertain as the residuals at the data. Source: the covariance of
-    Gauss and Newton's method, docs/theory.md §6.
-
-    network, friction: as fitted to the data by the loss. names: of the joints; numbers when there are none. seed: of
-    the other states.
+    Jacobian is J_e: directions of small singular values of J count as far as the torque depends on them. A term is
+    named if its standard deviation, RMS over all configurations at the data's speeds and accelerations, exceeds 100
+    times that of the residuals at the data. Source: the Gauss–Newton covariance, docs/theory.md §6. Joints without
+    `names` are numbered; the seed draws the other states.
     """
     equations = Equations.of(Equation.fitted(network, friction, loss), _thinned(data))
     theta, rows, n = equations.theta, torch.arange(len(equations)), data.nv
@@ -50,9 +47,9 @@ def unidentifiable(
     for term, J in zip(_TERMS, _terms(equations, data, seed), strict=True):
         ratio = _spread(factor, J).reshape(-1, n).square().mean(0).sqrt() / certain
         found += [(float(ratio[i]), f"{term} of {names[i] if names else f'joint {i + 1}'}") for i in range(n)]
-    scale = () if data.tau.any() else ("the torque's scale: without torque, M, C and G have one common factor unknown",)
+    scale = () if data.tau.any() else ("the torque's scale: without torque, a common factor of M, C and G is unknown",)
     left = sorted((x for x in found if x[0] > _WORTH_SAYING), reverse=True)
-    return scale + tuple(f"{what}: {float(f'{x:.1g}'):,.0f} times less certain elsewhere" for x, what in left)
+    return scale + tuple(f"{what}: {float(f'{x:.1g}'):,.0f} times less certain away from the data" for x, what in left)
 
 
 def _thinned(data: Dataset) -> Dataset:

@@ -1,7 +1,6 @@
-"""Bounds on the inertia matrix over all configurations, proved: M(q) ⪯ a₂W and M(q) ⪰ a₁I (docs/certificates.md).
+"""Proved bounds of the inertia matrix over all configurations: a₁W ⪯ M(q) ⪯ a₂W (docs/certificates.md §6).
 
-Joints that turn are let turn fully, joints that slide move within their limits. M is that of the rigid bodies and the
-rotors' armature.
+Revolute joints may turn fully, prismatic joints move within their limits. M includes the bodies and rotor armature.
 """
 
 import numpy as np
@@ -17,38 +16,50 @@ from nbs_pin.inertia.multipliers import largest_by_multipliers, least_by_multipl
 from nbs_pin.inertia.pose_grid import pose_grid_bound
 
 POSES = 150_000
-"""Poses that `trigonometric_bound` looks at, at most."""
-MULTIPLIERS = "energy of the bodies and what no pose changes of their twists, by multipliers"
+"""Largest number of poses that `trigonometric_bound` samples."""
+MULTIPLIERS = "energy of the bodies and conditions on their twists that hold in every pose, by multipliers"
 
 
 def largest_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> Claim:
-    """At least max_q λ_max(W^-½ M(q) W^-½), so that M(q) ⪯ value·W: by multipliers, else the better of two others.
+    """Upper bound of max_q λ_max(W^-½ M(q) W^-½), so that M(q) ⪯ value·W.
 
-    weight: W, symmetric positive definite, usually D₀ [N·m·s/rad]; the value is then 1/κ [s]. I gives a₂ [kg·m²].
-    The value is inf, with the reason, where a joint slides without end. Raises ArgumentError for a W that is none.
+    By multipliers, else the smaller of `trace_bound` and `trigonometric_bound`; inf, with the reason, if M depends on a
+    prismatic joint without limits.
+
+    Args:
+        weight: W, symmetric positive definite, usually D₀ [N·m·s/rad], which gives 1/κ [s]; I gives a₂ [kg·m²].
+
+    Raises:
+        ArgumentError: If W is not symmetric positive definite.
     """
     tree = RigidTree.of(arm)
     name = "largest inertia over W, max λ(W^-½MW^-½)"
     _check_weight(weight, tree.nv)
     if len(tree.endless):
-        because = f"joint {int(tree.endless[0]) + 1} slides without a stated end, so inertia has no bound"
+        because = f"joint {int(tree.endless[0]) + 1} slides without position limits, so the inertia has no upper bound"
         return Claim(name, np.inf, "", Label.PROVED, because)
     value = up(largest_by_multipliers(tree, weight))
     if np.isfinite(value):
         return Claim(name, value, "", Label.PROVED, MULTIPLIERS)
     bounds = {
-        "trace of W⁻¹M by the greatest lever arms": trace_bound(tree, weight),
-        "finitely many poses, a trigonometric polynomial between them": trigonometric_bound(tree, weight),
+        "trace of W⁻¹M by the largest lever arms": trace_bound(tree, weight),
+        "finitely many poses, with a bound of trigonometric polynomials": trigonometric_bound(tree, weight),
     }
     because = min(bounds, key=lambda key: bounds[key])
     return Claim(name, bounds[because], "", Label.PROVED, because)
 
 
 def least_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None) -> Claim:
-    """At most min_q λ_min(W^-½ M(q) W^-½): by multipliers, else the better of two others ÷ λ_max(W).
+    """Lower bound of min_q λ_min(W^-½ M(q) W^-½), so that M(q) ⪰ value·W.
 
-    weight: W, None for I: a₁ [kg·m², or kg along a joint that slides]. The value is 0, with the reason, where all say
-    nothing. Raises ArgumentError for a W that is not symmetric positive definite.
+    By multipliers, else the larger of `pencil_bound` and `determinant_bound` ÷ λ_max(W); 0, with the reason, if no
+    method gives a positive bound.
+
+    Args:
+        weight: W, symmetric positive definite; None is I, which gives a₁ [kg·m², kg for prismatic joints].
+
+    Raises:
+        ArgumentError: If W is not symmetric positive definite.
     """
     tree = RigidTree.of(arm)
     weight = np.eye(tree.nv) if weight is None else weight
@@ -57,41 +68,38 @@ def least_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None
     if value > 0.0:
         return Claim(name, value, "", Label.PROVED, MULTIPLIERS)
     bounds = {
-        "speeds of the bodies alone (pencil)": pencil_bound(tree),
+        "speeds of the bodies (pencil)": pencil_bound(tree),
         "determinant by articulated inertias": determinant_bound(tree),
     }
     because = max(bounds, key=lambda key: bounds[key])
     value = down(max(bounds[because], 0.0) / largest_eigenvalue(weight))
     if value == 0.0:
-        because = "a body without inertia of its own, or travel without end, leaves no bound above 0"
+        because = "no positive bound: a body has no inertia of its own, or a joint slides without position limits"
     return Claim(name, value, "", Label.PROVED, because)
 
 
 def trace_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> float:
-    """At least max_q trace(W⁻¹M(q)) for a diagonal W; for any other, with its diagonal scaled down below it."""
+    """Upper bound of max_q trace(W⁻¹M(q)); a W that is not diagonal is replaced by a diagonal matrix ⪯ W."""
     tree = RigidTree.of(arm)
     return up(float(np.sum(_body_traces(tree, 1.0 / _diagonal_below(weight)))))
 
 
 def trigonometric_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int = POSES) -> float:
-    """At least max_q λ_max(W^-½MW^-½) from its values at equally spaced poses (`pose_grid`).
-
-    The value is inf where a joint slides without end.
-    """
+    """Upper bound of max_q λ_max(W^-½MW^-½) from equally spaced poses (`pose_grid_bound`), inf if there is none."""
     tree = RigidTree.of(arm)
     if len(tree.endless) or not tree.physical:
         return np.inf
-    # What the Cholesky factor of W can lose, for W scaled to a unit diagonal.
+    # Bounds the condition number of W scaled to a unit diagonal, for the rounding of its Cholesky factor.
     spread = tree.nv * float(np.max(np.diag(weight) / _diagonal_below(weight)))
     return up(pose_grid_bound(tree, weight, poses)) * (1.0 + 64.0 * tree.nv * np.finfo(float).eps * spread)
 
 
 def pencil_bound(arm: Arm) -> float:
-    """At most min_q λ_min(M(q)), from the bodies' speeds alone.
+    """Lower bound of min_q λ_min(M(q)) from the speeds of the bodies.
 
-    2T ≥ Σ m_i‖v_i‖² + e_i‖ω_i‖², with v_i of the centre of mass and e_i the least inertia about it, while |q̇_i| is at
-    most ‖ω_i‖ + ‖ω_p‖ for a joint that turns, p its parent, and ‖v_i‖ + ‖v_p‖ + R_i‖ω_p‖, R_i ≥ ‖c_i − c_p‖, for one
-    that slides.
+    2T ≥ Σ m_i‖v_i‖² + e_i‖ω_i‖² with v_i of the centre of mass and e_i the smallest inertia about it, and for p the
+    parent of i, |q̇_i| ≤ ‖ω_i‖ + ‖ω_p‖ at a revolute joint and |q̇_i| ≤ ‖v_i‖ + ‖v_p‖ + R_i‖ω_p‖ with R_i ≥ ‖c_i − c_p‖
+    at a prismatic joint.
     """
     tree = RigidTree.of(arm)
     n = tree.nv
@@ -113,10 +121,10 @@ def pencil_bound(arm: Arm) -> float:
 
 
 def determinant_bound(arm: Arm) -> float:
-    """At most min_q λ_min(M(q)), from λ_min ≥ det·((n−1)/tr)^(n−1) and det M ≥ ∏ d_i.
+    """Lower bound of min_q λ_min(M(q)) from λ_min ≥ det·((n−1)/tr)^(n−1) and det M ≥ ∏ d_i.
 
-    d_i = s_iᵀI_is_i is the inertia of body i alone about (along) its joint. Taken of M, and of M scaled by the greatest
-    M_ii to a diagonal of at most 1, which suits joints of unlike size.
+    d_i = s_iᵀI_is_i is the inertia of body i alone about (along) its joint. The larger of the bounds from M and from M
+    scaled by upper bounds of M_ii to a diagonal ≤ 1, which suits joints of different size.
     """
     tree = RigidTree.of(arm)
     n = tree.nv
@@ -134,7 +142,7 @@ def determinant_bound(arm: Arm) -> float:
 
 
 def _body_traces(tree: RigidTree, weights: JointArray) -> JointArray:
-    """At least Σ_i w_i M_ii over all poses, by body: its mass on its greatest lever arms, its inertia, its rotor."""
+    """Upper bounds of each body's share of Σ_i w_i M_ii over all poses: mass at its lever arms, inertia and rotor."""
     if len(tree.endless) or not tree.physical:
         return np.full(tree.nv, np.inf)
     levers = lever_arms(tree, weights)
@@ -148,7 +156,7 @@ def _body_traces(tree: RigidTree, weights: JointArray) -> JointArray:
 
 
 def _apart(tree: RigidTree, i: int) -> float:
-    """‖c_i − c_parent‖ at most [m], for a joint that slides; 0 where the parent never turns and it does not matter."""
+    """Upper bound of ‖c_i − c_parent‖ [m] for a prismatic joint; 0 if the parent never turns: it then has no effect."""
     if tree.absent[i]:
         return 0.0
     ends = np.array([tree.lower[i], tree.upper[i]])
@@ -159,7 +167,7 @@ def _apart(tree: RigidTree, i: int) -> float:
 
 
 def _diagonal_below(weight: Float[np.ndarray, "n n"]) -> JointArray:
-    """A diagonal below W: W's own if it is diagonal, else that times λ_min of W scaled to a unit diagonal."""
+    """Diagonal of a matrix ⪯ W: that of W if W is diagonal, else times λ_min of W scaled to a unit diagonal."""
     diagonal = np.diag(weight)
     if np.array_equal(weight, np.diag(diagonal)):
         return diagonal
@@ -168,7 +176,7 @@ def _diagonal_below(weight: Float[np.ndarray, "n n"]) -> JointArray:
 
 
 def _check_weight(weight: Float[np.ndarray, "n n"], nv: int) -> None:
-    """Raises ArgumentError unless W is (nv, nv), symmetric and positive definite beyond rounding."""
+    """Raise ArgumentError unless W is (nv, nv), symmetric and positive definite by more than rounding."""
     symmetric = weight.shape == (nv, nv) and np.isfinite(weight).all() and np.array_equal(weight, weight.T)
     if not (symmetric and (np.diag(weight) > 0.0).all() and (_diagonal_below(weight) > 0.0).all()):
-        raise ArgumentError(f"the weight is not a symmetric positive definite matrix ({nv}, {nv}); give e.g. D₀ or I.")
+        raise ArgumentError(f"the weight is not a symmetric positive definite ({nv}, {nv}) matrix; give D₀ or I.")

@@ -1,9 +1,9 @@
-"""Lever arms: the greatest Σ_i w_i ρ_i² that a point of a body reaches, ρ_i its distance from each axis that moves it.
+"""Lever arms: the maximum over all poses of Σ_i w_i ρ_i², with ρ_i the distance of a point of a body from joint axis i.
 
-For a point r of body i, V_i(r) = w_i ρ_i(r)² + max over q_i of V_parent(r seen from the parent), ρ² replaced by 1 for a
-joint that slides. V_i is convex in r, because each step is a greatest value of convex functions of affine maps, and
-does not change when r turns about axis i. So a table over (distance from the axis, height along it) interpolated
-linearly lies above it, and so does the greatest value on a polygon around the circle that r describes.
+For a point r of body i, V_i(r) = w_i ρ_i(r)² + max over q_i of V_parent(r in the parent's frame), with ρ² = 1 for a
+prismatic joint. V_i is convex in r, as a maximum of convex functions of affine maps, and invariant under rotation about
+the axis of a revolute joint i. Hence linear interpolation in a table over (distance from the axis, height along it) is
+an upper bound, and so is the maximum over the corners of a polygon around the circle that r describes.
 """
 
 from collections.abc import Callable
@@ -16,15 +16,12 @@ from nbs_pin.base.arrays import JointArray, Scalars
 from nbs_pin.dynamics.rigid_tree import RigidTree
 
 CELLS, CORNERS = 48, 48
-"""Cells of a table from the axis outward, and corners of the polygon around a circle."""
+"""Cells of a table in the radial direction, and corners of the polygon around a circle."""
 Levers: TypeAlias = Callable[[Float[np.ndarray, "*batch 3"]], Scalars]
 
 
 def lever_arms(tree: RigidTree, weights: JointArray) -> list[Levers]:
-    """For each body a function of points in its frame [m] that is at least V_i, all poses considered.
-
-    weights: w ≥ 0 of each joint. No joint may be `endless`.
-    """
+    """Upper bounds of V_i for the weights w ≥ 0, as functions of points in frame i [m]; no joint may be `endless`."""
     radius = _radii(tree)
     levers: list[Levers] = []
     for i in range(tree.nv):
@@ -43,9 +40,7 @@ def _at_rest(points: Float[np.ndarray, "*batch 3"]) -> Scalars:
 
 
 def _radii(tree: RigidTree) -> JointArray:
-    """How far from frame i's origin a table is read [m]: every centre of mass behind joint i, and the corners of the
-    cells and polygons of the tables behind it.
-    """
+    """Radius of each body's table [m]: it covers the centres of mass, cells and polygons of all bodies behind it."""
     radius = np.maximum(np.linalg.norm(tree.centre, axis=1), 1e-9)
     for i in range(tree.nv - 1, 0, -1):
         p, stops = tree.parents[i], np.array(tree.stops(i) if tree.prismatic[i] else (0.0,))
@@ -57,12 +52,12 @@ def _radii(tree: RigidTree) -> JointArray:
 
 
 def _step(radius: float) -> float:
-    """The side of a cell of a table that is read up to the radius [m]."""
+    """Cell size of a table that is evaluated up to the radius [m]."""
     return radius / (CELLS - 1)
 
 
 def _sliding(tree: RigidTree, i: int, weight: float, before: Levers) -> Levers:
-    """V_i of a joint that slides: convex in its travel, so the worse of the two ends."""
+    """V_i of a prismatic joint: convex in the travel, hence the larger of the values at its ends."""
     stops = np.array(tree.stops(i))
     rotation, ends = tree.rotation[i], tree.placed(i, stops)[1]
 
@@ -73,7 +68,7 @@ def _sliding(tree: RigidTree, i: int, weight: float, before: Levers) -> Levers:
 
 
 def _turning(tree: RigidTree, i: int, weight: float, before: Levers, radius: float) -> Levers:
-    """V_i of a joint that turns, as a table over a half-plane through its axis."""
+    """V_i of a revolute joint, as a table over a half-plane through its axis."""
     angles = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
     corners = np.stack([np.cos(angles), np.sin(angles)], axis=-1) / np.cos(np.pi / CORNERS)
     step = _step(radius)
@@ -90,7 +85,7 @@ def _turning(tree: RigidTree, i: int, weight: float, before: Levers, radius: flo
         a = np.clip(rho.astype(int), 0, CELLS - 1)
         b = np.clip(height.astype(int), 0, 2 * CELLS - 1)
         s, t = rho - a, height - b
-        with np.errstate(invalid="ignore"):  # 0·inf, of points beyond the table
+        with np.errstate(invalid="ignore"):  # 0·inf at points outside the table
             inner = (1.0 - t) * table[a, b] + t * table[a, b + 1]
             outer = (1.0 - t) * table[a + 1, b] + t * table[a + 1, b + 1]
             between = (1.0 - s) * inner + s * outer

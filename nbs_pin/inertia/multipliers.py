@@ -1,11 +1,11 @@
-"""The extreme eigenvalues of the inertia matrix over all poses, from what poses cannot change (docs/certificates.md).
+"""The extreme eigenvalues of the inertia matrix over all poses, by an S-procedure (docs/certificates.md §6).
 
-The kinetic energy is a constant quadratic form of the bodies' twists, each in its own frame. A joint that turns about z
-takes its parent's twist (v, ω), placed at the joint, to the body's: v_z is kept, ω_z gains q̇, and the turn of the other
-components keeps ‖v_⊥‖², ‖ω_⊥‖², v_⊥·ω_⊥ and z·(v_⊥×ω_⊥). A joint that slides by s keeps ω, adds q̇ to v_z and s ω×z to
-v_⊥. These are linear and quadratic conditions without q. So energy − a q̇ᵀWq̇ + Σ h·(what is zero) ⪰ 0 on all twists
-proves aW ⪯ M(q) everywhere, whatever the multipliers h, and so from above; a semidefinite program, solved by clarabel,
-finds good ones, and what it finds is checked here.
+The kinetic energy is a constant quadratic form in the bodies' twists, each in its own frame. A revolute joint about z
+maps the twist (v, ω) of its parent, placed at the joint, to that of the body: v_z is kept, ω_z gains q̇, and rotation of
+the other components keeps ‖v_⊥‖², ‖ω_⊥‖², v_⊥·ω_⊥ and z·(v_⊥×ω_⊥). A prismatic joint at position s keeps ω, adds q̇ to
+v_z and s ω×z to v_⊥. These are linear and quadratic conditions without q. Hence, for any multipliers h, energy −
+a q̇ᵀWq̇ + Σ h·(forms that are zero) ⪰ 0 on all twists proves aW ⪯ M(q) for all q; upper bounds follow likewise. A
+semidefinite program, solved by clarabel, finds good multipliers, and its result is checked here.
 """
 
 from dataclasses import dataclass
@@ -19,31 +19,31 @@ from nbs_pin.base.rounding import least_eigenvalue
 from nbs_pin.dynamics.rigid_tree import RigidTree, cross
 
 REACH = 1e4
-"""Multipliers are kept below this, for forms and energy of size 1: larger ones gain nothing and cost digits."""
+"""Largest multiplier, for forms and energy scaled to order one: larger ones gain nothing and lose precision."""
 MARGINS = (1e-7, 1e-6, 1e-5)
-"""How positive the matrix is asked to be, for energy of size 1, one after the other, until one solution is proved."""
+"""Margins of positive definiteness, for energy scaled to order one, tried in turn until a solution is proved."""
 NOTHING = 1e-10
-"""Entries below this are zeros for the solver, which splits the matrix at them, though not for the proof."""
+"""Entries below this are zero for the solver, which decomposes the matrix by sparsity, but not for the proof."""
 
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """A quadratic form of all motions, and a bound on the sums of absolute values behind each of its entries."""
+    """A quadratic form of the motions, and bounds of the sums of absolute values behind its entries."""
 
     matrix: Float[np.ndarray, "m m"]
     size: Float[np.ndarray, "m m"]
     positive: bool = False
-    """Whether the form is ≤ 0 and not 0 on the arm's motions, so that its multiplier must be ≥ 0."""
+    """Whether the form is ≤ 0 instead of 0 on the motions of the arm, so that its multiplier must be ≥ 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """Twists that the linear conditions allow, in coordinates x, and what is known of them in every pose."""
+    """Twists that satisfy the linear conditions, in coordinates x, and quadratic conditions that hold in every pose."""
 
     energy: Form
     """2T, rotors included."""
     moving: list[int]
-    """Where q̇ is in x."""
+    """Indices of q̇ in x."""
     conditions: list[Form]
 
     @classmethod
@@ -56,7 +56,7 @@ class Motions:
         energy = np.zeros_like(sums)
         for i, p in enumerate(tree.parents.tolist()):
             placed = _placed(tree, i)
-            # own[0] are the twists and own[1] the sums of absolute values behind them.
+            # own[0] holds the twists and own[1] the sums of absolute values behind them.
             seen = np.stack([placed @ own[0, p], np.abs(placed) @ own[1, p]])
             own[:, i] = seen
             for row, column in zip(free[i], range(starts[i], starts[i + 1]), strict=True):
@@ -73,18 +73,18 @@ class Motions:
 
 
 def least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"] | None = None) -> float:
-    """At most min_q λ_min(W^-½ M(q) W^-½), nearly that, W = I if not given; 0 where no multipliers are found."""
+    """Nearly tight lower bound of min_q λ_min(W^-½ M(q) W^-½), W = I by default; 0 if no multipliers are found."""
     return max(0.0, _extreme(tree, np.eye(tree.nv) if weight is None else weight, 1.0))
 
 
 def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> float:
-    """At least max_q λ_max(W^-½ M(q) W^-½), nearly that; inf where no multipliers are found."""
+    """Nearly tight upper bound of max_q λ_max(W^-½ M(q) W^-½); inf if no multipliers are found."""
     least = -_extreme(tree, weight, -1.0)
     return least if least > 0.0 else np.inf
 
 
 def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> float:
-    """The greatest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf where none is."""
+    """The largest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf if none is found."""
     motions = Motions.of(tree)
     m = len(motions.energy.matrix)
     diagonal = np.abs(np.diag(motions.energy.matrix))
@@ -115,12 +115,13 @@ def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> 
 def maximise(
     constant: Float[np.ndarray, "m m"], terms: Float[np.ndarray, "k m m"], positive: Bool[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, " k"], bool]:
-    """Maximise y[0] subject to A₀ + Σ y_i A_i ⪰ 0, |y_i| ≤ REACH for i > 0: y, and whether the solver is content.
+    """Maximise y[0] subject to A₀ + Σ y_i A_i ⪰ 0, |y_i| ≤ REACH for i > 0.
 
-    Of y only this is certain: its numbers are finite, and ≥ 0 where `positive`.
+    Returns:
+        y, guaranteed only to be finite and ≥ 0 where `positive`, and whether the solver reports success.
     """
     k, m = len(terms), len(constant)
-    column, row = np.tril_indices(m)  # The upper triangle, column by column.
+    column, row = np.tril_indices(m)  # the upper triangle, column by column
     flat = np.concatenate([constant[None], terms])[:, row, column] * np.where(row == column, 1.0, np.sqrt(2.0))
     flat[np.abs(flat) < NOTHING] = 0.0
     ones = np.eye(k)
@@ -134,7 +135,7 @@ def maximise(
 
 
 def _settings() -> clarabel.DefaultSettings:
-    """Silent, on one thread, and to more digits than clarabel asks for, since y[0] may be small."""
+    """Silent, single-threaded, and with tighter tolerances than clarabel's defaults, since y[0] may be small."""
     settings = clarabel.DefaultSettings()
     settings.verbose, settings.max_threads = False, 1
     settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = 1e-12, 1e-7, 1e-9
@@ -142,7 +143,7 @@ def _settings() -> clarabel.DefaultSettings:
 
 
 def _placed(tree: RigidTree, i: int) -> Float[np.ndarray, "6 6"]:
-    """The parent's twist as that of frame i at q_i = 0; 0 on the base."""
+    """Matrix from the parent's twist to that of frame i at q_i = 0; zero on the base."""
     placed = np.zeros((6, 6))
     if tree.parents[i] >= 0:
         back = tree.rotation[i].T
@@ -152,7 +153,7 @@ def _placed(tree: RigidTree, i: int) -> Float[np.ndarray, "6 6"]:
 
 
 def _free(tree: RigidTree, i: int) -> list[int]:
-    """Components of the twist (v, ω) that the parent's twist does not fix linearly, the one that q̇ moves last."""
+    """Components of the twist (v, ω) that are not linear in the parent's twist, that along q̇ last."""
     if tree.prismatic[i]:
         return [2] if tree.absent[i] else [0, 1, 2]
     return [5] if tree.parents[i] < 0 else [0, 1, 3, 4, 5]
@@ -161,7 +162,7 @@ def _free(tree: RigidTree, i: int) -> list[int]:
 def _conditions(
     tree: RigidTree, i: int, own: Float[np.ndarray, "2 6 m"], seen: Float[np.ndarray, "2 6 m"]
 ) -> list[Form]:
-    """Quadratic conditions at joint i between its twist and its parent's; [0] are the twists, [1] the sums behind."""
+    """Quadratic conditions on the twists of body i and its parent; [0] holds twists, [1] sums of absolute values."""
     if tree.absent[i]:
         return []
     if not tree.prismatic[i]:
@@ -179,7 +180,7 @@ def _conditions(
 def _sliding_conditions(
     tree: RigidTree, i: int, own: Float[np.ndarray, "2 6 m"], seen: Float[np.ndarray, "2 6 m"]
 ) -> list[Form]:
-    """v_⊥ gains s g with g = ω×z: it is parallel to g, and (s − lower)(s − upper)‖g‖² ≤ 0 where travel has ends."""
+    """v_⊥ gains s g with g = ω×z: the gain is parallel to g, and (s − lower)(s − upper)‖g‖² ≤ 0 for bounded travel."""
     gain, sums = own[0, :2] - seen[0, :2], own[1, :2] + seen[1, :2]
     g, size = np.array([seen[0, 4], -seen[0, 3]]), seen[1, [4, 3]]
     rows, totals = np.vstack([gain, g]), np.vstack([sums, size])

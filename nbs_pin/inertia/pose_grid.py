@@ -1,9 +1,9 @@
-"""The largest eigenvalue of the inertia matrix over all poses, from finitely many of them.
+"""The largest eigenvalue of the inertia matrix over all poses, from finitely many poses (docs/certificates.md §6).
 
-In each joint that turns, xᵀM(q)x is a trigonometric polynomial of degree 2 that is nowhere negative, so its greatest
-value is at most its greatest at N equally spaced angles ÷ cos²(π/N); in each that slides it is convex, so the ends of
-the travel are enough. Joints at the end of the arm, which change M little, need no samples: the energy of what lies
-behind such a joint is replaced by a constant one that is never less (`_settled`). docs/certificates.md has the proofs.
+In a revolute joint, xᵀM(q)x is a nonnegative trigonometric polynomial of degree 2, so its maximum is at most the
+maximum over N equally spaced angles ÷ cos²(π/N); in a prismatic joint it is convex, so the ends of the travel suffice.
+Joints at the end of the arm, which change M little, are not sampled: the energy of the bodies behind such a joint is
+replaced by a constant upper bound (`_settled`).
 
 An energy is a symmetric matrix over (v, ω, q̇): the twist of a body's frame, in that frame, and all joint rates. Leading
 axes are the poses, one axis per joint that varies.
@@ -21,11 +21,11 @@ from nbs_pin.dynamics.rigid_tree import RigidTree, cross
 from nbs_pin.inertia.lever_arms import lever_arms
 
 FEWEST, MOST = 5, 48
-"""Angles per joint."""
+"""Smallest and largest number of angles per joint."""
 ROUGH = 1000
-"""Poses by which plans are chosen."""
+"""Number of poses by which plans are compared."""
 TURN = 64
-"""Angles at which the energy behind a settled joint is looked at."""
+"""Number of angles at which the energy behind a settled joint is evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,19 +33,19 @@ class Plan:
     """Which joints are sampled, at how many angles."""
 
     settled_from: int
-    """This joint and all after it are settled: replaced by constant energies."""
+    """The energies behind this joint and all later ones are replaced by constants ("settled")."""
     turning: int
-    """How many joints that turn are sampled."""
+    """Number of sampled revolute joints."""
     angles: int
 
     @property
     def factor(self) -> float:
-        """Greatest value of the polynomial ÷ its greatest sample, at most."""
+        """Upper bound of the maximum of the polynomial ÷ its largest sample."""
         return math.cos(math.pi / self.angles) ** (-2 * self.turning)
 
 
 def pose_grid_bound(tree: RigidTree, weight: Float[np.ndarray, "n n"], poses: int) -> float:
-    """At least max_q λ_max(W^-½ M(q) W^-½), with about so many poses sampled; no joint may slide without end."""
+    """Upper bound of max_q λ_max(W^-½ M(q) W^-½) from at most `poses` sampled poses; no joint may be `endless`."""
     whiten = np.linalg.inv(np.linalg.cholesky(weight))
     scales = _scales(tree, 1.0 / np.diag(weight))
 
@@ -58,7 +58,7 @@ def pose_grid_bound(tree: RigidTree, weight: Float[np.ndarray, "n n"], poses: in
 
 
 def _plans(tree: RigidTree, poses: int) -> list[Plan]:
-    """Joints settled from each joint back, and as many angles for the others as the number of poses allows."""
+    """One plan per choice of the first settled joint, with as many angles as the number of poses allows."""
     present, plans = np.flatnonzero(~tree.absent), []
     for first in [*present.tolist(), tree.nv]:
         before = present[present < first]
@@ -70,7 +70,7 @@ def _plans(tree: RigidTree, poses: int) -> list[Plan]:
 
 
 def _angles(poses: int, joints: int) -> int:
-    """How many angles each joint gets."""
+    """Number of angles per joint."""
     return min(MOST, math.floor(poses ** (1.0 / joints) + 1e-9)) if joints else MOST
 
 
@@ -81,9 +81,9 @@ def _greatest_sample(
     whiten: Float[np.ndarray, "n n"],
     scales: Float[np.ndarray, "n size"],
 ) -> float:
-    """The greatest eigenvalue among the samples, with the energies of settled joints.
+    """The largest eigenvalue among the samples, with constant energies for settled joints.
 
-    The first joint that varies is taken one position at a time, which keeps the arrays small.
+    The first varying joint is evaluated one position at a time, which keeps the arrays small.
     """
     motions = [_motions(tree, i, _positions(tree, i, TURN if i >= settled_from else angles)) for i in range(tree.nv)]
     varying = [i for i in range(min(settled_from, tree.nv)) if len(motions[i]) > 1]
@@ -107,13 +107,13 @@ def _greatest_sample(
 
 
 def _greater(greatest: float, matrices: Matrices) -> float:
-    """The greatest eigenvalue so far; matrices whose Frobenius norm is less need no spectrum."""
+    """The largest eigenvalue so far; eigenvalues are computed only of matrices with a larger Frobenius norm."""
     candidates = matrices[np.linalg.norm(matrices, axis=(-2, -1)) > greatest]
     return max(greatest, float(np.max(largest_eigenvalues(candidates), initial=0.0)))
 
 
 def _seen(energy: Float[np.ndarray, "*b m m"], motion: Float[np.ndarray, "*c m m"]) -> Float[np.ndarray, "*d m m"]:
-    """An energy of a body's twist as one of its parent's."""
+    """An energy in a body's twist as an energy in its parent's twist."""
     return np.swapaxes(motion, -1, -2) @ energy @ motion
 
 
@@ -123,10 +123,10 @@ def _settled(
     scales: Float[np.ndarray, " m"],
     turns: bool,
 ) -> Float[np.ndarray, "m m"]:
-    """An energy of the parent's twist that is never less, wherever the joint is.
+    """A constant energy in the parent's twist that is an upper bound at every position of the joint.
 
-    The mean, and γ times a positive definite A on whose scale what is left stays within ±1/γ: at every angle if at 64,
-    since what is left is a trigonometric polynomial of degree 2. Of two A the one that adds less is taken.
+    It is the mean plus γA, with A ≻ 0 and −γA ⪯ energy − mean ⪯ γA. This difference is a trigonometric polynomial of
+    degree 2, so that its values at 64 angles bound it at every angle. Of two matrices A the one that adds less is used.
     """
     seen = _seen(energy, motions)
     mean = seen.mean(axis=0)
@@ -146,14 +146,14 @@ def _settled(
 
 
 def _positions(tree: RigidTree, i: int, angles: int) -> Float[np.ndarray, " samples"]:
-    """Where joint i is looked at [rad, m]."""
+    """Sampled positions of joint i [rad, m]."""
     if tree.prismatic[i]:
         return np.array(tree.stops(i))
     return np.zeros(1) if tree.absent[i] else 2.0 * np.pi * np.arange(angles) / angles
 
 
 def _motions(tree: RigidTree, i: int, q: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples m m"]:
-    """The matrix that takes (parent's twist, rates) to (twist of body i, rates), at each q_i."""
+    """Matrices from (parent's twist, rates) to (twist of body i, rates), one per q_i."""
     rotation, position = tree.placed(i, q)
     motions = np.tile(np.eye(6 + tree.nv), (len(q), 1, 1))
     back = np.swapaxes(rotation, 1, 2)
@@ -175,8 +175,9 @@ def _bodies(tree: RigidTree) -> list[Float[np.ndarray, "m m"]]:
 
 
 def _scales(tree: RigidTree, weights: JointArray) -> Float[np.ndarray, "n m"]:
-    """Per joint, 1 ÷ how large the parent's twist and the rates can be when Σ q̇²/w ≤ 1: where a constant energy costs
-    alike. Any positive numbers give a true bound.
+    """Per joint, reciprocals of the parent's twist and the rates at their largest for Σ q̇²/w ≤ 1.
+
+    With these scales a constant energy costs about the same in every component; any positive scales give a valid bound.
     """
     levers = lever_arms(tree, weights)
     length = np.linalg.norm(tree.position, axis=1).sum() + np.linalg.norm(tree.centre, axis=1).max()

@@ -1,4 +1,4 @@
-"""The motion a study follows, by name or from a file."""
+"""Desired motions by name or from a file."""
 
 import difflib
 import math
@@ -10,15 +10,14 @@ from nbs_pin.robots.robot import Robot
 
 NAMED = ("sinusoid", "paper")
 DEFAULT_DURATION = 10.0
-"""How long a motion without an end is followed unless said otherwise [s]."""
+"""Duration of a motion by name, which has no end of its own [s]."""
 
 
 def motion_of(text: str, robot: Robot, *, frequency: float, period: float) -> tuple[DesiredMotion, float]:
-    """The motion that the text names, and how long to follow it: a whole number of periods [s].
+    """The motion that `text` names and its duration [s].
 
-    text: "sinusoid" (`Sinusoid.for_robot` at `frequency` [rad/s]), "paper" (`paper_reference`), or a CSV or NPZ file
-    (`load_reference`), whose length is taken. Raises ArgumentError for any other text, FileNotFoundError and
-    FileFormatError for the file.
+    `text` is "sinusoid" (`Sinusoid.for_robot` at `frequency` [rad/s]), "paper" (`paper_reference`), or a CSV or NPZ
+    file (`load_reference`), whose duration is cut to whole periods [s]. Raises ArgumentError for any other text.
     """
     if text == "sinusoid":
         return Sinusoid.for_robot(robot, frequency), DEFAULT_DURATION

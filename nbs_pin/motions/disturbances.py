@@ -1,6 +1,6 @@
-"""Disturbance torques τ_d(t, q, v) [N·m] for `simulate`; any callable of that signature will do.
+"""Disturbance torques τ_d(t, q, v) [N·m] for `simulate`, which accepts any callable with this signature.
 
-Each record gives its torque to every start of a batch, except `TorqueNoise`, which draws one per start.
+Each class applies the same torque to all states of a batch, except `TorqueNoise`, which draws one for each state.
 """
 
 import math
@@ -20,7 +20,14 @@ Disturbance: TypeAlias = Callable[[float, np.ndarray, np.ndarray], Any]
 
 @dataclass(frozen=True, eq=False)
 class ConstantTorque:
-    """τ_d = torque [N·m]."""
+    """Constant τ_d = torque [N·m], one number or one per joint.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> import numpy as np
+        >>> nbs.ConstantTorque([1.0, -2.0])(t=0.0, q=np.zeros(2), v=np.zeros(2))
+        array([ 1., -2.])
+    """
 
     torque: PerJoint
 
@@ -28,13 +35,13 @@ class ConstantTorque:
         per_joint(self, "torque")
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
-        """Torque at time t [s] in the state (q, v) [N·m]."""
+        """τ_d [N·m] at time t [s] and state (q, v)."""
         return _on_joints(self.torque, q)
 
 
 @dataclass(frozen=True, eq=False)
 class SinusoidalTorque:
-    """τ_d = amplitude·sin(frequency·t + phase): amplitude [N·m], frequency [rad/s], phase [rad]."""
+    """τ_d = amplitude·sin(frequency·t + phase), with amplitude [N·m], frequency [rad/s] and phase [rad]."""
 
     amplitude: PerJoint
     frequency: PerJoint
@@ -44,13 +51,13 @@ class SinusoidalTorque:
         per_joint(self, "amplitude", "frequency", "phase")
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
-        """Torque at time t [s] in the state (q, v) [N·m]."""
+        """τ_d [N·m] at time t [s] and state (q, v)."""
         return _on_joints(self.amplitude * np.sin(self.frequency * t + self.phase), q)
 
 
 @dataclass(frozen=True, eq=False)
 class SquareWave:
-    """Bang-bang: ±amplitude [N·m] with the sign of sin(frequency·t + phase), frequency [rad/s], + at zero."""
+    """τ_d = amplitude·sgn(sin(frequency·t + phase)), sgn 0 = 1: amplitude [N·m], frequency [rad/s], phase [rad]."""
 
     amplitude: PerJoint
     frequency: PerJoint
@@ -60,22 +67,22 @@ class SquareWave:
         per_joint(self, "amplitude", "frequency", "phase")
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
-        """Torque at time t [s] in the state (q, v) [N·m]."""
+        """τ_d [N·m] at time t [s] and state (q, v)."""
         return _on_joints(self.amplitude * np.where(np.sin(self.frequency * t + self.phase) >= 0.0, 1.0, -1.0), q)
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueNoise:
-    """White noise of standard deviation std [N·m], constant over each `period` [s].
+    """Gaussian noise of standard deviation `std` [N·m], held constant over each `period` [s].
 
-    A pure function of time: the same seed gives the same torque at the same t, in whatever order it is asked.
+    A pure function of time: the same seed gives the same torque at the same t, in any order of evaluation.
     """
 
     std: PerJoint
     period: float
     seed: int = 0
     share: tuple[int, int, int] | None = None
-    """(first, last + 1, all): the starts of a larger batch that q stands for; the noise is theirs in that batch."""
+    """(first, last + 1, count): q holds these states of a batch of `count`, and gets their noise in that batch."""
 
     def __post_init__(self) -> None:
         per_joint(self, "std")
@@ -84,8 +91,8 @@ class TorqueNoise:
             raise ArgumentError(f"seed is {self.seed}, expected an integer ≥ 0; give another seed.")
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
-        """Torque at time t [s] in the state (q, v) [N·m]."""
-        interval = math.floor(t / self.period + 1e-9)  # t = k·period may round to just below its interval
+        """τ_d [N·m] at time t [s] and state (q, v)."""
+        interval = math.floor(t / self.period + 1e-9)  # t = k·period may be rounded into the interval before
         rng = np.random.default_rng((self.seed, interval))
         if self.share is None:
             return _on_joints(self.std, q) * rng.standard_normal(q.shape)
@@ -94,9 +101,8 @@ class TorqueNoise:
 
 
 def _on_joints(torque: Any, q: np.ndarray) -> np.ndarray:
-    """The torque for every start and joint of q."""
-    if np.size(torque) not in (1, q.shape[-1]):
-        raise ArgumentError(
-            f"the disturbance has {np.size(torque)} torques for {q.shape[-1]} joints; give one, or one for each."
-        )
+    """The torque, broadcast to the shape of q."""
+    count, joints = np.size(torque), q.shape[-1]
+    if count not in (1, joints):
+        raise ArgumentError(f"the disturbance has {count} torques for {joints} joints; give one, or one per joint.")
     return np.zeros(q.shape) + torque

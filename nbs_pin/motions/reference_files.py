@@ -1,4 +1,4 @@
-"""Desired motions from samples and from files: a C² spline with its exact derivatives, held at both ends."""
+"""Desired motions from samples and from files: a C² spline with exact derivatives, held constant beyond its ends."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,21 +16,28 @@ from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
 
 FEWEST_SAMPLES = 4
-"""A not-a-knot cubic spline needs four samples."""
+"""Fewest samples of a not-a-knot cubic spline."""
 PLAUSIBLE_JUMP = 1.0
-"""Change of velocity from one sample to the next that any sampling may show [rad/s]."""
-_SUDDEN = 10.0  # times the usual change of velocity around it is a jump, where a fast smooth motion shows two or three
-_AROUND = 7  # samples; even a single outlying q changes the velocity at only three of them
-_MISREAD = 0.1  # how far a stated velocity may lie from dq/dt, per the joint's largest speed
+"""Change of velocity from one sample to the next that is always accepted [rad/s]."""
+_SUDDEN = 10.0  # times the median change of velocity nearby is a jump; fast smooth motions reach two or three
+_AROUND = 7  # samples in that median; an outlier of q affects the velocity change at only three of them
+_MISREAD = 0.1  # tolerance of a stated velocity against dq/dt, relative to the joint's largest speed
 
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
     """The not-a-knot cubic spline through samples q (k, n) [rad] at increasing times t (k,) [s].
 
-    q is C² between the samples, v and a are its exact derivatives, a is continuous. Outside the samples the first or
-    the last one is held with v = a = 0 (never extrapolated), so samples that end in motion end in a velocity jump.
-    Raises ArgumentError for samples that are not finite, too few, of other shapes or not in order of time.
+    q is C², and v and a are its exact derivatives. Before the first and after the last sample, q is held with
+    v = a = 0 (no extrapolation), so samples that begin or end in motion give a velocity jump.
+
+    Raises:
+        ArgumentError: If samples are not finite, fewer than four, of wrong shape or not in order of time.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.Sampled(t=[0.0, 1.0, 2.0, 3.0], q=[[0.0], [1.0], [4.0], [9.0]])(t=1.5).v
+        array([3.])
     """
 
     t: Any
@@ -38,7 +45,7 @@ class Sampled:
 
     def __post_init__(self) -> None:
         t, q = floats("t", self.t), floats("q", self.q)
-        fault = _fault(t, q, _numbered(np.atleast_1d(q).shape[-1]))
+        fault = _fault(t, q, [f"q{i + 1}" for i in range(np.atleast_1d(q).shape[-1])])
         if fault:
             raise ArgumentError(f"samples of a reference: {fault}.")
         object.__setattr__(self, "t", t)
@@ -46,7 +53,7 @@ class Sampled:
 
     @property
     def duration(self) -> float:
-        """Time of the last sample [s], after which it is held."""
+        """Time of the last sample [s]."""
         return float(self.t[-1])
 
     @cached_property
@@ -64,14 +71,16 @@ class Sampled:
 
 
 def load_reference(path: str | Path, joint_names: Sequence[str]) -> Sampled:
-    """The motion in a CSV or NPZ file for the joints named, in their order.
+    """Load the motion of the joints `joint_names` from a CSV or NPZ file.
 
-    CSV: a header `t` and the joint names in any order (or q1 … qn in the arm's order), then numbers in [s] and [rad];
-    or the header of a log, `q_NAME` and whatever else it holds (`load_log`).
-    NPZ: arrays `t` (rows,) and `q` (rows, n), with `joint_names` (n,) if their order is to be checked; a recorded
-    run is such a file. A velocity `v` (rows, n) beside them is only compared with dq/dt.
-    A motion whose velocity jumps is refused: between samples, or at the ends, beyond which it is held.
-    Raises FileNotFoundError for no file and FileFormatError naming file, row, column and remedy for any other fault.
+    CSV: a header of `t` and the joint names in any order (or q1 … qn in the arm's order), then numbers in [s] and
+    [rad]; or the header of a log, with columns `q_NAME` and others (`load_log`).
+    NPZ: arrays `t` (rows,) and `q` (rows, n), and `joint_names` (n,) if their order is to be checked; a saved `Run` is
+    such a file. A velocity `v` (rows, n) is only compared with dq/dt, which must not jump, not even at the ends.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        FileFormatError: If it has any other fault; names file, row, column and remedy.
     """
     path = Path(path)
     read = {".csv": _read_csv, ".npz": _read_npz}.get(path.suffix.lower())
@@ -91,7 +100,7 @@ def load_reference(path: str | Path, joint_names: Sequence[str]) -> Sampled:
 
 
 def _fault(t: np.ndarray, q: np.ndarray, columns: list[str]) -> str:
-    """What is wrong with samples and what to do, or an empty string; rows count from 1."""
+    """What is wrong with the samples and what to do, or an empty string; rows are counted from 1."""
     if t.ndim != 1 or q.ndim != 2 or len(t) != len(q):
         return f"t has shape {t.shape} and q {q.shape}, expected (rows,) and (rows, joints); give one time per row"
     if len(t) < FEWEST_SAMPLES:
@@ -121,26 +130,20 @@ def _jump(motion: Sampled, columns: list[str]) -> str:
     row, joint = np.unravel_index(np.argmax(jumps), jumps.shape)
     at = f"velocity jump {jumps[row, joint]:.3g} rad/s of {columns[joint]} at t = {t[row]:.6g} s"
     if row in (0, len(t) - 1):
-        return f"{at}, where the motion {'ends' if row else 'starts'} and beyond which it is held; let it rest there"
+        return f"{at}, where the motion {'ends' if row else 'starts'} and q is held; add samples at rest there"
     return f"{at} (row {row + 1}); smooth the motion or sample it more finely"
 
 
 def _disagreement(motion: Sampled, v: np.ndarray, columns: list[str]) -> str:
-    """Where the velocity that a file states is not the derivative of q, or an empty string."""
+    """Where the velocity stated in a file is not the derivative of q, and what to do, or an empty string."""
     slope = motion(motion.t).v
     bound = _MISREAD * np.maximum(np.abs(slope).max(axis=0), PLAUSIBLE_JUMP)
     wrong = ~(np.abs(v - slope) <= bound)
     if not wrong.any():
         return ""
     row, joint = np.argwhere(wrong)[0]
-    return (
-        f"row {row + 1}, v of {columns[joint]}: {v[row, joint]:.6g} rad/s, but q changes by {slope[row, joint]:.6g} "
-        "rad/s; correct it or leave v out"
-    )
-
-
-def _numbered(n: int) -> list[str]:
-    return [f"q{i + 1}" for i in range(n)]
+    at, stated, found = f"row {row + 1}, v of {columns[joint]}", v[row, joint], slope[row, joint]
+    return f"{at}: {stated:.6g} rad/s, but q changes by {found:.6g} rad/s; correct it or leave v out"
 
 
 _Columns: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str]]
@@ -168,7 +171,7 @@ def _read_csv(path: Path) -> _Columns:
     if header[:1] != ["t"]:
         raise FileFormatError(f"{path}: the first column is '{header[0]}', expected 't'; put time first.")
     q, v = (joint_columns(header, kind) for kind in "qv")
-    if not q:  # no log's header, so every other column is the joint that it names
+    if not q:  # not the header of a log, so every other column is named by its joint
         return table[:, 0], table[:, 1:], None, header[1:]
     stated = table[:, [v[joint] for joint in q]] if q.keys() <= v.keys() else None
     return table[:, 0], table[:, list(q.values())], stated, list(q)

@@ -1,7 +1,6 @@
 """Desired motions: callables ref(t) -> Reference(q, v, a) whose v and a are the exact derivatives of q.
 
-t is a time [s], giving shapes (n,), or an array of times, giving shapes (..., n). Any callable like that will do for
-`simulate`; motions from files are in `motions/reference_files.py`.
+t is a time [s], giving shapes (n,), or an array of times, giving shapes (..., n); `simulate` takes any such callable.
 """
 
 from collections.abc import Callable
@@ -17,15 +16,19 @@ from nbs_pin.base.records import Reference
 from nbs_pin.robots.robot import Robot
 
 DesiredMotion: TypeAlias = Callable[[Any], Reference]
-"""ref(t) -> Reference, of a time [s] (shapes (n,)) or of an array of times (shapes (..., n))."""
+"""ref(t) -> Reference, for a time [s] (shapes (n,)) or an array of times (shapes (..., n))."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sinusoid:
-    """q = offset + amplitude·sin(frequency·t + phase), per joint.
+    """q = offset + amplitude·sin(frequency·t + phase), each one number or one per joint.
 
-    amplitude, offset [rad]; frequency [rad/s]; phase [rad]. The longest list says how many joints move, a number
-    beside it serves them all; numbers alone make the motion of one joint.
+    amplitude, offset and phase [rad]; frequency [rad/s]. Numbers alone give the motion of one joint.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.Sinusoid(amplitude=[0.5, 0.2], frequency=2.0)(t=0.0).v
+        array([1. , 0.4])
     """
 
     amplitude: PerJoint
@@ -42,10 +45,10 @@ class Sinusoid:
 
     @classmethod
     def for_robot(cls, robot: Robot, frequency: float = 1.0, amplitude: float = 0.5) -> "Sinusoid":
-        """A motion the arm can follow: neighbouring joints a quarter period apart, about a posture it can hold.
+        """A moderate motion about `resting_posture`, with neighbouring joints a quarter period apart.
 
-        frequency [rad/s]. amplitude: at most this [rad], a quarter of the joint's range, and half its velocity limit.
-        Raises ArgumentError when a number is not positive.
+        Each joint has the angular frequency `frequency` [rad/s] and the least of three amplitudes: `amplitude` [rad], a
+        quarter of its range, and half its velocity limit over `frequency`. Raises ArgumentError unless both are > 0.
         """
         positive("frequency", frequency, "rad/s")
         positive("amplitude", amplitude, "rad")
@@ -64,7 +67,7 @@ class Sinusoid:
 def resting_posture(robot: Robot) -> np.ndarray:
     """The middle of the joint ranges [rad], or the posture nearest to it that needs at most half the effort limits.
 
-    Among postures within a quarter of each range of the middle; where none is so light, the lightest.
+    It is chosen among samples within a quarter of each range of the middle; if none qualifies, the one of least load.
     """
     lower, upper = robot.sampling_range
     middle, data = 0.5 * (lower + upper), robot.model.createData()
@@ -79,13 +82,19 @@ def resting_posture(robot: Robot) -> np.ndarray:
 def paper_reference(n: int) -> Sinusoid:
     """The paper's q_d = [sin 0.1t, cos 0.1t, sin 0.1t, …] for n joints [rad]."""
     if n < 1:
-        raise ArgumentError(f"n is {n}, expected at least one joint.")
+        raise ArgumentError(f"n is {n}, expected at least one joint; give the number of joints.")
     return Sinusoid(amplitude=np.ones(n), frequency=0.1, phase=0.5 * np.pi * (np.arange(n) % 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """q constant [rad], one number per joint (a number alone: one joint), v = a = 0."""
+    """Constant q [rad], one number per joint, with v = a = 0.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.Hold([0.1, 0.2])(t=0.0)
+        Reference(q=array([0.1, 0.2]), v=array([0., 0.]), a=array([0., 0.]))
+    """
 
     q: PerJoint
 
@@ -101,10 +110,15 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class MinimumJerk:
-    """From waypoint to waypoint, resting at each: quintics 10s³ − 15s⁴ + 6s⁵, the motions of least squared jerk.
+    """Motion through waypoints, at rest at each: quintics 10s³ − 15s⁴ + 6s⁵, which minimise the integral of jerk².
 
-    waypoints (k, n) [rad] are reached at times (k,) [s], which increase. q is held before the first and after the last.
-    v is at most 1.875 and a at most 5.774 times the mean speed Δq/T of a segment, and Δq/T².
+    waypoints (k, n) [rad] are reached at increasing times (k,) [s]; q is held before the first and after the last.
+    On a segment of length Δq and duration T, |v| ≤ 1.875 |Δq|/T and |a| ≤ 5.774 |Δq|/T².
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.MinimumJerk(waypoints=[[0.0], [1.0]], times=[0.0, 2.0])(t=1.0)
+        Reference(q=array([0.5]), v=array([0.9375]), a=array([0.]))
     """
 
     waypoints: Any
@@ -118,9 +132,7 @@ class MinimumJerk:
                 "expected (k, n) and (k,) with k ≥ 2; give one time per waypoint."
             )
         if not (np.isfinite(waypoints).all() and np.isfinite(times).all()):
-            raise ArgumentError(
-                "MinimumJerk's waypoints and times must be finite numbers; correct the one that is not."
-            )
+            raise ArgumentError("MinimumJerk's waypoints and times must be finite; correct the one that is not.")
         if not (np.diff(times) > 0.0).all():
             k = int(np.argmin(np.diff(times) > 0.0))
             raise ArgumentError(f"times must increase, but times[{k + 1}] = {times[k + 1]} ≤ {times[k]}; correct them.")
@@ -142,11 +154,12 @@ class MinimumJerk:
 
 
 def check_reference(reference: DesiredMotion, robot: Robot, duration: float, *, samples: int = 2001) -> None:
-    """Refuse a motion that the arm cannot follow, before it starts.
+    """Check a desired motion against the limits of the arm at `samples` times over `duration` [s].
 
-    Position and velocity limits, and the torque M a + C v + G against the effort limits (`Robot.with_effort_limit`
-    sets others), at `samples` times over `duration` [s]. Joint friction is not counted.
-    Raises ArgumentError naming the joint, the time, the value, the limit and the remedy.
+    Its torque is M a + C v + G, without joint friction; `Robot.with_effort_limit` sets other effort limits.
+
+    Raises:
+        ArgumentError: If a limit is exceeded; names the joint, the time, the value, the limit and the remedy.
     """
     positive("duration", duration, "s")
     t = np.linspace(0.0, duration, samples)

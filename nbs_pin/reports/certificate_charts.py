@@ -1,8 +1,9 @@
-"""Pictures of certificates: what was promised beside what happened, in the style of `plotting`."""
+"""Figures of certificates: bounds beside what happened, in the style of `plotting`."""
 
 import textwrap
 from pathlib import Path
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,22 +18,22 @@ from nbs_pin.robots.robot import configuration_difference
 
 _INK, _NOTE, _VIOLET = "#1d2733", "#5d6b7a", "#7a4fa3"
 _DASHED, _DOTTED = (0, (5, 3)), (0, (1, 2))
-_DECADES = 12  # of V, at most
+_LEGEND: Any = {"frameon": False, "ncols": 6, "handlelength": 1.4, "columnspacing": 1.2, "borderaxespad": 0.1}
+_DECADES = 12  # of V that are drawn, at most
 _TERMS = {
     "potential": ("−∇ΦᵀΛ∇Φ", TORQUE),
     "damping": ("−z2ᵀ(ωM + D)z2", ACTUAL),
     "disturbance": ("z2ᵀτ_d", REFERENCE),
     "held": ("z2ᵀ(held − law)", _VIOLET),
-    "saturation": ("z2ᵀ(cut torque)", SATURATED),
+    "saturation": ("z2ᵀ(τ − τ_command)", SATURATED),
 }
 
 
 def plot_monitor(monitored: Monitored, path: str | Path) -> Path:
-    """Draws what a certificate promised of a run and what happened, and writes the picture (PNG); returns its path.
+    """Plot a run against its certificate and write the picture (PNG); returns its path.
 
-    V against its promise on a logarithmic scale; ‖z1‖ against its bound, and the |z1_i| that went furthest beyond its
-    own; V̇ and each of its terms; and when each assumption failed. Stretches in which the torque was cut are shaded, and
-    where a promise was broken is marked.
+    V and its bound on a logarithmic scale; ‖z1‖ and its bound, with the |z1_i| that exceeds its own most; V̇ and each of
+    its terms; and when each assumption failed. Saturated stretches are shaded, exceeded bounds are marked.
     """
     rows = max(len(monitored.failures), 1)
     with picture(path, 11.0, 8.2 + 0.34 * rows) as figure:
@@ -52,11 +53,10 @@ def plot_monitor(monitored: Monitored, path: str | Path) -> Path:
 
 
 def plot_certificate(certificate: Certificate, attack: Attack | None, path: str | Path) -> Path:
-    """Draws the bounds and the worst motion an adversary found, and writes the picture (PNG); returns its path.
+    """Plot the bounds and the worst motion found, and write the picture (PNG); returns its path.
 
-    With an attack: ‖z1(t)‖ of its worst motion below its bound, the bound that the paper prints, and how the attack got
-    there; always: each joint's bound, beside the worst that was found of it. The title says how the bounds are known,
-    or which conditions make them void.
+    With an attack: ‖z1(t)‖ of its worst motion, the certified bound and the one that the paper prints. Always: the
+    bound of each joint, beside its largest error found. The title says how the bounds are known, or why they are void.
     """
     with picture(path, 11.0, 4.6) if attack is not None else picture(path, 6.4, 4.2) as figure:
         if attack is None:
@@ -72,12 +72,12 @@ def plot_certificate(certificate: Certificate, attack: Attack | None, path: str 
 
 
 def _standing(certificate: Certificate, width: int) -> str:
-    """The arm, the disturbance and how the bounds are known; below them, in lines of the width, why they are void."""
+    """The arm, the disturbance and how the bounds are known; below, wrapped to the width, why they are void."""
     arm = "" if certificate.robot is None else _plain(certificate.robot.name) + ", "
     title = f"{arm}{certificate.admissible}: {certificate.label}"
     if not certificate.void:
         return title
-    failed = f"bounds not promised, as this does not hold here: {'; '.join(certificate.void)}"
+    failed = f"the bounds are void, as these conditions fail: {'; '.join(certificate.void)}"
     return "\n".join([title, *textwrap.wrap(_plain(failed), width)])
 
 
@@ -86,7 +86,7 @@ def _draw_storage(axes: Axes, seen: Monitored) -> None:
     top = values.max() if values.max() > 0.0 else 1.0
     low = max(values[values > 0.0].min(initial=top), top * 10.0**-_DECADES)
     axes.fill_between(*thin(seen.t, seen.promise), low * 1e-3, color=LIMIT, alpha=0.12, linewidth=0)
-    axes.plot(*thin(seen.t, seen.promise), color=LIMIT, linestyle=_DASHED, label="promised: at most V(0) exp(−ct) + V∞")
+    axes.plot(*thin(seen.t, seen.promise), color=LIMIT, linestyle=_DASHED, label="bound, V(0) exp(−ct) + V∞")
     axes.plot(*thin(seen.t, np.where(seen.storage > 0.0, seen.storage, np.nan)), color=ACTUAL, label="V")
     _mark(axes, seen, "V", seen.storage)
     axes.set(yscale="log", ylim=(0.5 * low, 3.0 * top))
@@ -124,7 +124,7 @@ def _draw_terms(axes: Axes, seen: Monitored) -> None:
 
 
 def _draw_flags(axes: Axes, seen: Monitored) -> None:
-    """A line per assumption that failed, drawn while it did."""
+    """A line per assumption that failed, drawn while it failed."""
     names = list(seen.failures)
     for k, name in enumerate(names):
         bars = [(seen.t[begin], seen.t[end] - seen.t[begin]) for begin, end in stretches(seen.failures[name])]
@@ -142,7 +142,7 @@ def _draw_attack(axes: Axes, certificate: Certificate, attack: Attack) -> None:
     z1 = configuration_difference(run.q, run.q_ref, run.continuous)
     axes.plot(*thin(run.t, np.linalg.norm(z1, axis=-1)), color=ERROR, label=f"worst found, {attack.error:.3g}")
     bounds = [(certificate.error, _INK, _DASHED, f"certified, {certificate.error:.3g}")]
-    # For gains shaped by the inertia it is the certified one, and one line is enough.
+    # For inertia-shaped gains it equals the certified one, and one line is enough.
     if abs(certificate.printed_error - certificate.error) > 0.01 * certificate.error:
         printed = f"printed in the paper, {certificate.printed_error:.3g}"
         bounds.append((certificate.printed_error, REFERENCE, _DOTTED, printed))
@@ -156,7 +156,7 @@ def _draw_attack(axes: Axes, certificate: Certificate, attack: Attack) -> None:
 
 
 def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) -> None:
-    """A bar per joint up to its bound, and a bar within it up to what was found."""
+    """A bar per joint up to its bound, with a bar inside up to the largest error found."""
     bounds, units = certificate.joint_errors, certificate.joint_units
     at, mixed = np.arange(len(bounds)), len(set(units)) > 1
     axes.barh(at, bounds, height=0.7, color=LIMIT, alpha=0.35, label="certified")
@@ -177,7 +177,7 @@ def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) ->
     axes.set_title(title, loc="left", color=_INK)
     if not bounds.any():
         axes.set_xticks([0.0])
-        axes.annotate("every bound is 0: nothing disturbs", (0.5, 0.5), xycoords="axes fraction", ha="center",
+        axes.annotate("every bound is 0: no disturbance", (0.5, 0.5), xycoords="axes fraction", ha="center",
                       va="center", color=_NOTE)  # fmt: skip
 
 
@@ -192,24 +192,16 @@ def _ends(values: np.ndarray) -> str:
 
 
 def _mark(axes: Axes, seen: Monitored, name: str, values: np.ndarray) -> None:
-    """Where the quantity of that name went beyond its bound."""
+    """Mark where the quantity of that name exceeds its bound."""
     if name in seen.excesses:
         where = np.where(seen.excesses[name], values, np.nan)
-        label = "promise broken" if name == next(iter(seen.excesses)) else None
+        label = "bound exceeded" if name == next(iter(seen.excesses)) else None
         axes.plot(*thin(seen.t, where), color=ERROR, linewidth=2.2, label=label)
 
 
 def _title(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="left", color=_INK)
-    axes.legend(
-        frameon=False,
-        ncols=6,
-        handlelength=1.4,
-        columnspacing=1.2,
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        borderaxespad=0.1,
-    )
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), **_LEGEND)
 
 
 def _plain(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Charts of studies: curves over many runs, in the style of `plotting`."""
+"""Figures of studies, over many runs, in the style of `plotting`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,11 +15,11 @@ from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED,
 from nbs_pin.simulation.metrics import PAPER_THRESHOLD, squared_error
 
 FAR = 1000.0
-"""‖z1‖ beyond which a motion is not drawn [rad]."""
+"""Motions are not drawn where ‖z1‖ exceeds this [rad]."""
 
 
 def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]], path: str | Path) -> Path:
-    """Draws cost [µs] against number of joints, a line per series, and writes the picture (PNG); returns its path."""
+    """Plot cost [µs] against the number of joints, one line per series, and write the picture; returns its path."""
     with picture(path, 6.4, 4.0) as figure:
         axes = figure.add_subplot()
         for (name, values), colour in zip(series.items(), (ACTUAL, REFERENCE, TORQUE, ERROR), strict=False):
@@ -37,11 +37,11 @@ def plot_training(
     after: Run,
     path: str | Path,
 ) -> Path:
-    """Draws what training changed and writes the picture (PNG); returns its path.
+    """Plot the effect of training and write the picture (PNG); returns its path.
 
-    Left: mean cost of the training and the held-out motions by epoch (`Training`), the best epoch marked. Right:
-    ‖z1‖ over time of the same motions under the controller before and after, their median, and the worst, at each time;
-    a line ends where its motion leaves `FAR` or the finite numbers.
+    Left: mean cost of the training and the held-out motions by epoch (`Training`), the best epoch marked. Right: ‖z1‖
+    over time of the same motions before and after training, median and worst at each time. A line ends where ‖z1‖
+    exceeds `FAR` or is not finite.
     """
     with picture(path, 11.0, 4.2) as figure:
         costs, errors = figure.subplots(1, 2)
@@ -69,7 +69,7 @@ def _draw_costs(
 
 def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
     for (name, run), colour in zip(runs.items(), (LIMIT, ACTUAL), strict=True):
-        with np.errstate(over="ignore", invalid="ignore"):  # of motions that diverge
+        with np.errstate(over="ignore", invalid="ignore"):  # motions may diverge
             size = np.sqrt(squared_error(run)).reshape(len(run.t), -1)
             size = np.where(size <= FAR, size, np.inf)
             median, worst = (np.where(np.isfinite(x), x, np.nan) for x in (np.median(size, axis=1), size.max(axis=1)))
@@ -86,11 +86,11 @@ def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
 
 
 def plot_comparison(rows: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
-    """Draws the convergence times of the fair comparison and writes the picture (PNG); returns its path.
+    """Plot the convergence times of the fair comparison and write the picture (PNG); returns its path.
 
-    rows: those of `benchmarks.fair.Row` as dictionaries. A panel per arm and period, all with one time axis; per law, a
-    dot at the median of its starts for each reference and a line to the worst one. What does not converge ends in an
-    arrow at the right edge.
+    rows: `benchmarks.fair.Row` as dictionaries. There is a panel per arm and period, on a common time axis, with a dot
+    per law and reference at the median of the starts and a line to the worst one. A line of starts that do not converge
+    ends in an arrow at the right edge.
     """
     panels = list(dict.fromkeys((row["arm"], row["period_s"]) for row in rows))
     times = np.array([[row["convergence_time_median_s"], row["convergence_time_worst_s"]] for row in rows])
@@ -134,10 +134,10 @@ def _draw_comparison(axes: Axes, rows: Sequence[Mapping[str, Any]], limits: tupl
 
 
 def plot_motions(columns: Mapping[str, Mapping[str, Sequence[Run]]], path: str | Path, *, until: float) -> Path:
-    """Draws two-joint motions side by side and writes the picture (PNG); returns its path.
+    """Plot two-joint motions side by side and write the picture (PNG); returns its path.
 
-    columns: title -> label -> runs, each with any batch of starts; a colour per label, joint 1 solid, joint 2 dashed.
-    Rows: angles and tracking errors up to the time `until` [s], then ‖z1‖² over all of it, both axes logarithmic.
+    columns: title -> label -> runs, each with any batch of starts; one colour per label, joint 1 solid, joint 2 dashed.
+    Rows: angles and tracking errors up to the time `until` [s], and ‖z1‖² over the whole time on logarithmic axes.
     """
     with picture(path, 1.2 + 4.2 * max(len(columns), 1.6), 8.4) as figure:
         grid = figure.subplots(3, len(columns), squeeze=False, sharey="row")
@@ -152,7 +152,7 @@ def plot_motions(columns: Mapping[str, Mapping[str, Sequence[Run]]], path: str |
 
 
 def _draw_motions(axes: np.ndarray, runs: Sequence[Run], colour: str, label: str, until: float) -> None:
-    """A column of `plot_motions`: the motions of one colour."""
+    """The motions of one colour in a column of `plot_motions`."""
     angles, errors, squares = axes
     for run in runs:
         shown, starts = run.t <= until, run.q.reshape(len(run.t), -1, run.nv)
@@ -175,9 +175,9 @@ def plot_bounds(
     panels: Mapping[str, Mapping[str, Float[np.ndarray, " alphas"]]],
     path: str | Path,
 ) -> Path:
-    """Draws ‖z1‖² [rad²] against α, a panel per title, and writes the picture (PNG); returns its path.
+    """Plot ‖z1‖² [rad²] against α, one panel per title, and write the picture (PNG); returns its path.
 
-    panels: title -> name -> values; a name that speaks of a bound is a line, every other one a row of dots.
+    panels: title -> name -> values, drawn as a line if the name contains "bound", else as dots.
     """
     with picture(path, 5.6 * len(panels), 4.6) as figure:
         grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]

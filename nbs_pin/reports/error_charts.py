@@ -1,4 +1,4 @@
-"""Pictures of model errors, in the style of `plotting`: a page for one model, and errors against amount of data."""
+"""Figures of model errors, in the style of `plotting`: a page per model, and errors against the amount of data."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -44,12 +44,12 @@ def plot_model_errors(
     joints: Sequence[str],
     missing: str = "no closed loop was run",
 ) -> Path:
-    """Draws one page of what `compare` found and writes the picture (PNG); returns its path.
+    """Plot the result of `compare` on one page and write the picture (PNG); returns its path.
 
-    The figures in a row; maps of the errors of M, C v and G over two joints (left out without a map); errors against
-    speed and against distance from the middle of the box, and the torque error of every joint; the errors of single
-    samples, energy in free motion, and ‖δ‖ along the closed loop beside its bound. missing: why there is no closed
-    loop, where there is none. joints: their names with units.
+    The figures in a row; maps of the errors of M, C v and G over two joints (omitted without a map); errors against
+    speed and against distance from the centre of the box, and the torque error of every joint; the errors of single
+    samples, energy in free motion, and ‖δ‖ along the closed loop with its bound. missing: the note in its place if no
+    closed loop was run. joints: their names with units.
     """
     joints, rows = [joint.replace("$", r"\$") for joint in joints], 2 if heat is None else 3
     with picture(path, 13.5, 1.4 + 3.3 * rows) as figure:
@@ -75,10 +75,10 @@ def plot_model_errors(
 def plot_sample_sizes(
     panels: Mapping[str, Mapping[str, Mapping[int, Sequence[float]]]], path: str | Path, *, ylabel: str
 ) -> Path:
-    """Draws errors against number of samples, both axes logarithmic, and writes the picture (PNG); returns its path.
+    """Plot errors against the number of samples on logarithmic axes and write the picture (PNG); returns its path.
 
-    panels: title -> model -> number of samples -> an error per seed. A line through the medians of the finite ones, a
-    band from least to greatest, a colour per model in all panels.
+    panels: title -> model -> number of samples -> one error per seed. A line joins the medians of the finite errors and
+    a band spans their range; a model has the same colour in all panels.
     """
     names = list(dict.fromkeys(name for models in panels.values() for name in models))
     colours = dict(zip(names, cycle((ACTUAL, REFERENCE, TORQUE, ERROR, VIOLET, LIMIT, SATURATED)), strict=False))
@@ -108,7 +108,7 @@ def _draw_seeds(axes: Axes, curve: Mapping[int, Sequence[float]], colour: str, n
 
 
 def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
-    """The title and a row of tiles, each a name and its number."""
+    """The title and a row of tiles, each with a name and a number."""
     low, high = errors.mass_ratio
     tiles = {f"error of {label}": number(getattr(errors, name)) for name, (label, _) in LOOKS.items()}
     tiles |= {
@@ -134,7 +134,7 @@ def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
 
 
 def _drift(errors: ModelErrors) -> str:
-    """The energy drift, as a bound where the integrator drifts as much."""
+    """The energy drift, as an upper bound if the integrator drifts as much."""
     if errors.motion is None:
         return "not run"
     resolved = errors.energy_drift > 2.0 * float(errors.motion.floor.max())
@@ -142,7 +142,7 @@ def _drift(errors: ModelErrors) -> str:
 
 
 def _draw_maps(part: SubFigure, heat: ErrorMap, names: Sequence[str]) -> None:
-    """Errors of M, C v and G over two joints, one colour scale for the three; the best fiftieth share its end."""
+    """Errors of M, C v and G over two joints on one colour scale, whose lower end is the 2 % quantile."""
     kinds = ("mass_matrix", "coriolis", "gravity")
     shown = [_seen(getattr(heat.errors, kind)) for kind in kinds]
     seen = np.concatenate([x[np.isfinite(x)] for x in shown])
@@ -191,7 +191,7 @@ def _draw_curves(axes: Axes, growth: Growth, shown: Sequence[str]) -> None:
 
 
 def _draw_joints(axes: Axes, errors: ModelErrors, names: Sequence[str]) -> None:
-    """Torque error of every joint beside the deviation of its torque."""
+    """Torque error of every joint, relative to the standard deviation of its torque."""
     rows = np.arange(len(names))
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = _seen(errors.torque_rms / errors.torque_deviation)
@@ -207,12 +207,12 @@ def _draw_joints(axes: Axes, errors: ModelErrors, names: Sequence[str]) -> None:
     axes.set_yticks(rows, [name.partition(" [")[0] for name in names])
     _log_ticks(axes.xaxis, *axes.get_xlim())
     axes.grid(False, axis="y")
-    axes.set(xlabel="RMS error ÷ deviation of the torque")
+    axes.set(xlabel="RMS error ÷ standard deviation of the torque")
     axes.set_title("torque error by joint", loc="left", color=INK)
 
 
 def _draw_samples(axes: Axes, errors: ModelErrors) -> None:
-    """Share of the samples whose error is smaller, per quantity, with a dot at the RMS, the relative error."""
+    """Share of the samples with a smaller error, per quantity, with a dot at the RMS over all."""
     ranks = np.arange(1, errors.samples + 1) / errors.samples
     for name, (label, colour) in LOOKS.items():
         values, rms = np.sort(_seen(getattr(errors.each, name))), float(_seen(getattr(errors, name)))
@@ -228,7 +228,7 @@ def _draw_samples(axes: Axes, errors: ModelErrors) -> None:
 
 
 def _draw_energy(axes: Axes, motion: FreeMotion) -> None:
-    """Drift of energy in free motion: median of the starts, and the worst for the drift that counts."""
+    """Drift of energy in free motion: median and worst of the starts."""
     for values, colour, label in (
         (motion.drift, ERROR, "true energy, model's motion"),
         (motion.own, ACTUAL, "model's energy, model's motion"),
@@ -249,7 +249,7 @@ def _draw_energy(axes: Axes, motion: FreeMotion) -> None:
 
 
 def _draw_mismatch(axes: Axes, mismatch: Mismatch) -> None:
-    """‖δ‖ over time, median and worst trajectory, under the bound of the same states."""
+    """‖δ‖ over time, median and worst trajectory, with the largest bound at the same states."""
     bound = mismatch.bound(mismatch.q_norm, mismatch.v_norm)
     size = _seen(mismatch.size)
     median, worst = np.median(size, axis=1), size.max(axis=1)
@@ -264,16 +264,16 @@ def _draw_mismatch(axes: Axes, mismatch: Mismatch) -> None:
     axes.set_title("closed loop: mismatch ‖δ‖ [N·m]", loc="left", color=INK)
     axes.legend(frameon=False, ncols=3, loc="upper left", bbox_to_anchor=(0.0, 0.87), handlelength=1.4)
     if mismatch.violation < 1.0:
-        sure = f"a further start breaks it: ≤ {mismatch.violation:.1%} (confidence 1 − {number(mismatch.doubt)})"
+        sure = f"a further start exceeds it: ≤ {mismatch.violation:.1%} (confidence 1 − {number(mismatch.doubt)})"
     else:
-        sure = "too few starts to say anything of further ones"
+        sure = "too few starts to bound further ones"
     told = f"‖δ‖ ≤ {number(mismatch.a)} ‖q‖ + {number(mismatch.b)} ‖v‖ + {number(mismatch.c)}"
     note = f"{told}   ({mismatch.trajectories} starts)\n{sure}"
     axes.annotate(note, (0.02, 0.985), xycoords="axes fraction", va="top", fontsize=7.8, color=INK)
 
 
 def _seen(values: Any) -> np.ndarray:
-    """The values within what is drawn, NaN for those that are not finite."""
+    """The values clipped to the drawn range, NaN for those that are not finite."""
     values = np.asarray(values, dtype=float)
     return np.asarray(np.clip(np.where(np.isfinite(values), values, np.nan), LEAST, MOST))
 
@@ -284,7 +284,7 @@ def _leave_out(axes: Axes, why: str) -> None:
 
 
 def number(value: float) -> str:
-    """Three digits at most, 1.3e-6 rather than 0.0000013."""
+    """The number in at most three digits, as 1.3e-6 rather than 0.0000013."""
     if not np.isfinite(value):
         return "not finite"
     if value == 0.0 or 1e-2 <= abs(value) < 1e4:
@@ -294,7 +294,7 @@ def number(value: float) -> str:
 
 
 def _limits(low: float, high: float) -> tuple[float, float]:
-    """A range of at least one decade round the numbers, for a logarithmic axis."""
+    """A range of at least one decade around the numbers, for a logarithmic axis."""
     middle = np.sqrt(low * high)
     return float(min(low, middle / 3.2) / 1.2), float(max(high, middle * 3.2) * 1.2)
 
@@ -309,7 +309,7 @@ def _log_errors(axes: Axes) -> None:
 
 
 def _log_ticks(ruler: Axis, low: float, high: float) -> None:
-    """Whole powers of ten where there are three decades of them, else 1, 2 and 5 times those."""
+    """Ticks at powers of ten for more than three decades, otherwise also at small multiples of them."""
     if high / low > 1e3:
         ruler.set_major_locator(LogLocator(numticks=7))
     else:

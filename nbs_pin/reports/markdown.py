@@ -1,4 +1,4 @@
-"""Pages of studies: sections of Markdown, the numbers behind them, and tables in Markdown and CSV."""
+"""Pages of studies in Markdown: sections with the numbers behind them, and tables."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ class Section(NamedTuple):
 
     title: str
     markdown: str
-    """Its text, without the title."""
+    """The text without the title."""
     figures: Mapping[str, Any] = {}
     """Every number in it, by name, as JSON can store it."""
 
@@ -21,13 +21,13 @@ def page(title: str, lead: str, sections: Sequence[Section]) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose first column is text and whose others are numbers."""
+    """A table with a first column of text and further columns of numbers."""
     ruler = ["---", *(["---:"] * (len(head) - 1))]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ruler, *rows))
 
 
 def short(value: float, never: str = "∞") -> str:
-    """A number in three digits, 1.30e-6 rather than 0.0000013; `never` for one that is not finite."""
+    """The number in three digits, as 1.30e-6 rather than 0.0000013; `never` if it is not finite."""
     if not math.isfinite(value):
         return never
     if value == 0.0:

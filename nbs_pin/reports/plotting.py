@@ -1,4 +1,4 @@
-"""Figures of runs, and the style of every picture; drawn without any global plotting state."""
+"""Figures of runs, and the style of every figure, without any global plotting state."""
 
 import io
 from collections.abc import Iterator
@@ -23,31 +23,21 @@ from nbs_pin.simulation.metrics import saturated_fraction
 ACTUAL, REFERENCE, ERROR = "#1f5fbf", "#ff8c1a", "#b3261e"
 TORQUE, LIMIT, SATURATED = "#22734d", "#8a8f98", "#f6c945"
 MAX_POINTS = 4000
-"""More rows than this are thinned, keeping every stretch's extremes."""
+"""Longer curves are thinned, keeping the extremes of every stretch."""
 
 _STYLE: Any = {
-    "font.size": 8.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#9aa3ad",
-    "axes.linewidth": 0.7,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
-    "grid.color": "#e6eaee",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.2,
-    "lines.solid_capstyle": "round",
-    "xtick.color": "#4a5562",
-    "ytick.color": "#4a5562",
-}
+    "font.size": 8.5, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#9aa3ad",
+    "axes.linewidth": 0.7, "axes.grid": True, "axes.axisbelow": True, "axes.formatter.useoffset": False,
+    "grid.color": "#e6eaee", "grid.linewidth": 0.6, "lines.linewidth": 1.2, "lines.solid_capstyle": "round",
+    "xtick.color": "#4a5562", "ytick.color": "#4a5562",
+}  # fmt: skip
 
 
 @contextmanager
 def picture(path: str | Path, width: float, height: float, dpi: int = 120) -> Iterator[Figure]:
-    """An empty figure of that size [inch] in the style of every picture, written to the path (PNG) when the block ends.
+    """An empty figure of that size [inch] in the common style, written to the path (PNG) when the block ends.
 
-    Written whole or, when drawing fails, not at all; raises OSError when it cannot be written.
+    It is written whole, or not at all if drawing fails. Raises OSError if it cannot be written.
     """
     with rc_context(_STYLE):
         figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
@@ -59,11 +49,23 @@ def picture(path: str | Path, width: float, height: float, dpi: int = 120) -> It
 
 
 def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
-    """Draws how each joint followed its reference and writes the picture (PNG); returns its path.
+    """Plot how each joint follows its reference and write the picture (PNG); returns its path.
 
-    A row per joint: actual against desired position, |error| on a logarithmic scale (wrapped on continuous joints),
-    and applied torque with the effort limits; stretches where the asked torque was cut off are shaded.
-    start: which start of a batched run to draw. Raises ArgumentError when it does not exist.
+    Each row shows actual and desired position, |error| on a logarithmic scale (wrapped on continuous joints), and the
+    applied torque with the effort limits, saturated stretches shaded. `start` selects one start of a batched run.
+
+    Raises:
+        ArgumentError: If the start does not exist.
+
+    Example:
+        >>> import tempfile
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+        >>> run = nbs.simulate(nbs.MujocoPlant(robot), law, reference, 0.1, 0.001)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     print(nbs.plot_tracking(run, f"{folder}/tracking.png").name)
+        tracking.png
     """
     starts = int(np.prod(run.q.shape[1:-1], dtype=int))
     if not 0 <= start < starts:
@@ -73,7 +75,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
     )
     error = np.abs(configuration_difference(q, q_ref, run.continuous))
     cut = np.abs(asked) > run.effort_limit
-    tau[-1], cut[-1] = np.nan, False  # asked for, never applied
+    tau[-1], cut[-1] = np.nan, False  # commanded, but never applied
     fraction = float(np.ravel(saturated_fraction(run))[start])
     with picture(path, 13.0, 1.15 + 1.5 * run.nv) as figure:
         grid = figure.subplots(run.nv, 3, sharex=True, squeeze=False)
@@ -94,7 +96,7 @@ def _draw_position(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarra
 
 
 def _draw_error(axes: Axes, t: Float[np.ndarray, " rows"], error: Float[np.ndarray, " rows"]) -> None:
-    """|error| over at most nine decades; exact zeros fall off the scale."""
+    """|error| over at most nine decades; exact zeros are not drawn."""
     finite = error[np.isfinite(error) & (error > 0.0)]
     top = 10.0 ** np.ceil(np.log10(finite.max())) if len(finite) else 1.0
     low = max(10.0 ** np.floor(np.log10(np.percentile(finite, 0.5))) if len(finite) else 0.1, 1e-9 * top)
@@ -107,7 +109,7 @@ def _draw_error(axes: Axes, t: Float[np.ndarray, " rows"], error: Float[np.ndarr
 
 def _draw_torque(axes: Axes, t: Float[np.ndarray, " rows"], tau: Float[np.ndarray, " rows"], limit: float,
                  cut: Bool[np.ndarray, " rows"]) -> None:  # fmt: skip
-    """Torque, its limits where they are within sight, and the stretches where it was cut off."""
+    """Torque, its limits if it comes near them, and the stretches where it is saturated."""
     bars = [(t[begin], t[min(end, len(t) - 1)] - t[begin]) for begin, end in stretches(cut)]
     axes.broken_barh(bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=SATURATED, alpha=0.45, linewidth=0)
     axes.plot(*thin(t, tau), color=TORQUE, linewidth=1.0)
@@ -144,7 +146,7 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
 
 
 def thin(t: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tuple[np.ndarray, np.ndarray]:
-    """The curve with at most MAX_POINTS points: least and greatest of every stretch, so that no spike is lost."""
+    """The curve with at most MAX_POINTS points, the extremes of every stretch, so that no peak is lost."""
     if len(t) <= MAX_POINTS:
         return t, y
     width = -(-2 * len(t) // MAX_POINTS)
@@ -165,5 +167,5 @@ def stretches(flags: Bool[np.ndarray, " rows"]) -> list[tuple[int, int]]:
 
 
 def _short(text: str, width: int = 28) -> str:
-    """The text cut to the width, with no letter that matplotlib would read as mathematics."""
+    """The text cut to the width, with dollar signs escaped for matplotlib."""
     return (text if len(text) <= width else text[: width - 1] + "…").replace("$", r"\$")

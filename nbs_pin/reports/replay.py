@@ -1,8 +1,8 @@
-"""Runs in the browser: one self-contained page with the arm and a translucent reference arm.
+"""Replays of runs in the browser: one self-contained page with the arm and a translucent reference arm.
 
-The page carries meshcat's viewer, the arm as meshcat commands that are handled in order, and the poses of its bodies
-by Pinocchio's forward kinematics; a small script of ours (`replay.html`) moves them. No server is started, and
-the page's own security policy forbids it every connection.
+The page contains meshcat's viewer, the arm as a sequence of meshcat commands, and the poses of its bodies by
+Pinocchio's forward kinematics; a small script (`replay.html`) moves them. No server is started, and the page's content
+security policy forbids every connection.
 """
 
 import base64
@@ -31,18 +31,35 @@ from nbs_pin.robots.visuals import Visual, link_visuals, tip
 FRAME_RATE = 50.0
 """Frames per second of run time [1/s]; the page interpolates between them."""
 MAX_FRAMES = 12_000
-"""Longer runs get fewer frames per second, to keep the page small."""
+"""Longer runs get fewer frames per second, so that the page stays small."""
 
 
 def replay(
     run: Run, path: str | Path, robot: Robot | None = None, *, start: int = 0, package_dirs: Iterable[str | Path] = ()
 ) -> Path:
-    """Writes a page that plays `run` in any browser without a network; returns its path.
+    """Write a page that plays the run in any browser without a network; returns its path.
 
-    robot: the arm to draw; None loads the one the run names. start: which start of a batched run to show.
-    package_dirs: further folders that meshes may be read from. A mesh that cannot be drawn is named in a warning.
-    Raises ArgumentError when the run names no robot, when that robot is no longer the one that ran, when `robot` has
-    other joints, when `start` does not exist, or when the run is not finite.
+    A mesh that cannot be drawn is named in a warning.
+
+    Args:
+        run: The run.
+        path: The HTML file.
+        robot: The arm to draw. None loads the one that the run names.
+        start: Which start of a batched run to show.
+        package_dirs: Further folders that meshes may be read from.
+
+    Raises:
+        ArgumentError: If the run is not finite, its robot is missing or has changed, or `robot` or `start` do not fit.
+
+    Example:
+        >>> import tempfile
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+        >>> run = nbs.simulate(nbs.MujocoPlant(robot), law, reference, 0.1, 0.001)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     print(nbs.replay(run, f"{folder}/replay.html").name)
+        replay.html
     """
     robot = _robot_of(run) if robot is None else robot
     if robot.joint_names != run.joint_names:
@@ -89,7 +106,7 @@ def body_poses(robot: Robot, q: Float[np.ndarray, "rows n"]) -> Float[np.ndarray
 
 
 def _robot_of(run: Run) -> Robot:
-    """The robot a run names, if it is still the one that ran."""
+    """The robot that the run names; raises ArgumentError unless it is still the one that ran."""
     if not run.robot:
         raise ArgumentError("the run names no robot: give it as replay(run, path, robot=load_robot(…)).")
     unknown = run.robot_options.keys() - {"gravity", "lock", "zero_limits"}
@@ -119,7 +136,7 @@ def _frame_rows(t: Float[np.ndarray, " rows"]) -> Int[np.ndarray, " frames"]:
 
 
 def _notes(run: Run) -> str:
-    """What the run's notes say of controller and plant, in one line."""
+    """Controller, plant and reference from the run's notes, in one line."""
     return " · ".join(str(run.info[key]) for key in ("controller", "plant", "reference") if run.info.get(key))
 
 
@@ -128,7 +145,7 @@ def _body_node(body: int) -> tuple[str, str]:
 
 
 def _commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]:
-    """The commands for meshcat that build the arm: a node per body, under it a node per shape."""
+    """The meshcat commands that build the arm: a node per body, under it a node per shape."""
     commands = [SetTransform(np.eye(4), ScenePath(_body_node(body))) for body in range(robot.model.njoints)]
     for index, visual in enumerate(visuals):
         frame = robot.model.frames[robot.model.getFrameId(visual.link, pin.FrameType.BODY)]
@@ -149,7 +166,7 @@ def _material(visual: Visual) -> MeshPhongMaterial:
 
 
 def _view(robot: Robot, visuals: tuple[Visual, ...], poses: Float[np.ndarray, "frames 2 bodies 7"]) -> dict[str, Any]:
-    """Where to look so that the whole motion of both arms is in the picture, and how wide the grid's cells are [m]."""
+    """The view in which the whole motion of both arms is visible, and the cell width of the grid [m]."""
     picked = poses[np.unique(np.linspace(0, len(poses) - 1, 40).astype(int))].reshape(-1, *poses.shape[2:])
     points = [np.zeros((1, 3))]
     for visual in visuals:
@@ -182,7 +199,7 @@ def _encoded(array: np.ndarray, dtype: type[np.floating[Any]]) -> str:
 
 
 def _page(name: str, data: dict[str, Any]) -> str:
-    """The template with its four holes filled in one pass, so that no content is read as a hole."""
+    """The template with its four placeholders filled in one pass, so that content is never read as a placeholder."""
     viewer = importlib.resources.files("meshcat") / "viewer" / "dist"
     holes = {
         "title": html.escape(f"{name} – replay"),

@@ -1,1 +1,1 @@
-"""The paper and the studies of this package, run again."""
+"""The paper's experiments reproduced, and the studies of this package."""

@@ -2,11 +2,11 @@
 
 It differs from the paper's text, and from the laws of this package, in six ways (docs/theory.md §8): the smoothed ReLU
 lacks −d/2 and jumps; the diagonal of the damping factor is (relu(·) + m) times z2, and D = LLᵀ; M, C and G are
-constants in the gradient; the cost holds q(t + h) against q_d(t); weights are drawn in float32; one start is all.
+constants in the gradient; the cost compares q(t + h) with q_d(t); weights are drawn in float32; there is one start.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import matvec
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Run
-from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.motions.references import paper_reference
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
@@ -25,7 +24,9 @@ from nbs_pin.training.optimisers import optimiser, scheduled_rate
 PERIOD = 0.01
 """Control period and Euler step [s]."""
 WIDTH, CORNER = 32, 0.01
-# In the order in which the program draws them, which makes its seeds ours: name, (inputs, outputs), bounds.
+States: TypeAlias = Float[torch.Tensor, "seeds rows 2"]
+Desired: TypeAlias = Float[torch.Tensor, "... 2"]
+# Names and shapes (inputs, outputs) in the order in which the program draws them: equal seeds give equal weights.
 _POTENTIAL = (
     ("x0", (2, WIDTH)), ("x1", (2, WIDTH)), ("x2", (2, WIDTH)), ("y1", (WIDTH, WIDTH)), ("y2", (WIDTH, WIDTH)),
     ("x3", (2, 1)), ("y3", (WIDTH, 1)),
@@ -36,11 +37,14 @@ _DAMPING = (
 )  # fmt: skip
 
 
-class AuthorsLaw(MemorylessController):
+class AuthorsLaw:
     """The program's law for several seeds at once: start k of a batch (seeds, 2) is under the weights of seed k.
 
     τ = M a_r + C v_r + G − ∇Φ − LLᵀz2 with S = I and L = [[d₁, 0], [o, d₂]], d = (relu(·) + m)z2.
-    seeds: of torch's generator, whose float32 draws are the program's. m: 0.001, or 1 under a disturbance.
+
+    Args:
+        seeds: Seeds of torch's generator, whose float32 draws are those of the program.
+        m: 0.001, or 1 under a disturbance.
     """
 
     def __init__(self, seeds: Sequence[int], m: float = 0.001) -> None:
@@ -48,25 +52,7 @@ class AuthorsLaw(MemorylessController):
         self.m, self.dynamics = m, AnalyticDynamics()
         self.weights = {name: torch.nn.Parameter(torch.stack([w[name] for w in drawn])) for name in drawn[0]}
 
-    @property
-    def nv(self) -> int:
-        """Two joints."""
-        return 2
-
-    def torque(self, q: Any, v: Any, q_ref: Any, v_ref: Any, a_ref: Any) -> Float[np.ndarray, "seeds 2"]:
-        """τ [N·m] for the state of every seed, (seeds, 2), under one reference, (2,); numpy only."""
-        with torch.inference_mode():
-            state = (torch.from_numpy(x)[:, None] for x in (q, v))
-            return self.torques(*state, *(torch.from_numpy(x) for x in (q_ref, v_ref, a_ref)))[:, 0].numpy()
-
-    def torques(
-        self,
-        q: Float[torch.Tensor, "seeds rows 2"],
-        v: Float[torch.Tensor, "seeds rows 2"],
-        q_ref: Float[torch.Tensor, "... 2"],
-        v_ref: Float[torch.Tensor, "... 2"],
-        a_ref: Float[torch.Tensor, "... 2"],
-    ) -> Float[torch.Tensor, "seeds rows 2"]:
+    def torques(self, q: States, v: States, q_ref: Desired, v_ref: Desired, a_ref: Desired) -> States:
         """τ [N·m] for many states of every seed, differentiable in weights and errors, not through M, C and G."""
         dv = v - v_ref
         gradient, gradient_rate = self._potential(q - q_ref, dv)
@@ -122,17 +108,18 @@ def task(duration: float) -> Loop:
 def follow_authors(law: AuthorsLaw, duration: float, torque: Any = 0.0) -> Run:
     """Every seed follows q_d = [sin 0.1t, cos 0.1t] from rest at zero under a constant disturbance `torque` [N·m].
 
-    A seed that leaves the finite numbers goes on with infinities, and leaves the others alone.
+    A seed whose motion diverges continues with infinities and does not affect the others.
     """
     loop = task(duration)
     schedule = loop.schedule(paper_reference(2))
     rest = np.zeros((len(law.weights["x0"]), 2))
     run = loop.blank_run(schedule.times, schedule.desired, rest, rest, type(law).__name__)
     run.disturbance[:] = torque
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"), torch.inference_mode():
         for k, desired in enumerate(zip(*schedule.desired, strict=True)):
             q, v = run.q[k], run.v[k]
-            run.tau[k] = law.torque(q, v, *desired)
+            state = (torch.from_numpy(x)[:, None] for x in (q, v))
+            run.tau[k] = law.torques(*state, *map(torch.from_numpy, desired))[:, 0].numpy()
             if k < loop.steps:
                 acceleration = law.dynamics.forward_dynamics(q, v, run.tau[k] + torque)
                 run.q[k + 1], run.v[k + 1] = q + PERIOD * v, v + PERIOD * acceleration
@@ -145,16 +132,15 @@ def follow_authors(law: AuthorsLaw, duration: float, torque: Any = 0.0) -> Run:
 def train_authors(law: AuthorsLaw, *, epochs: int = 200, torque: Any = 0.0, progress: bool = False) -> None:
     """The program's training, in place: Σ ‖q(t + h) − q_d(t)‖² over 1 s, Adam at 1e-3, halved every 40 epochs.
 
-    A seed whose motion leaves the finite numbers is lost, as in the program, and leaves the others alone.
+    A seed whose motion diverges is lost, as in the program, and does not affect the others.
     """
     adam = optimiser("adam", list(law.weights.values()), 1e-3)
     for epoch in tracked(range(epochs), "training as the paper's program does", progress):
         for group in adam.param_groups:
             group["lr"] = scheduled_rate("adam", 1e-3, epoch, epochs)
         run = follow_authors(law, 1.0, torque)
-        q, v, *desired = (
-            torch.from_numpy(x[:-1].swapaxes(0, 1)) for x in (run.q, run.v, run.q_ref, run.v_ref, run.a_ref)
-        )
+        recorded = (run.q, run.v, run.q_ref, run.v_ref, run.a_ref)
+        q, v, *desired = (torch.from_numpy(x[:-1].swapaxes(0, 1)) for x in recorded)
         tau = law.torques(q.requires_grad_(), v.requires_grad_(), *desired)
         by_state = [torch.autograd.grad(tau[..., i].sum(), (q, v), retain_graph=True) for i in range(2)]
         jacobians = [torch.stack(rows, dim=-2).numpy().swapaxes(0, 1) for rows in zip(*by_state, strict=True)]
@@ -178,7 +164,7 @@ def _torque_cotangents(law: AuthorsLaw, run: Run, by_q: np.ndarray, by_v: np.nda
 
 
 def _drawn(seed: int) -> dict[str, torch.Tensor]:
-    """Weights of one seed, (inputs, outputs) each, in float64; biases of the damping networks begin at zero."""
+    """Weights of one seed, (inputs, outputs) each, in float64; the biases of the damping networks are zero."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         weights = {name: torch.empty(shape).uniform_(-0.1, 0.2).double() for name, shape in _POTENTIAL}

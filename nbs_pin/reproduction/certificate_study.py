@@ -1,16 +1,14 @@
-"""Certificates against an adversary: how loose the bounds are, whether any is broken, and the paper's that is."""
+"""Certificates against an adversary: how loose the bounds are, and a violation of the paper's."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
 from nbs_pin.certificates.admissible import Admissible
@@ -24,15 +22,13 @@ from nbs_pin.motions.references import Hold
 from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, picture
 from nbs_pin.reproduction import certificate_poses
+from nbs_pin.reproduction.study import write_records
 from nbs_pin.robots.robot import Robot, load_robot
 
 FILES = ("certificates.csv", "certificates.png", certificate_poses.FILE)
 """What `reproduce_certificates` writes."""
-ARMS = ("two_link", "ur5", "panda")
 TORQUE = 5.0
 """Bound on the disturbance of every joint of an arm [N·m]."""
-MODULI, DAMPINGS = (0.25, 0.5, 1.0, 2.0), (0.5, 1.0, 2.0)
-"""μ = 2S [N·m/rad] and D [N·m·s/rad] of the laws for one joint."""
 _BATCH = 250
 _ONE_JOINT = (
     '<robot name="one_joint"><link name="base"/><link name="rotor"><inertial><mass value="1"/>'
@@ -42,62 +38,61 @@ _ONE_JOINT = (
 )
 
 
-@dataclass(frozen=True)
-class Scale:
-    """How much of everything."""
+class Scale(NamedTuple):
+    """How much of everything; the defaults take some minutes on two cores."""
 
-    arms: Sequence[str] = ARMS
-    moduli: Sequence[float] = MODULI
-    dampings: Sequence[float] = DAMPINGS
+    arms: Sequence[str] = ("two_link", "ur5", "panda")
+    moduli: Sequence[float] = (0.25, 0.5, 1.0, 2.0)
+    """μ = 2S [N·m/rad] of the laws for one joint."""
+    dampings: Sequence[float] = (0.5, 1.0, 2.0)
+    """D [N·m·s/rad] of the laws for one joint."""
     random: int = 1_000
-    """Random disturbances for every arm's laws and for the first of the laws for one joint."""
+    """Random disturbances for every law of an arm and for the first of the laws for one joint."""
     family: int = 100
-    """For every other law for one joint."""
+    """Random disturbances for every other law for one joint."""
     longest: int = 1_500
-    """Periods of a random one, at most."""
+    """Largest number of periods of a random disturbance."""
     rounds: int = 8
-    """Of ascent."""
+    """Rounds of ascent of the adversary."""
     duration: float | None = None
-    """Of the adversary's motions [s]; None takes what the law asks for."""
+    """Duration of the adversary's motions [s]; None takes that of `attack`."""
     fine: tuple[float, float] = (28.0, 0.002)
     """Duration and control period of the motion that breaks the paper's bound [s]."""
-    poses: certificate_poses.Scale = field(default_factory=certificate_poses.Scale)
+    poses: certificate_poses.Scale = certificate_poses.Scale()
 
 
 class Row(NamedTuple):
-    """One law, its bound and what was tried against it."""
+    """One law, its bound and the worst errors found."""
 
     arm: str
     law: str
     disturbance_Nm: float
-    """Bound on every joint."""
+    """Bound on the disturbance of every joint."""
     label: str
     certified_rad: float
     """Bound of ‖z1‖."""
     printed_rad: float
-    """What the paper's Theorem 3 prints."""
+    """Bound that the paper's Theorem 3 prints."""
     found_rad: float
     """The worst ‖z1‖ of adversary and random disturbances."""
     ratio: float
-    """certified ÷ found."""
+    """Certified ÷ found."""
     random_rad: float
-    """The worst of the random disturbances."""
+    """The worst ‖z1‖ of the random disturbances."""
     tried: int
-    """Random disturbances."""
+    """Number of random disturbances."""
     violations: int
-    """Motions in which ‖z1‖ or some |z1_i| exceeded its bound, the adversary's among them."""
+    """Motions in which ‖z1‖ or some |z1_i| exceeded its bound, those of the adversary included."""
 
 
 class Case(NamedTuple):
-    """A law to be certified and attacked."""
+    """A law to be certified and attacked, with its bound on every joint [N·m] and its control period [s]."""
 
     arm: str
     law: str
     controller: NeuralBackstepping
     torque: float
-    """Bound on every joint [N·m]."""
     period: float
-    """[s]."""
     random: int
     """Random disturbances to try."""
 
@@ -105,21 +100,15 @@ class Case(NamedTuple):
 def reproduce_certificates(
     folder: Path, seed: int = 0, progress: bool = False, scale: Scale | None = None
 ) -> list[Section]:
-    """Runs everything, writes `FILES` into the folder and returns the sections of the page.
-
-    seed: of networks, disturbances and poses. scale: None takes `Scale()`, some minutes on two cores.
-    Raises OSError when a file cannot be written and KeyboardInterrupt on Ctrl-C.
-    """
+    """Run the study, write `FILES` into the folder and return the sections of the page."""
     scale = scale or Scale()
     cases = [*one_joint_cases(scale, seed), *arm_cases(scale, seed)]
     rows: list[Row] = []
     for case in tracked(cases, lambda: f"certificates: {cases[min(len(rows), len(cases) - 1)].law}", progress):
         rows.append(held(case, scale, seed))
     poses = certificate_poses.study(scale.poses, seed, progress)
-    write_csv(folder / FILES[0], Row._fields, rows)
-    _draw(rows, folder / FILES[1])
-    certificate_poses.write(poses, folder)
-    return [_section(rows, scale, seed), _counterexample(scale), certificate_poses.section(poses, scale.poses)]
+    sections = [_section(rows, scale, seed, folder), _counterexample(scale)]
+    return [*sections, certificate_poses.section(poses, scale.poses, folder)]
 
 
 def one_joint() -> Robot:
@@ -131,7 +120,7 @@ def one_joint() -> Robot:
 
 
 def constant_damping(robot: Robot, modulus: float, damping: float, *, quiet: bool, seed: int = 0) -> NeuralBackstepping:
-    """The paper's kind of law: Λ = I, S = ½μI, D = dI + TᵀT; quiet: with ψ = 0 and T = 0, which makes it linear."""
+    """A law as the paper's: Λ = I, S = ½μI, D = dI + TᵀT; quiet: with ψ = 0 and T = 0, which makes it linear."""
     n = robot.nv
     potential = Potential(0.5 * modulus * np.eye(n), seed=seed)
     law = NeuralBackstepping(PinocchioDynamics(robot), potential, Damping(n, floor=damping * np.eye(n), seed=seed + 1))
@@ -166,70 +155,53 @@ def arm_cases(scale: Scale, seed: int) -> Iterator[Case]:
 
 def held(case: Case, scale: Scale, seed: int) -> Row:
     """The certificate of one law, against the adversary and random disturbances."""
-    controller, n = case.controller, case.controller.nv
+    law, n, period = case.controller, case.controller.nv, case.period
     admissible = Admissible.of(np.full(n, case.torque), n)
-    certificate = certify(controller, admissible, period=case.period)
-    reference = Hold(np.zeros(1)) if n == 1 else None
-    worst = attack(
-        controller,
-        admissible,
-        reference=reference,
-        period=case.period,
-        rounds=scale.rounds,
-        seed=seed,
-        duration=scale.duration,
-    )
+    certificate = certify(law, admissible, period=period)
+    motion: dict[str, Any] = {"reference": Hold(np.zeros(1)) if n == 1 else None, "period": period, "seed": seed}
+    worst = attack(law, admissible, rounds=scale.rounds, duration=scale.duration, **motion)
     steps = min(worst.disturbance.shape[0], scale.longest)
-    rng, errors, joints = np.random.default_rng((seed, n)), [], []
+    rng, errors, joints = np.random.default_rng((seed, n)), [np.array([worst.error])], [worst.joint_errors[None]]
     for first in range(0, case.random, _BATCH):
-        count = min(_BATCH, case.random - first)
-        torques = random_disturbances(admissible, steps, case.period, count, rng)
-        peaks = worst_of(controller, torques, reference, period=case.period, seed=seed)
+        torques = random_disturbances(admissible, steps, period, min(_BATCH, case.random - first), rng)
+        peaks = worst_of(law, torques, **motion)
         errors.append(peaks.error)
         joints.append(peaks.joint_errors)
-    error = np.concatenate([[worst.error], *errors])
-    joint = np.concatenate([worst.joint_errors[None], *joints])
-    broken = (error > certificate.error) | (joint > certificate.joint_errors).any(axis=1)
+    error = np.concatenate(errors)
+    broken = (error > certificate.error) | (np.concatenate(joints) > certificate.joint_errors).any(axis=1)
+    found = float(error.max())
     return Row(
-        case.arm,
-        case.law,
-        case.torque,
-        str(certificate.label),
-        certificate.error,
-        certificate.printed_error,
-        float(error.max()),
-        certificate.error / float(error.max()),
-        float(error[1:].max(initial=0.0)),
-        case.random,
-        int(broken.sum()),
+        *(case.arm, case.law, case.torque, str(certificate.label)),
+        *(certificate.error, certificate.printed_error, found, certificate.error / found),
+        *(float(error[1:].max(initial=0.0)), case.random, int(broken.sum())),
     )
 
 
-def _section(rows: Sequence[Row], scale: Scale, seed: int) -> Section:
+def _section(rows: Sequence[Row], scale: Scale, seed: int, folder: Path) -> Section:
+    """Tables and picture of all laws, with their files in the folder."""
+    figures = write_records(folder / FILES[0], rows)
+    _draw(rows, folder / FILES[1])
     head = ["", "certified [rad]", "paper prints", "worst found", "certified ÷ found", "worst random", "violations"]
-    tables = []
-    for arm in dict.fromkeys(row.arm for row in rows):
-        table = markdown_table(head, [_cells(row) for row in rows if row.arm == arm])
-        torque = next(row.disturbance_Nm for row in rows if row.arm == arm)
-        tables.append(f"**{arm}, up to {torque:g} N·m on every joint**\n\n{table}")
+    tables = "\n\n".join(
+        f"**{arm}, up to {torque:g} N·m on every joint**\n\n{markdown_table(head, list(map(_cells, group)))}"
+        for (arm, torque), group in groupby(rows, key=lambda row: (row.arm, row.disturbance_Nm))
+    )
     broken, proved = sum(row.violations for row in rows), all(row.label == "PROVED" for row in rows)
     printed = [f"{row.arm}, {row.law}" for row in rows if row.printed_rad < row.found_rad]
-    kept = "no motion" if not broken else f"{broken} motions"
-    joined = "\n\n".join(tables)
     text = f"""
 Bounds of ‖z1‖ that `certify` gives{", every one PROVED" if proved else ""}, beside the worst that was found from
 z1 = z2 = 0: by the adversary (`attack`, {scale.rounds} rounds, on the arm's own reference and in seven postures) and in
 {scale.random} random admissible disturbances ({scale.family} for most laws of one joint) of every kind: constant,
 square waves, steps, switching, sines, sums of them, filtered noise. Control at 1 ms (one joint: 5 ms) with half a
 period of look-ahead, no effort limits, seed {seed}. A violation is a motion in which ‖z1‖ or any |z1_i| exceeded its
-bound: {kept} of {sum(row.tried + 1 for row in rows)}.
+bound: {f"{broken} motions" if broken else "no motion"} of {sum(row.tried + 1 for row in rows)}.
 
-{joined}
+{tables}
 
-The bound that the paper's Theorem 3 prints was exceeded by {"no law" if not printed else "; ".join(printed)}.
+The bound that the paper's Theorem 3 prints was exceeded by {"; ".join(printed) or "no law"}.
 
 ![Certified, printed and found](certificates.png)"""
-    return Section("Certificates against an adversary", text, {"certificates": plain([row._asdict() for row in rows])})
+    return Section("Certificates against an adversary", text, {"certificates": figures})
 
 
 def _cells(row: Row) -> list[str]:
@@ -255,21 +227,19 @@ limsup ‖∇Φ‖² ≤ ½ d and so z1² ≤ 2 d. Under the switching torque th
 
 
 def _draw(rows: Sequence[Row], path: Path) -> None:
-    """A line per law: certified ÷ found, with the printed bound and the worst random one in the same measure."""
+    """A bar per law: certified ÷ found, with the printed bound and the worst random error ÷ found."""
+    lines, found = np.arange(len(rows)), [row.found_rad for row in rows]
+    certified, printed, random = np.array([(r.certified_rad, r.printed_rad, r.random_rad) for r in rows]).T / found
     with picture(path, 8.5, 1.3 + 0.24 * len(rows)) as figure:
         axes = figure.add_subplot()
-        for y, row in enumerate(rows):
-            axes.barh(y, row.ratio, height=0.62, color="#d5d9de")
-            axes.plot(row.printed_rad / row.found_rad, y, "|", color=ERROR, markersize=9, markeredgewidth=1.8)
-            axes.plot(row.random_rad / row.found_rad, y, "o", color=ACTUAL, markersize=4)
-            beside = (max(row.ratio, row.printed_rad / row.found_rad), y)
-            axes.annotate(f"{row.ratio:.2f}", beside, xytext=(4, 0), textcoords="offset points", va="center",
+        axes.barh(lines, certified, height=0.62, color="#d5d9de", label="certified")
+        axes.plot(printed, lines, "|", color=ERROR, ms=9, mew=1.8, label="printed in the paper")
+        axes.plot(random, lines, "o", color=ACTUAL, ms=4, label="worst random disturbance")
+        for y, right in enumerate(np.maximum(certified, printed)):
+            axes.annotate(f"{rows[y].ratio:.2f}", (right, y), xytext=(4, 0), textcoords="offset points", va="center",
                           fontsize=7.5, color="#4a5562")  # fmt: skip
         axes.axvline(1.0, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
-        axes.set_yticks(range(len(rows)), [f"{row.arm}, {row.law}" for row in rows])
+        axes.set_yticks(lines, [f"{row.arm}, {row.law}" for row in rows])
         axes.set(xlabel="÷ worst ‖z1‖ found", ylim=(len(rows) - 0.4, -0.6), xlim=(0.0, None))
         axes.grid(False, axis="y")
-        axes.barh(np.nan, 0.0, color="#d5d9de", label="certified")
-        axes.plot([], [], "|", color=ERROR, markersize=9, markeredgewidth=1.8, label="printed in the paper")
-        axes.plot([], [], "o", color=ACTUAL, markersize=4, label="worst random disturbance")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside upper right", ncols=3, frameon=False)

@@ -1,14 +1,12 @@
-"""The paper's Figure 5: three links, a model learned from data, and what its number says about that model."""
+"""The paper's Figure 5: three links, a model learned from data, and what the steady error says about the model."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nbs_pin.base.arrays import Matrices, Scalars, Vectors
-from nbs_pin.base.csv_files import write_csv
-from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Run
 from nbs_pin.controllers.controller import Controller
@@ -20,28 +18,37 @@ from nbs_pin.kernels.layout import Packed
 from nbs_pin.motions.references import paper_reference
 from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, TORQUE, picture, thin
+from nbs_pin.reproduction.paper_table import trained
+from nbs_pin.reproduction.study import write_records
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.simulation import metrics
-from nbs_pin.simulation.costs import squared_error
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 from nbs_pin.simulation.simulate import simulate
-from nbs_pin.training.train import train
 
 FILES = ("figure5.png", "figure5.csv")
-"""What `write` writes."""
 PRINTED = 1.5e-3
 """The paper's steady ‖z1‖² [rad²]."""
 WITHOUT, WITH = "no gravity, Ĝ left out of the law", "gravity, Ĝ in the law"
-"""The paper's set-up, and the one it speaks of."""
+"""The set-up that the paper ran, and the one that it describes."""
 PD_GAINS = 20.0, 10.0
-"""K_p [N·m/rad] and K_d [N·m·s/rad] of the PD beside it, which knows no model."""
-PERIOD, TRAINING_PERIOD = 0.001, 0.01
-"""Control period of the runs, which is the step of MuJoCo, and of the training [s]."""
+"""K_p [N·m/rad] and K_d [N·m·s/rad] of the PD law without a model."""
+PERIOD = 0.001
+"""Control period of the runs and step of MuJoCo [s]."""
+
+
+class Row(NamedTuple):
+    """One run."""
+
+    setup: str
+    law: str
+    steady_error_rad2: float
+    convergence_time_s: float
+    peak_torque_Nm: float
 
 
 class Weightless(DynamicsProvider):
-    """A model with its gravity left out: M and C of it, G = 0, and no arm, so no limits."""
+    """A model without its gravity: the same M and C, G = 0, and no `robot`."""
 
     def __init__(self, model: DynamicsProvider) -> None:
         self.model = model
@@ -68,7 +75,7 @@ class Weightless(DynamicsProvider):
         return 0.0 * q[..., 0]
 
     def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
-        """M a_r + C v_r [N·m]: the model's torque less the one that holds it still, by its fastest route to both."""
+        """M a_r + C v_r [N·m]: the model's torque minus its torque at rest."""
         rest = 0.0 * q
         return self.model.reference_torque(q, v, v_r, a_r) - self.model.reference_torque(q, rest, rest, rest)
 
@@ -82,115 +89,67 @@ class Weightless(DynamicsProvider):
         return Packed(tree.layout, weights)
 
 
-def trained_law(model: DynamicsProvider, epochs: int, seed: int = 0, progress: bool = False) -> NeuralBackstepping:
-    """The paper's law on that model, its networks trained on it as the paper says, its gains left alone.
-
-    ∫ z1ᵀz1 over 1 s from rest at zero, control at 10 ms, Adam at 1e-3. Raises KeyboardInterrupt when Ctrl-C ended it.
-    """
-    training = train(
-        paper_controller(model, seed=seed),
-        DynamicsPlant(model),
-        [paper_reference(model.nv)],
-        starts=np.zeros((1, model.nv)),
-        duration=1.0,
-        period=TRAINING_PERIOD,
-        lookahead=0.0,
-        cost=squared_error,
-        gains=False,
-        epochs=epochs,
-        optimiser="adam",
-        learning_rate=1e-3,
-        progress=progress,
-    )
-    if training.stopped == "interrupted":
-        raise KeyboardInterrupt
-    law: Any = training.controller
-    return law
-
-
 def follow_again(
-    learned: Mapping[str, DynamicsProvider],
-    *,
-    epochs: int = 200,
-    duration: float = 100.0,
-    seed: int = 0,
-    progress: bool = False,
+    learned: Mapping[str, DynamicsProvider], *, epochs: int, duration: float, seed: int = 0, progress: bool = False
 ) -> dict[str, dict[str, Run]]:
     """Set-up -> law -> its run along the paper's reference from rest at zero, in MuJoCo, no torque limit or look-ahead.
 
-    learned: models by name, with Ĝ. The NBS law is trained once, on the first of them without its gravity, and has the
-    same networks on every model.
+    The NBS law runs on the exact model and on every learned one (by name, with Ĝ). It is trained once, for `epochs`, on
+    the first learned model without its gravity, and has the same networks on all.
     """
-    robot = load_robot("three_link")
-    models = {"the exact model": PinocchioDynamics(robot), **learned}
-    networks = trained_law(Weightless(next(iter(learned.values()))), epochs, seed, progress)
+    arms = {WITHOUT: load_robot("three_link", gravity=0.0), WITH: load_robot("three_link")}
+    exact, light = PinocchioDynamics(arms[WITH]), Weightless(next(iter(learned.values())))
+    networks = trained(paper_controller(light, seed=seed), epochs, plant=DynamicsPlant(light), progress=progress)
+    kp, kd = PD_GAINS
+    pd = PD(Weightless(exact), feedforward="gravity", kp=kp, kd=kd)
     laws: dict[tuple[str, str], Controller] = {}
-    for setup in (WITHOUT, WITH):
-        for name, model in models.items():
+    for setup in arms:
+        for name, model in {"the exact model": exact, **learned}.items():
             believed = Weightless(model) if setup == WITHOUT else model
             laws[setup, f"NBS on {name}"] = NeuralBackstepping(believed, networks.potential, networks.damping)
-        kp, kd = PD_GAINS
-        laws[setup, f"PD ({kp:g}, {kd:g}), no model"] = PD(
-            Weightless(models["the exact model"]), feedforward="gravity", kp=kp, kd=kd
-        )
+        laws[setup, f"PD ({kp:g}, {kd:g}), no model"] = pd
     runs: dict[str, dict[str, Run]] = {WITHOUT: {}, WITH: {}}
     for setup, name in tracked(list(laws), "the paper's Figure 5", progress):
-        arm = load_robot("three_link", gravity=0.0) if setup == WITHOUT else robot
-        runs[setup][name] = _followed(arm, laws[setup, name], duration)
+        runs[setup][name] = _followed(arms[setup], laws[setup, name], duration)
     return runs
 
 
-def write(runs: Mapping[str, Mapping[str, Run]], folder: Path) -> None:
-    """The picture in the paper's form, and the figures."""
-    _draw(runs, folder / FILES[0])
-    rows = [[*entry.values()] for entry in figures(runs)]
-    write_csv(folder / FILES[1], list(figures(runs)[0]), rows)
-
-
-def figures(runs: Mapping[str, Mapping[str, Run]]) -> list[dict[str, Any]]:
-    """One entry per run."""
-    return [
-        {
-            "setup": setup,
-            "law": name,
-            "steady_error_rad2": float(metrics.steady_error(run)),
-            "convergence_time_s": float(metrics.convergence_time(run)),
-            "peak_torque_Nm": float(metrics.peak_torque(run)),
-        }
+def section(runs: Mapping[str, Mapping[str, Run]], folder: Path) -> Section:
+    """Table and picture in the paper's form, with their files in the folder."""
+    measures = metrics.steady_error, metrics.convergence_time, metrics.peak_torque
+    found = {
+        (setup, law): Row(setup, law, *(float(measure(run)) for measure in measures))
         for setup, several in runs.items()
-        for name, run in several.items()
-    ]
-
-
-def section(runs: Mapping[str, Mapping[str, Run]]) -> Section:
-    """The part of the page that tells of it."""
-    found = figures(runs)
-    names = list(runs[WITHOUT])
-    steady = {(x["setup"], x["law"]): x["steady_error_rad2"] for x in found}
+        for law, run in several.items()
+    }
+    figures = write_records(folder / FILES[1], list(found.values()))
+    _draw(runs, folder / FILES[0])
     head = ["", "no gravity: steady ‖z1‖² [rad²]", "gravity: steady ‖z1‖² [rad²]", "no gravity: peak torque [N·m]",
             "gravity: peak torque [N·m]"]  # fmt: skip
-    peak = {(x["setup"], x["law"]): x["peak_torque_Nm"] for x in found}
-    lines = [
-        [name, *(short(steady[s, name]) for s in (WITHOUT, WITH)), *(short(peak[s, name]) for s in (WITHOUT, WITH))]
-        for name in names
-    ]
-    without, within = ([name for name in names if steady[s, name] <= PRINTED] for s in (WITHOUT, WITH))
+    lines = []
+    for name in runs[WITHOUT]:
+        both = [found[setup, name] for setup in (WITHOUT, WITH)]
+        lines.append([name, *(short(x.steady_error_rad2) for x in both), *(short(x.peak_torque_Nm) for x in both)])
+    without, within = (
+        "; ".join(name for name in runs[s] if found[s, name].steady_error_rad2 <= PRINTED) or "none"
+        for s in (WITHOUT, WITH)
+    )
     text = f"""
 The paper reports ‖z1‖² ≤ {PRINTED:g} along q_d = [sin 0.1t, cos 0.1t, sin 0.1t] for the law on its learned model, in
 MuJoCo, from rest at zero. Its program ran that with gravity switched off and Ĝ left out of the law (docs/theory.md §8).
-The same again: control at 1 ms, {runs[WITHOUT][names[0]].t[-1]:g} s, no torque limit; the paper's networks, trained
-once, under every model. Steady: largest ‖z1‖² of the last 30 %.
+Here: control at 1 ms, {next(iter(runs[WITHOUT].values())).t[-1]:g} s, no torque limit; the same trained
+networks on every model. Steady: largest ‖z1‖² of the last 30 %.
 
 {markdown_table(head, lines)}
 
-At or below the paper's {PRINTED:g} without gravity: {"; ".join(without) or "none"}.
+At or below the paper's {PRINTED:g} without gravity: {without}.
 A number that a law without a model reaches says nothing about a learned one. With gravity, where the law
-needs Ĝ: {"; ".join(within) or "none"}.
+needs Ĝ: {within}.
 
 ![The paper's Figure 5, without and with gravity](figure5.png)
 
 Solid, dashed and dotted: joints 1, 2 and 3; black: desired; dashed grey: the paper's bound."""
-    return Section("Figure 5: three links and a learned model", text, {"figure5": plain(found)})
+    return Section("Figure 5: three links and a learned model", text, {"figure5": figures})
 
 
 def _followed(robot: Robot, law: Controller, duration: float) -> Run:
@@ -200,7 +159,7 @@ def _followed(robot: Robot, law: Controller, duration: float) -> Run:
 
 
 def _draw(runs: Mapping[str, Mapping[str, Run]], path: Path) -> None:
-    """Columns: the set-ups. Rows: angles, tracking errors, ‖z1‖² over all of the time."""
+    """Columns: the set-ups. Rows: angles, tracking errors, ‖z1‖² over time."""
     colours = (TORQUE, ACTUAL, ERROR, REFERENCE)
     with picture(path, 11.0, 8.6) as figure:
         grid = figure.subplots(3, len(runs), squeeze=False, sharex="col", sharey="row")
@@ -217,7 +176,7 @@ def _draw(runs: Mapping[str, Mapping[str, Run]], path: Path) -> None:
 
 
 def _draw_run(axes: np.ndarray, run: Run, colour: str, name: str, width: float) -> None:
-    """A column of the picture; the run of the exact model is wide, for others to lie on."""
+    """A run in a column of the picture; that of the exact model is wide and pale."""
     z1, t = metrics.error(run), run.t
     look: dict[str, Any] = {"color": colour, "linewidth": width, "alpha": 0.45 if width > 1.0 else 1.0}
     for joint, style in zip(range(run.nv), ("-", "--", ":"), strict=False):

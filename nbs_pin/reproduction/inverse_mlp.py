@@ -1,7 +1,7 @@
-"""A plain network from motion to torque, with no mechanics in it: what structure has to beat."""
+"""A plain network from motion to torque, without any mechanics: the baseline of the models with structure."""
 
+import copy
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,34 +12,40 @@ from nbs_pin.dynamics.tanh_network import TanhNetwork
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.network_equations import deviation_of
 
-STEPS, WIDTHS = 4_000, (128, 128)
-"""Steps of Adam, and hidden layers, unless others are asked for."""
 HELD_OUT = 0.2
-"""Share of the trajectories that choose the step it ends with."""
+"""Share of the trajectories that choose the step whose parameters are kept."""
 _BATCH, _RATE, _DECAY, _CHECKS = 256, 2e-3, 1.0, 60
 
 
-@dataclass(frozen=True, eq=False)
 class InverseMlp:
-    """τ(q, v, v̇) by tanh layers on the sine and cosine of q, v, v̇ and, for friction, tanh(v/transition)."""
+    """τ(q, v, v̇) by tanh layers on the sine and cosine of q, v, v̇ and, for friction, tanh(v/transition).
 
-    network: TanhNetwork
-    features: JointFeatures
-    transition: float | None
-    """Speed at which friction turns [rad/s]; None where none is expected."""
-    inputs: Float[np.ndarray, "2 inputs"]
-    """Mean and deviation of each input, which the network sees in these units."""
-    outputs: Float[np.ndarray, "2 n"]
-    """The same of the torques [N·m]."""
+    Inputs and outputs of the network are in units of their deviations in the data, about their means.
+    """
+
+    def __init__(
+        self, data: Dataset, transition: float | None, widths: tuple[int, ...], generator: torch.Generator
+    ) -> None:
+        self.features, self.transition = JointFeatures(data.prismatic.tolist()), transition
+        raw = self._raw(data.q, data.v, data.a)
+        self.inputs = np.stack([raw.mean(0), deviation_of(raw)])
+        self.outputs = np.stack([data.tau.mean(0), deviation_of(data.tau)])
+        self.network = TanhNetwork((raw.shape[1], *widths, data.nv), generator)
 
     def torque(
         self, q: Float[np.ndarray, "rows n"], v: Float[np.ndarray, "rows n"], a: Float[np.ndarray, "rows n"]
     ) -> Float[np.ndarray, "rows n"]:
         """Torque of the motors [N·m]."""
-        mean, deviation = self.inputs
         with torch.no_grad():
-            x = torch.from_numpy((_inputs(self.features, self.transition, q, v, a) - mean) / deviation)
-            return self.outputs[0] + self.outputs[1] * self.network(x).numpy()
+            return self.outputs[0] + self.outputs[1] * self.network(self.scaled(q, v, a)).numpy()
+
+    def scaled(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> Float[torch.Tensor, "rows inputs"]:
+        """Inputs of the network."""
+        return torch.from_numpy((self._raw(q, v, a) - self.inputs[0]) / self.inputs[1])
+
+    def _raw(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray, "rows inputs"]:
+        friction = [] if self.transition is None else [np.tanh(v / self.transition)]
+        return np.concatenate([self.features(torch.from_numpy(q)).numpy(), v, a, *friction], axis=1)
 
 
 def fit_mlp(
@@ -47,25 +53,28 @@ def fit_mlp(
     seed: int = 0,
     *,
     transition: float | None = None,
-    steps: int = STEPS,
-    widths: tuple[int, ...] = WIDTHS,
+    steps: int = 4_000,
+    widths: tuple[int, ...] = (128, 128),
 ) -> InverseMlp:
     """The network with the least squared torque error, each joint's in units of its deviation.
 
-    Adam on batches with decay of the weights, its step falling along a cosine; the parameters that explain a fifth of
-    the trajectories best are kept. Widths and decay are the best of a dozen tried on three_link and ur5.
-    transition: of friction in the data [rad/s], None for none. Raises ArgumentError for one trajectory only.
+    Adam on batches with weight decay, its step falling along a cosine; the parameters that explain a fifth of the
+    trajectories best are kept. Widths and decay are the best of a dozen tried on three_link and ur5.
+
+    Args:
+        data: Motions of the arm, at least two trajectories.
+        seed: Seed of split, first parameters and batches.
+        transition: Speed at which the friction in the data changes sign [rad/s]; None for none.
+        steps: Steps of Adam.
+        widths: Sizes of the hidden layers.
     """
     train, checked = data.split(HELD_OUT, seed)
-    features, generator = JointFeatures(data.prismatic.tolist()), torch.Generator().manual_seed(seed)
-    raw = _inputs(features, transition, train.q, train.v, train.a)
-    inputs = np.stack([raw.mean(0), deviation_of(raw)])
-    outputs = np.stack([train.tau.mean(0), deviation_of(train.tau)])
-    network = TanhNetwork((raw.shape[1], *widths, data.nv), generator)
-    found = InverseMlp(network, features, transition, inputs, outputs)
-    x, y = torch.from_numpy((raw - inputs[0]) / inputs[1]), torch.from_numpy((train.tau - outputs[0]) / outputs[1])
+    generator = torch.Generator().manual_seed(seed)
+    found = InverseMlp(train, transition, widths, generator)
+    network, deviation = found.network, found.outputs[1]
+    x, y = found.scaled(train.q, train.v, train.a), torch.from_numpy((train.tau - found.outputs[0]) / deviation)
     optimiser = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
-    least, best = math.inf, {name: p.clone() for name, p in network.state_dict().items()}
+    least, best = math.inf, copy.deepcopy(network.state_dict())
     for step in range(steps):
         optimiser.param_groups[0]["lr"] = _RATE * 0.5 * (1.0 + math.cos(math.pi * step / steps))
         rows = torch.randint(len(x), (min(_BATCH, len(x)),), generator=generator)
@@ -73,18 +82,9 @@ def fit_mlp(
         (network(x[rows]) - y[rows]).square().mean().backward()
         optimiser.step()
         if (step + 1) % max(1, steps // _CHECKS) == 0:
-            error = (found.torque(checked.q, checked.v, checked.a) - checked.tau) / outputs[1]
-            if np.square(error).mean() < least:
-                least = float(np.square(error).mean())
-                best = {name: p.clone() for name, p in network.state_dict().items()}
+            error = np.square((found.torque(checked.q, checked.v, checked.a) - checked.tau) / deviation).mean()
+            if error < least:
+                least, best = float(error), copy.deepcopy(network.state_dict())
     network.load_state_dict(best)
     network.requires_grad_(False)
     return found
-
-
-def _inputs(
-    features: JointFeatures, transition: float | None, q: np.ndarray, v: np.ndarray, a: np.ndarray
-) -> Float[np.ndarray, "rows inputs"]:
-    """What the network sees, before its units."""
-    columns = [features(torch.from_numpy(q)).numpy(), v, a]
-    return np.concatenate(columns if transition is None else [*columns, np.tanh(v / transition)], axis=1)

@@ -1,18 +1,14 @@
-"""What motion without torque leaves open: networks learned from the paper's own data, and their torque scale."""
+"""What motion without torque does not determine: networks learned from the paper's own data, and their torque scale."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import joblib
 import numpy as np
 
 from nbs_pin.accuracy.compare import best_scale
-from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.plain import plain
-from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -20,25 +16,24 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit import fit
-from nbs_pin.kernels.threads import cores
-from nbs_pin.reports.markdown import Section, markdown_table, short
+from nbs_pin.reports.markdown import Section, markdown_table
+from nbs_pin.reproduction.study import on_all_cores, spread, write_records
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 
 FILE = "passive.csv"
-"""What `write` writes."""
 ACTUATED = 10
-"""Samples with torque that the last columns take the factor from."""
+"""Samples with torque from which the last columns take the factor."""
 _FEW = 500
 
 
 @dataclass(frozen=True)
 class Learner:
-    """A network, the data without torque it learns from, and how long."""
+    """A network, the data without torque from which it learns, and the iterations of the fit."""
 
     network: str
     data: str
-    """"one swing", the paper's, or "states everywhere"."""
+    """"one swing", the paper's, 1 ms apart, `_FEW` of its samples, or "states everywhere", three times as many."""
     widths: tuple[int, ...]
     iterations: int
 
@@ -57,7 +52,7 @@ class Row(NamedTuple):
     data: str
     seed: int
     acceleration_error: float
-    """Relative error of v̇ where it learned, motors off."""
+    """Relative error of v̇ at the data, motors off."""
     torque_error: float
     """Relative error of the torque there, for accelerations of the same size."""
     scale: float
@@ -71,35 +66,28 @@ class Row(NamedTuple):
 
 
 class Passive(NamedTuple):
-    """The rows, every model by (network, data, seed), and why `chain` learns nothing from such data."""
+    """What was learned, and the message with which `chain` refuses such data."""
 
     rows: list[Row]
     models: dict[tuple[str, str, int], LagrangianDynamics]
+    """By network, data and seed."""
     refusal: str
 
 
 def learn_passively(
-    robot: Robot,
-    seeds: Sequence[int],
-    learners: Sequence[Learner] = LEARNERS,
-    samples: int = 10_000,
-    progress: bool = False,
+    robot: Robot, seeds: Sequence[int], learners: Sequence[Learner], samples: int, progress: bool
 ) -> Passive:
-    """Every learner with every seed on motions of the arm with its motors off, and each held against the truth.
-
-    samples: of the paper's swing, 1 ms apart; of all of them 500, evenly spread, are learned from: its speeds show
-    through. The states everywhere are three times as many.
-    """
+    """Every learner with every seed on motions of the arm with its motors off; samples: those of the swing."""
     swing = collect(robot, "passive", samples)
     data = {"one swing": swing.take(np.linspace(0, samples - 1, min(_FEW, samples)).astype(int)),
             "states everywhere": coasting(collect(robot, "uniform", 3 * _FEW, seed=seeds[0]), robot)}  # fmt: skip
     truth, actuated = PinocchioDynamics(robot), collect(robot, "uniform", ACTUATED, seed=seeds[0] + 1)
-    tasks = [(learner, seed) for learner in learners for seed in seeds]
+    tasks = [(learner, data[learner.data], seed) for learner in learners for seed in seeds]
     rows, models = [], {}
-    learned = _learned([(learner, data[learner.data], seed) for learner, seed in tasks])
-    for learner, seed in tracked(tasks, "learning without torque", progress):
-        model = models[learner.network, learner.data, seed] = next(learned)
-        rows.append(Row(learner.network, learner.data, seed, *_judged(model, truth, data[learner.data], actuated)))
+    learned = on_all_cores(_learn, tasks, "learning without torque", progress)
+    for (learner, own, seed), model in zip(tasks, learned, strict=True):
+        models[learner.network, learner.data, seed] = model
+        rows.append(Row(learner.network, learner.data, seed, *_judged(model, truth, own, actuated)))
     return Passive(rows, models, _refusal(swing))
 
 
@@ -109,52 +97,35 @@ def coasting(data: Dataset, robot: Robot) -> Dataset:
     return replace(data, a=MujocoPlant(robot).acceleration(data.q, data.v, rest), tau=rest)
 
 
-def write(found: Passive, folder: Path) -> Path:
-    """Every row as a file."""
-    return write_csv(folder / FILE, Row._fields, found.rows)
-
-
-def section(found: Passive) -> Section:
-    """The part of the page that tells of it."""
+def section(found: Passive, folder: Path) -> Section:
+    """The table and its text, with the file in the folder."""
     head = ["network, data", "v̇ error, motors off", "torque error", "c with τ ≈ c τ̂", "torque error of c τ̂",
             f"c from {ACTUATED} samples with torque", "torque error of that"]  # fmt: skip
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in found.rows:
-        groups.setdefault((row.network, row.data), []).append(row)
-    lines = [
-        [f"{network}, {data}", *(_spread(column) for column in list(zip(*rows, strict=True))[3:])]
-        for (network, data), rows in groups.items()
-    ]
-    seeds = sorted({row.seed for row in found.rows})
+    lines = []
+    for group in dict.fromkeys((row.network, row.data) for row in found.rows):
+        figures = zip(*(row[3:] for row in found.rows if (row.network, row.data) == group), strict=True)
+        lines.append([", ".join(group), *map(spread, figures)])
     text = f"""
 The paper learns from one swing of 10 s from rest with the motors off. With τ = 0, L and c·L have the same motions
-(docs/theory.md §6): no such data can tell the scale of the torque. A torque loss has the solution M = 0, so these
+(docs/theory.md §6): no such data determine the scale of the torque. A torque loss has the solution M = 0, so these
 networks learn the acceleration. Relative errors where each was learned, least – **median** – greatest of seeds
-{seeds[0]} to {seeds[-1]}; the torque is the one that the accelerations of the data, dealt anew to its states, need.
+{found.rows[0].seed} to {found.rows[-1].seed}; the torque is the one that the accelerations of the data, assigned to its
+states in random order, need.
 
 {markdown_table(head, lines)}
 
-c should be 1. What is found instead comes from where each network began, also with states from everywhere, however
-well the motions are explained: no use for control (see Figure 5). Where they are explained well, a few samples with
-torque settle c; what is left then is what the network did not learn. The networks are smaller than the paper's, and
-learn from at most {_FEW} samples of the swing, evenly spread, or {3 * _FEW} states.
+c should be 1. What is found instead depends on the first parameters of each network, also with states from everywhere,
+however well the motions are explained: such a model is of no use for control (see Figure 5). Where they are explained
+well, a few samples with torque determine c; what is left then is what the network did not learn. The networks are
+smaller than the paper's, and learn from at most {_FEW} samples of the swing, evenly spread, or {3 * _FEW} states.
 
 `fit(data, "chain")` refuses: "{found.refusal}\""""
-    return Section("Data without torque", text, {"passive": plain([row._asdict() for row in found.rows])})
-
-
-def _learned(tasks: Sequence[tuple[Learner, Dataset, int]]) -> Iterator[Any]:
-    """A model per task, in order, on all cores."""
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        pool = joblib.Parallel(n_jobs=min(cores(), len(tasks)), return_as="generator")
-        yield from pool(joblib.delayed(_learn)(*task) for task in tasks)
+    return Section("Data without torque", text, {"passive": write_records(folder / FILE, found.rows)})
 
 
 def _learn(learner: Learner, data: Dataset, seed: int) -> DynamicsProvider:
-    return fit(
-        data, learner.network, seed, loss="acceleration", held_out=0.0, widths=learner.widths,
-        iterations=learner.iterations,
-    )  # fmt: skip
+    size: dict[str, Any] = {"widths": learner.widths, "iterations": learner.iterations}
+    return fit(data, learner.network, seed, loss="acceleration", held_out=0.0, **size)
 
 
 def _judged(model: Any, truth: DynamicsProvider, data: Dataset, actuated: Dataset) -> tuple[float, ...]:
@@ -172,15 +143,9 @@ def _relative(found: np.ndarray, true: np.ndarray) -> float:
 
 
 def _refusal(data: Dataset) -> str:
-    """What fitting a chain says; raises RuntimeError when it says nothing."""
+    """The message with which fitting a chain refuses the data."""
     try:
         fit(data, "chain")
     except ArgumentError as error:
         return str(error)
     raise RuntimeError("a chain was fitted to data without torque; its scale means nothing.")
-
-
-def _spread(values: Sequence[float]) -> str:
-    if len(values) == 1:
-        return short(values[0])
-    return f"{short(min(values))} – **{short(float(np.median(values)))}** – {short(max(values))}"

@@ -1,1 +1,1 @@
-"""Descriptions of arms: URDF, checks, drawings."""
+"""Robot descriptions: reading and checking URDF files, and visual geometry."""

@@ -11,7 +11,7 @@ from nbs_pin.robots.urdf_checks import ZeroLimits
 
 @dataclass(frozen=True)
 class Entry:
-    """Where an arm's file is and how it is to be read."""
+    """The file of an arm and the settings to load it with."""
 
     name: str
     path: Path
@@ -37,19 +37,19 @@ _EXAMPLES: dict[str, tuple[str, tuple[str, ...], ZeroLimits]] = {
 }
 _SUFFIXES = (".urdf", ".xacro")
 ROBOT_NAMES: tuple[str, ...] = (*_BUNDLED, *_EXAMPLES)
-"""Every name `load_robot` knows."""
+"""Names of all arms that `load_robot` knows."""
 
 
 def example_robot_share() -> Path:
-    """The `share` folder of the installed example-robot-data, whose meshes are `package://example-robot-data/…`."""
+    """The `share` folder of the installed example-robot-data, to which `package://example-robot-data/…` refers."""
     share = importlib.metadata.distribution("example-robot-data").locate_file("cmeel.prefix/share")
     return Path(str(share))
 
 
 def find(name_or_path: str) -> Entry:
-    """The catalogue's entry for a name, or a plain entry for a path.
+    """The catalogue's entry for a name, or an entry with default settings for a path.
 
-    Raises RobotNotFound for neither, with the names that come close, and RobotError for a path that may not be read.
+    Raises RobotNotFound, with the nearest names, if it is neither, and RobotError if the path cannot be read.
     """
     if name_or_path in _BUNDLED:
         folder = Path(__file__).parent.parent / "_urdf"
@@ -68,15 +68,15 @@ def find(name_or_path: str) -> Entry:
 
 
 def _entry_of_file(path: Path) -> Entry:
-    """A plain entry for a file; raises RobotNotFound, with what could have been meant, when there is none."""
+    """An entry with default settings for a file; raises RobotNotFound with suggestions if there is none."""
     if path.is_file():
         return Entry("", path.resolve())
     names = ", ".join(ROBOT_NAMES)
     if path.is_dir():
         inside = ", ".join(sorted(file.name for file in path.iterdir() if file.suffix in _SUFFIXES)[:10])
-        raise RobotNotFound(f"'{path}' is a directory; give one file in it ({inside or 'no .urdf lies here'}).")
+        raise RobotNotFound(f"'{path}' is a directory; give one file in it ({inside or 'it contains no .urdf'}).")
     if path.suffix in _SUFFIXES or len(path.parts) > 1:
-        raise RobotNotFound(f"no file '{path}' (seen from {Path.cwd()}); give a file or one of {names}.")
+        raise RobotNotFound(f"no file '{path}' (current folder {Path.cwd()}); give a file or one of {names}.")
     near = difflib.get_close_matches(path.name, ROBOT_NAMES)
     hint = f" did you mean {' or '.join(near)}?" if near else ""
     raise RobotNotFound(f"no robot '{path}':{hint} give a file or one of {names}.")

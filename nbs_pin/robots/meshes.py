@@ -1,6 +1,6 @@
-"""Mesh files of a robot's drawing, read with suspicion and cut into parts of one colour.
+"""Mesh files of a robot's visual geometry, checked and split into parts of one colour.
 
-Meshes are never needed for the dynamics; a file that cannot be drawn raises `MeshError` and is left to the caller.
+The dynamics never need meshes; a file that cannot be drawn raises `MeshError`, and the caller decides what to do.
 """
 
 from dataclasses import dataclass
@@ -20,19 +20,19 @@ MAX_BYTES = 50_000_000
 MAX_FACES = 1_000_000
 MAX_COLORS = 32
 CREASE = np.radians(40.0)
-"""Edges sharper than this are drawn sharp [rad]."""
+"""Edges with a larger angle between their faces are drawn sharp [rad]."""
 
 Color = tuple[float, float, float, float]
 """Red, green, blue, opacity, each in [0, 1]."""
 
 
 class MeshError(RobotError):
-    """A mesh that will not be drawn; says why."""
+    """A mesh that cannot be drawn; names the reason and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Triangles of one colour; None where the file states none."""
+    """A triangle mesh of one colour; `color` is None if the file states none."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -40,10 +40,10 @@ class Part:
 
 
 def find_mesh(uri: str, urdf: Path, package_dirs: tuple[Path, ...] = ()) -> Path:
-    """The file a URDF means by `uri`, confined to the folders that belong to the robot.
+    """The mesh file that `uri` refers to in a URDF, restricted to the folders that belong to the robot.
 
     These are the URDF's own folder, the ROS package around it (the nearest folder with a `package.xml`),
-    example-robot-data, and `package_dirs`. Raises MeshError for any other scheme, suffix or place, or no file.
+    example-robot-data, and `package_dirs`. Raises MeshError for another scheme, suffix or folder, or a missing file.
     """
     scheme, _, rest = uri.rpartition("://")
     package = next((folder for folder in urdf.parents if (folder / "package.xml").is_file()), urdf.parent)
@@ -51,7 +51,7 @@ def find_mesh(uri: str, urdf: Path, package_dirs: tuple[Path, ...] = ()) -> Path
     if scheme not in ("", "file", "package"):
         raise MeshError(f"mesh '{uri}' is not a file on this machine: give a relative or package:// path.")
     if Path(rest).suffix.lower() not in SUFFIXES:
-        raise MeshError(f"mesh '{uri}' is of an unknown kind: give one of {', '.join(SUFFIXES)}.")
+        raise MeshError(f"mesh '{uri}' is a file of unknown kind: give one of {', '.join(SUFFIXES)}.")
     candidates = [urdf.parent / unquote(rest)]
     if scheme == "package":
         name, _, inner = unquote(rest).partition("/")
@@ -66,22 +66,22 @@ def find_mesh(uri: str, urdf: Path, package_dirs: tuple[Path, ...] = ()) -> Path
 
 
 def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
-    """The parts of a mesh file, scaled, sharp edges split so that smooth shading looks right.
+    """The parts of a mesh file, scaled, with sharp edges split so that smooth shading looks right.
 
-    Raises MeshError for a file that is too large, unreadable, empty or not finite.
+    Raises MeshError if the file is too large, unreadable or empty, or if a vertex is not finite.
     """
     if path.stat().st_size > MAX_BYTES:
         raise MeshError(f"mesh {path} has {path.stat().st_size} bytes, at most {MAX_BYTES} are drawn: simplify it.")
     try:
         scene = trimesh.load_scene(path, resolver=_Beside(str(path)))
-    except Exception as error:  # parsers of foreign files raise whatever they trip over
-        raise MeshError(f"mesh {path} cannot be read ({type(error).__name__}: {error}): export it anew.") from error
+    except Exception as error:  # mesh parsers may raise any exception
+        raise MeshError(f"mesh {path} cannot be read ({type(error).__name__}: {error}): export it again.") from error
     meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
     count = sum(len(mesh.faces) for mesh in meshes)
     if not 0 < count <= MAX_FACES:
         raise MeshError(f"mesh {path} has {count} faces, between 1 and {MAX_FACES} are drawn: repair or simplify it.")
     if not all(np.isfinite(mesh.vertices).all() for mesh in meshes):
-        raise MeshError(f"mesh {path} has vertices that are not finite: export it anew.")
+        raise MeshError(f"mesh {path} has vertices that are not finite: export it again.")
     pieces: dict[Color | None, list[trimesh.Trimesh]] = {}
     for mesh in meshes:
         for color, faces in _by_color(mesh):
@@ -90,7 +90,7 @@ def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
 
 
 def shaded(mesh: Any, color: Color | None, scale: Float[np.ndarray, "3"] | None = None) -> Part:
-    """A trimesh as a part: vertices merged, then split along creases."""
+    """A trimesh as a `Part`, its vertices merged and then split along sharp edges."""
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices()
     mesh = trimesh.graph.smooth_shade(mesh, angle=CREASE, facet_minarea=None)
@@ -101,7 +101,7 @@ def shaded(mesh: Any, color: Color | None, scale: Float[np.ndarray, "3"] | None 
 
 
 class _Beside(trimesh.resolvers.FilePathResolver):
-    """Lets an OBJ read the material file beside it, and nothing else."""
+    """Resolver that lets an OBJ file read only a material file in its own folder."""
 
     def get(self, name: str) -> bytes:
         path = (Path(self.parent) / name).resolve()
@@ -111,7 +111,7 @@ class _Beside(trimesh.resolvers.FilePathResolver):
 
 
 def _by_color(mesh: Any) -> list[tuple[Color | None, Int[np.ndarray, "f 3"]]]:
-    """The faces of a mesh by colour, None where the file gave none."""
+    """The faces of a mesh by colour, None if the file states none."""
     faces = np.asarray(mesh.faces, dtype=np.int64)
     visual = mesh.visual
     if visual.kind is None or len(faces) == 0:

@@ -1,4 +1,4 @@
-"""A robot arm: one validated URDF, read once, and what Pinocchio makes of it."""
+"""A robot arm: its checked URDF and the Pinocchio model built from it."""
 
 import hashlib
 from collections.abc import Iterable
@@ -21,16 +21,22 @@ from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
 from nbs_pin.robots.urdf_checks import ZERO_LIMITS
 
 _SINGULAR = 1e-10
-"""Smallest eigenvalue of M scaled to a unit diagonal that still counts as positive."""
+"""Smallest eigenvalue of M, scaled to a unit diagonal, that counts as positive."""
 
 
 @storable(("name", "source", "options", "sha256", "effort_limit"))
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot:
-    """A fixed-base arm with nq = nv = n joints.
+    """A fixed-base arm with nq = nv = n joints, as returned by `load_robot`.
 
     A `continuous` joint is an unbounded revolute joint whose tracking error is wrapped (`difference`); locked joints
-    are fixed. `urdf` is the one description that Pinocchio, MuJoCo and the drawings are built from.
+    are fixed. Pinocchio, MuJoCo and the drawings are all built from `urdf`.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link").with_effort_limit([50.0, 20.0])
+        >>> robot.joint_names, robot.effort_limit
+        (('joint1', 'joint2'), array([50., 20.]))
     """
 
     name: str
@@ -41,7 +47,7 @@ class Robot:
     gravity_vector: Float[np.ndarray, "3"]
     """Gravitational acceleration in the base frame [m/s²]."""
     options: dict[str, Any] = field(default_factory=dict)
-    """What `load_robot` was told beside the source, as JSON can store it: load_robot(source, **options) is this arm."""
+    """Further arguments of `load_robot`, storable as JSON: load_robot(source, **options) gives this arm."""
 
     @property
     def nv(self) -> int:
@@ -84,15 +90,13 @@ class Robot:
 
     @property
     def sampling_range(self) -> tuple[JointArray, JointArray]:
-        """(lower, upper) to draw configurations from [rad, m]: the position limits, ∓π where there is none."""
+        """(lower, upper) for sampling configurations [rad, m]: the position limits, ∓π where there is none."""
         lower, upper = self.lower, self.upper
         return np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
 
     @property
     def one_turn_range(self) -> tuple[JointArray, JointArray]:
-        """(lower, upper) of all configurations worth telling apart [rad, m]: `sampling_range`, of a joint that turns
-        one turn about its middle at most; a joint that slides keeps its limits, however long.
-        """
+        """(lower, upper) of distinct configurations [rad, m]: `sampling_range`, rotary joints cut to one turn."""
         lower, upper = self.sampling_range
         longer, middle = ~self.prismatic & (upper - lower > 2.0 * np.pi), 0.5 * (lower + upper)
         return np.where(longer, middle - np.pi, lower), np.where(longer, middle + np.pi, upper)
@@ -109,22 +113,22 @@ class Robot:
 
     @property
     def continuous(self) -> Bool[np.ndarray, " n"]:
-        """True where the error wraps to (−π, π]."""
+        """True for joints whose error is wrapped to (−π, π]."""
         return np.array([joint.continuous for joint in self.joints])
 
     @property
     def prismatic(self) -> Bool[np.ndarray, " n"]:
-        """True for joints that slide."""
+        """True for prismatic joints."""
         return np.array([joint.prismatic for joint in self.joints])
 
     @property
     def parents(self) -> Int[np.ndarray, " n"]:
-        """The joint before each, i + 1 for joint i, 0 for the base."""
+        """The parent of each joint: 0 for the base, i + 1 for joint i."""
         return np.array(list(self.model.parents)[1:], dtype=np.int64)
 
     @property
     def sha256(self) -> str:
-        """Fingerprint of links, joints, stated limits and gravity: equal for equal dynamics, however they are drawn."""
+        """SHA-256 of links, joints, stated limits and gravity, independent of visual and collision geometry."""
         return hashlib.sha256(self.urdf.without_geometry() + self.gravity_vector.tobytes()).hexdigest()
 
     def difference(self, q: Vectors, q_ref: Vectors) -> Vectors:
@@ -132,9 +136,13 @@ class Robot:
         return configuration_difference(q, q_ref, self.continuous)
 
     def with_effort_limit(self, limit: PerJoint) -> "Robot":
-        """The same arm with other effort limits [N·m, N for a prismatic joint]: one or one per joint, inf for none.
+        """The same arm with other effort limits; the XML of its URDF and its `sha256` stay the same.
 
-        Its description and fingerprint stay those of the file. Raises ArgumentError unless the limits are > 0.
+        Args:
+            limit: One number > 0 or one per joint [N·m, N for a prismatic joint], inf for no limit.
+
+        Raises:
+            ArgumentError: If a limit is not > 0 or the number of limits is wrong.
         """
         effort = floats("effort limit", limit)
         if effort.shape not in ((), (self.nv,)) or not (effort > 0.0).all():
@@ -167,15 +175,25 @@ def load_robot(
     lock: Iterable[str] | None = None,
     zero_limits: str | None = None,
 ) -> Robot:
-    """The arm of a bundled URDF, of example-robot-data by short name, or of a `.urdf` or `.xacro` file.
+    """Load an arm by name or from a `.urdf` or `.xacro` file.
 
-    gravity: downward acceleration [m/s²] or a vector in the base frame; None takes the catalogue's, else 9.81.
-    lock: joints to fix at zero; None takes the catalogue's list.
-    zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range at zero, or read such zeros as
-    "unlimited", as files do that leave their limits open; None takes the catalogue's, else "refuse".
-    Raises RobotNotFound for a name or path that leads nowhere, RobotError for a description that would give a wrong
-    model, ArgumentError for a gravity or zero_limits that is none, and MissingExtra for a `.xacro` without the `xacro`
-    extra.
+    Args:
+        name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), or the path of a file.
+        gravity: Downward acceleration [m/s²] or a vector in the base frame. None takes the catalogue's, else 9.81.
+        lock: Joints to fix at zero. None takes the catalogue's list.
+        zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range at zero, or read these as
+            "unlimited", for files that do not state their limits. None takes the catalogue's, else "refuse".
+
+    Raises:
+        RobotNotFound: If no such name or file exists.
+        RobotError: If the description would give a wrong model.
+        ArgumentError: If gravity is not one or three finite numbers, or zero_limits is unknown.
+        MissingExtra: If a `.xacro` file is given and the extra `xacro` is not installed.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.load_robot("panda")
+        Robot('panda', 7 joints)
     """
     entry = find(str(name_or_path))
     zeros = entry.zero_limits if zero_limits is None else zero_limits
@@ -208,7 +226,7 @@ def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
 
 
 def _build_model(urdf: Urdf) -> pin.Model:
-    """Pinocchio's model of the arm, with our limits; raises RobotError when it cannot be built."""
+    """The Pinocchio model with the limits of `urdf.joints`; raises RobotError if it cannot be built."""
     try:
         model = pin.buildModelFromXML(urdf.without_geometry().decode())
     except (ValueError, RuntimeError) as error:
@@ -217,7 +235,7 @@ def _build_model(urdf: Urdf) -> pin.Model:
 
 
 def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
-    """The model, carrying the limits of `urdf.joints`."""
+    """The model, its limits set to those of `urdf.joints`."""
     by_name = {joint.name: joint for joint in urdf.joints}
     joints = [by_name[name] for name in model.names[1:]]
     effort, velocity = (np.array([getattr(joint, key) for joint in joints]) for key in ("effort", "velocity"))
@@ -231,7 +249,7 @@ def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
 def _check_mass_matrix(robot: Robot) -> None:
     """Raise RobotError unless M(q) ≻ 0 at zero and at five seeded configurations within the limits.
 
-    The test is on M scaled to a unit diagonal, so that grams beside tonnes and metres beside radians do not matter.
+    M is scaled to a unit diagonal, so that the test depends neither on units nor on masses of different magnitude.
     """
     model, data = robot.model, robot.model.createData()
     low, high = robot.sampling_range

@@ -1,4 +1,4 @@
-"""A URDF file read once, checked, and brought to the form that every engine is given."""
+"""A URDF file, checked and brought to the form from which every engine builds its model."""
 
 import math
 import xml.etree.ElementTree as ET
@@ -18,13 +18,13 @@ from nbs_pin.robots.urdf_checks import (
 from nbs_pin.robots.urdf_source import read_source
 
 _UNLIMITED = 1e9
-"""How an absent limit is written into the XML: no engine reads "inf"."""
+"""Value of an absent limit in the XML, because no engine reads "inf"."""
 _DYNAMIC = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "dynamics")}
 
 
 @dataclass(frozen=True)
 class JointData:
-    """One moving joint as the URDF states it; SI units, inf where the file states no limit."""
+    """One moving joint as stated in the URDF, in SI units; inf where the file states no limit."""
 
     name: str
     continuous: bool
@@ -39,10 +39,10 @@ class JointData:
 
 @dataclass(frozen=True)
 class Urdf:
-    """A checked description: `xml` has locked joints fixed and continuous joints as unbounded revolute ones.
+    """A checked description; in `xml`, locked joints are fixed and continuous joints are unbounded revolute joints.
 
-    Every number of the dynamics stands in `xml` in its shortest exact form, absent limits as ±1e9; drawings, materials
-    and transmissions are as the file has them, unchecked.
+    `xml` has every number of the dynamics in its shortest exact form and absent limits as ±1e9. Visuals, materials and
+    transmissions are those of the file, unchecked.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Urdf:
     joints: tuple[JointData, ...]
 
     def without_geometry(self) -> bytes:
-        """The dynamics alone: links with inertias and joints, no visual, collision, material or extension."""
+        """The dynamics alone: links with inertias and joints, without visual, collision, material or extension."""
         source = ET.fromstring(self.xml)
         robot = ET.Element("robot", {"name": self.name})
         for part in source:
@@ -64,10 +64,13 @@ class Urdf:
 def read_urdf(path: Path, *, lock: tuple[str, ...] = (), zero_limits: ZeroLimits = "refuse") -> Urdf:
     """The checked description in the `.urdf` or `.xacro` file `path`, with the joints in `lock` fixed at zero.
 
-    An arm without a name, which drawing tools refuse, takes its file's.
-    zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range, or read zeros as "unlimited".
-    Raises RobotError, naming file, line, element, value and remedy, for a description that would give a wrong model,
-    RobotNotFound for a path without a file, MissingExtra for a `.xacro` file without the `xacro` extra.
+    An arm without a name, which drawing tools refuse, is named after its file. `zero_limits` says whether to "refuse"
+    joints that state zero effort, zero velocity or an empty range at zero, or to read these as "unlimited".
+
+    Raises:
+        RobotError: If the description would give a wrong model; names file, line, element, value and remedy.
+        RobotNotFound: If the file does not exist.
+        MissingExtra: If it is a `.xacro` file and the extra `xacro` is not installed.
     """
     robot = read_source(path)
     robot.element.set("name", robot.element.get("name", path.stem))
@@ -78,7 +81,7 @@ def read_urdf(path: Path, *, lock: tuple[str, ...] = (), zero_limits: ZeroLimits
 
 
 def _settle(joint: Joint, zero_limits: ZeroLimits) -> JointData:
-    """The data of a moving joint, written back into its element as a revolute or prismatic joint with all limits."""
+    """The data of a moving joint; its element becomes a revolute or prismatic joint that states all limits."""
     check_axis(joint)
     limits = read_limits(joint, zero_limits)
     damping, friction = read_friction(joint)
@@ -92,7 +95,7 @@ def _settle(joint: Joint, zero_limits: ZeroLimits) -> JointData:
 
 
 def _bare(element: ET.Element) -> ET.Element:
-    """A copy without the file's spaces, so that equal dynamics give equal bytes."""
+    """A copy without the whitespace of the file, so that equal dynamics give equal bytes."""
     copy = ET.Element(element.tag, element.attrib)
     copy.extend(_bare(child) for child in element)
     return copy

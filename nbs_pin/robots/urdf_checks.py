@@ -1,7 +1,7 @@
-"""What a URDF must be for its model to be right: names, one tree, physical bodies, usable axes and limits.
+"""Checks of a URDF: unique names, one tree, physical inertias, valid axes and limits.
 
-Pinocchio and MuJoCo each accept descriptions that corrupt an arm in silence (a mass "nan", an axis of zeros, a link
-with two parents); these checks run before either sees the file and raise RobotError with file, line and remedy.
+Pinocchio and MuJoCo each accept descriptions that silently give a wrong model (a mass "nan", a zero axis, a link with
+two parents). These checks run before either reads the file and raise RobotError with file, line and remedy.
 """
 
 import math
@@ -15,23 +15,23 @@ import numpy as np
 from nbs_pin.robots.urdf_source import Node, shorten
 
 MAX_JOINTS = 64
-"""Most moving joints of an arm."""
+"""Largest number of moving joints of an arm."""
 MAX_LINKS = 1000
-"""Most links of an arm, tool frames included."""
+"""Largest number of links of an arm, tool frames included."""
 MAX_NAME = 128
-"""Longest name of a link or joint."""
+"""Largest length of the name of a link or joint."""
 ZeroLimits: TypeAlias = Literal["refuse", "unlimited"]
-"""What a zero effort, a zero velocity or an empty range at zero is taken for."""
+"""How to treat a zero effort, a zero velocity or an empty range at zero."""
 ZERO_LIMITS: tuple[ZeroLimits, ...] = get_args(ZeroLimits)
 MOVING = ("revolute", "continuous", "prismatic")
-"""Joint types with one degree of freedom, which an arm may have."""
+"""Supported joint types with one degree of freedom."""
 
 _UNSUPPORTED = ("floating", "planar")
 _ROUNDING = 1e-6
-"""Relative slack for numbers that were rounded when the file was written."""
+"""Relative tolerance for numbers that were rounded when the file was written."""
 _POINT = 1e-9
-"""Radius of gyration below which a body is a point [m]."""
-_OPEN = ", or load it with zero_limits='unlimited' if 0 means that none is stated"
+"""Radius of gyration below which a body counts as a point mass [m]."""
+_OPEN = ", or load it with zero_limits='unlimited' if 0 means no limit"
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -46,7 +46,7 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of the tree: where it stands in the file, and the links it ties together."""
+    """A joint of the tree: its element in the file, its type and the links that it connects."""
 
     node: Node
     name: str
@@ -61,7 +61,7 @@ class Joint:
 
 
 def check_tree(robot: Node, lock: tuple[str, ...]) -> list[Joint]:
-    """The joints of the arm in file order, those in `lock` fixed; one tree with one root, unique names, known types."""
+    """The joints in file order, those in `lock` fixed; checks for unique names, known types and a single tree."""
     _check_name(robot, robot.text("name"))
     links = _unique(robot, "link")
     nodes = _unique(robot, "joint")
@@ -84,9 +84,9 @@ def check_tree(robot: Node, lock: tuple[str, ...]) -> list[Joint]:
 
 
 def check_bodies(robot: Node, joints: list[Joint]) -> None:
-    """Every stated inertia belongs to a physical body, and every moving joint carries mass.
+    """Check that every stated inertia is physical and that every moving joint carries mass.
 
-    Links fixed to each other are one body, so a tool frame or a massless flange behind a massive link is fine.
+    Links fixed to each other count as one body, so a tool frame or a flange of a massive link may have no mass.
     """
     above = {joint.child: joint for joint in joints}
     mass: dict[str, float] = defaultdict(float)
@@ -103,7 +103,7 @@ def check_bodies(robot: Node, joints: list[Joint]) -> None:
 
 
 def check_axis(joint: Joint) -> None:
-    """The axis has a direction; one that is not a unit vector is normalised, with a warning."""
+    """Check that the axis has a direction; normalise it, with a warning, if it is not a unit vector."""
     axis = joint.node.child("axis")
     if axis is None:
         return
@@ -112,17 +112,17 @@ def check_axis(joint: Joint) -> None:
     if length < 1e-9:
         raise axis.refuse(f"axis xyz '{axis.text('xyz')}' has zero length", "fix <axis xyz=…>")
     if abs(length - 1.0) > _ROUNDING:
-        line = axis.lines[axis.element]
-        text = f"{axis.label}:{line}: {axis.owner}: axis xyz '{axis.text('xyz')}' is no unit vector; it was normalised."
+        place = f"{axis.label}:{axis.lines[axis.element]}: {axis.owner}"
+        text = f"{place}: axis xyz '{axis.text('xyz')}' is not a unit vector; it was normalised."
         warnings.warn(text, stacklevel=2)
         axis.element.set("xyz", " ".join(repr(x / length) for x in xyz))
 
 
 def read_limits(joint: Joint, zero_limits: ZeroLimits) -> Limits:
-    """The limits the joint states.
+    """The limits that a joint states.
 
-    A continuous joint has no position limits and may state none at all; every other moving joint states all four.
-    zero_limits: "refuse" a zero effort or velocity and an empty range, or read them as "unlimited".
+    A continuous joint has no position limits and may omit the others; every other moving joint must state all four.
+    `zero_limits`: "refuse" a zero effort or velocity and an empty range, or read these zeros as "unlimited".
     """
     none = Limits(-math.inf, math.inf, math.inf, math.inf)
     limit = joint.node.child("limit")
@@ -145,7 +145,7 @@ def read_limits(joint: Joint, zero_limits: ZeroLimits) -> Limits:
 
 
 def read_friction(joint: Joint) -> tuple[float, float]:
-    """Viscous damping [N·m·s/rad] and Coulomb friction [N·m] of the joint, zero where none is stated."""
+    """Viscous damping [N·m·s/rad] and Coulomb friction [N·m] of the joint, zero where not stated."""
     dynamics = joint.node.child("dynamics")
     if dynamics is None:
         return 0.0, 0.0
@@ -153,7 +153,7 @@ def read_friction(joint: Joint) -> tuple[float, float]:
 
 
 def check_origin(node: Node) -> None:
-    """The placement of a joint or inertia, where stated, is six finite numbers."""
+    """Check that the placement of a joint or inertia, where stated, is six finite numbers."""
     origin = node.child("origin")
     if origin is not None:
         origin.numbers("xyz", 3, (0.0, 0.0, 0.0))
@@ -161,7 +161,7 @@ def check_origin(node: Node) -> None:
 
 
 def _unique(robot: Node, tag: str) -> dict[str, Node]:
-    """The links or joints by name; names are short, printable and used once."""
+    """The links or joints by name; raises RobotError unless names are valid and unique."""
     nodes: dict[str, Node] = {}
     for node in robot.named(tag):
         name = node.text("name")
@@ -174,14 +174,14 @@ def _unique(robot: Node, tag: str) -> dict[str, Node]:
 
 
 def _check_name(node: Node, name: str) -> None:
-    """Raise RobotError for a name that messages, pages and Pinocchio's own "universe" cannot live with."""
+    """Raise RobotError for a name that is empty, too long, unprintable or Pinocchio's reserved "universe"."""
     if not 0 < len(name) <= MAX_NAME or not name.isprintable() or name == "universe":
         problem = f"the name '{shorten(name)}' is empty, reserved, unprintable or longer than {MAX_NAME} characters"
         raise node.refuse(problem, f"rename the {node.element.tag}")
 
 
 def _joint(node: Node, name: str, locked: bool) -> Joint:
-    """The joint of an element, made fixed when locked; a fixed joint keeps only what a fixed joint has."""
+    """The joint of an element, fixed if `locked`; a fixed joint keeps only its parent, child and origin."""
     kind = node.text("type")
     allowed = (*MOVING, "fixed", *(_UNSUPPORTED if locked else ()))
     if kind not in allowed:
@@ -199,38 +199,36 @@ def _joint(node: Node, name: str, locked: bool) -> Joint:
 
 
 def _check_connected(links: dict[str, Node], joints: list[Joint]) -> None:
-    """Every joint ties two known links, every link hangs on one joint, and all hang on one root."""
+    """Check that joints connect defined links, no link has two parent joints, and all links descend from one root."""
     above: dict[str, Joint] = {}
     below: dict[str, list[str]] = defaultdict(list)
     for joint in joints:
         for role, name in (("parent", joint.parent), ("child", joint.child)):
             if name not in links:
-                raise joint.node.refuse(
-                    f"{role} link '{shorten(name)}' is not defined", f"add the link or fix <{role}>"
-                )
+                raise joint.node.refuse(f"{role} link '{shorten(name)}' is not defined", f"add it or fix <{role}>")
         if joint.child in above:
             problem = f"not a tree: link '{joint.child}' is also the child of joint '{above[joint.child].name}'"
-            raise joint.node.refuse(problem, "a link hangs on one joint")
+            raise joint.node.refuse(problem, "give each link one parent joint")
         above[joint.child] = joint
         below[joint.parent].append(joint.child)
     reached = [name for name in links if name not in above]
     if len(reached) > 1:
         names = ", ".join(f"'{name}'" for name in reached[:5])
-        raise links[reached[1]].refuse(f"not a tree: links {names} have no parent", "tie all but one to a joint")
+        raise links[reached[1]].refuse(f"not a tree: links {names} have no parent", "give all but one a parent")
     for name in reached:
         reached.extend(below[name])
-    hanging = set(reached)
-    lost = [joint for joint in joints if joint.child not in hanging]
+    connected = set(reached)
+    lost = [joint for joint in joints if joint.child not in connected]
     if lost:
         names = ", ".join(f"'{joint.name}'" for joint in lost[:5])
-        raise lost[0].node.refuse(f"not a tree: joints {names} hang on a cycle", "fix their <parent>")
+        raise lost[0].node.refuse(f"not a tree: joints {names} form a cycle or follow one", "fix their <parent>")
 
 
 def _mass(link: Node) -> float:
-    """The mass a link states [kg], with an inertia some rigid body can have; 0 where it states none.
+    """The mass of a link [kg], 0 if none is stated; raises RobotError unless a rigid body can have its inertia.
 
     Principal moments of a rigid body are ≥ 0 and none exceeds the sum of the other two. Point masses (all zero) and
-    rods (one zero) are bodies; M(q) ≻ 0 is tested on the whole arm.
+    rods (one zero) are allowed; M(q) ≻ 0 is tested on the whole arm.
     """
     inertial = link.child("inertial")
     if inertial is None:
@@ -255,7 +253,7 @@ def _mass(link: Node) -> float:
 
 
 def _strength(limit: Node, key: str, kind: str, zero_limits: ZeroLimits) -> float:
-    """The effort or velocity limit: > 0, or inf where not stated."""
+    """The effort or velocity limit: > 0, or inf if there is none."""
     value = limit.number(key, math.inf if kind == "continuous" else None)
     if value == 0.0 and zero_limits == "unlimited":
         return math.inf

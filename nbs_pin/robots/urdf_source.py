@@ -1,4 +1,4 @@
-"""From a file to vetted XML: bytes are read once, bounded and parsed without DTDs; every element knows its line."""
+"""Reading of URDF files: limited in size, parsed without DTDs, with the line number of every element."""
 
 import math
 import re
@@ -15,28 +15,28 @@ from defusedxml.ElementTree import DefusedXMLParser
 from nbs_pin.base.exceptions import MissingExtra, RobotError, RobotNotFound
 
 MAX_BYTES = 5_000_000
-"""Largest URDF that is read [bytes]; meshes live in files of their own."""
+"""Largest URDF that is read [bytes]; meshes are separate files."""
 MAX_DEPTH = 128
 """Deepest nesting of XML elements."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _QUOTE = {'"': "&quot;"}
-_FOREIGN = {"xacro": "expand it with xacro first or give the .xacro file", "xinclude": "paste what it includes"}
+_FOREIGN = {"xacro": "expand it with xacro first or give the .xacro file", "xinclude": "insert the included text"}
 
 
 @dataclass(frozen=True)
 class Node:
-    """One XML element that can say where it stands, and reads its children and numbers strictly."""
+    """An XML element with its place in the file for messages, and strict access to children and numbers."""
 
     label: str
-    """The file, as messages name it."""
+    """Name of the file in messages."""
     lines: Mapping[ET.Element, int]
     element: ET.Element
     owner: str
-    """What messages call it: "link 'l1'"."""
+    """Name of the element in messages, such as "link 'l1'"."""
 
     def refuse(self, problem: str, remedy: str) -> RobotError:
-        """The error that names file, line and element, says what is wrong, and what to do about it."""
+        """A RobotError that names file, line, element, problem and remedy."""
         line = self.lines.get(self.element, 1)
         return RobotError(f"{self.label}:{line}: {self.owner}: {problem}; {remedy}.")
 
@@ -45,12 +45,12 @@ class Node:
         return Node(self.label, self.lines, element, owner or self.owner)
 
     def named(self, tag: str) -> Iterator["Node"]:
-        """The children <tag>, each owning its messages under its own name."""
+        """The children <tag>, each named in messages by its own name."""
         for element in self.element.findall(tag):
             yield self.at(element, f"{tag} '{shorten(element.get('name', ''))}'")
 
     def child(self, tag: str) -> "Node | None":
-        """The child <tag>, or None; raises RobotError when there are two."""
+        """The child <tag>, or None; raises RobotError if there are two."""
         found = self.element.findall(tag)
         if len(found) > 1:
             lines = " and ".join(str(self.lines[element]) for element in found[:2])
@@ -58,14 +58,14 @@ class Node:
         return self.at(found[0]) if found else None
 
     def need(self, tag: str) -> "Node":
-        """The child <tag>; raises RobotError when there is none or two."""
+        """The child <tag>; raises RobotError if there is none or there are two."""
         child = self.child(tag)
         if child is None:
             raise self.refuse(f"<{self.element.tag}> has no <{tag}>", f"add <{tag} …/>")
         return child
 
     def text(self, key: str) -> str:
-        """The attribute `key`; raises RobotError when it is missing."""
+        """The attribute `key`; raises RobotError if it is missing."""
         value = self.element.get(key)
         if value is None:
             raise self.refuse(f"<{self.element.tag}> states no {key}", f'add {key}="…" to <{self.element.tag}>')
@@ -79,10 +79,10 @@ class Node:
         return value
 
     def numbers(self, key: str, count: int, default: tuple[float, ...] | None = None) -> tuple[float, ...]:
-        """The attribute `key` as `count` finite numbers, or `default` where it is missing (None: it may not be).
+        """The attribute `key` as `count` finite numbers, or `default` if it is missing (None: it is required).
 
-        The attribute is rewritten in its shortest exact form, so that no engine reads another number than this one:
-        Pinocchio drops the whole body of a mass " 1 ". Raises RobotError for anything but plain finite numbers.
+        The attribute is rewritten in its shortest exact form, so that every engine reads the same number: Pinocchio
+        ignores a body whose mass is written " 1 ". Raises RobotError for anything but `count` finite numbers.
         """
         if default is not None and key not in self.element.attrib:
             return default
@@ -100,7 +100,7 @@ class Node:
 
 
 def shorten(text: str) -> str:
-    """A text as messages quote it: printable and at most 60 characters."""
+    """The text for use in messages: printable and at most 60 characters."""
     safe = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
     return safe if len(safe) <= 60 else safe[:57] + "..."
 
@@ -108,8 +108,8 @@ def shorten(text: str) -> str:
 def read_source(path: Path) -> Node:
     """The <robot> element of a `.urdf` or `.xacro` file.
 
-    Raises RobotNotFound for a path without a file, RobotError for bytes that are no vetted URDF, and MissingExtra for
-    a `.xacro` file without the `xacro` extra.
+    Raises RobotNotFound if the file does not exist, RobotError if it cannot be read or parsed, and MissingExtra for a
+    `.xacro` file if the extra `xacro` is not installed.
     """
     data = _read_bytes(path)
     if path.suffix != ".xacro":
@@ -121,7 +121,7 @@ def read_source(path: Path) -> Node:
 def parse(data: bytes, label: str, *, expanded: bool = True) -> Node:
     """The <robot> element in the bytes of a URDF; `label` names them in messages.
 
-    UTF-8 alone, no DTD, entity, XInclude or (where `expanded`) xacro element, at most MAX_BYTES and MAX_DEPTH deep.
+    They must be UTF-8 without DTD, entity or (if `expanded`) xacro and XInclude, within MAX_BYTES and MAX_DEPTH.
     """
     _check_text(data, label)
     builder = _Builder(label)
@@ -145,7 +145,7 @@ def parse(data: bytes, label: str, *, expanded: bool = True) -> Node:
 
 
 class _Builder(ET.TreeBuilder):
-    """Builds the tree, keeps the line of every element, and stops at MAX_DEPTH."""
+    """Tree builder that records the line of every element and limits the depth to MAX_DEPTH."""
 
     expat: Any = None
 
@@ -170,14 +170,14 @@ class _Builder(ET.TreeBuilder):
 
 
 def _drop_default_namespace(root: ET.Element) -> None:
-    """Name the elements of <robot xmlns="…"> as every URDF reader does, by their bare tags."""
+    """Remove the default namespace of <robot xmlns="…"> from all tags, as every URDF reader does."""
     namespace = root.tag.removesuffix("robot")
     for element in root.iter() if namespace.endswith("}") else ():
         element.tag = element.tag.removeprefix(namespace)
 
 
 def _refuse_foreign(node: Node) -> None:
-    """Raise RobotError for an element of xacro or XInclude, which every URDF reader skips in silence."""
+    """Raise RobotError for an element of xacro or XInclude, which URDF readers silently skip."""
     namespace, _, tag = str(node.element.tag).rpartition("}")
     for kind, remedy in _FOREIGN.items():
         if kind in namespace.lower():
@@ -185,7 +185,7 @@ def _refuse_foreign(node: Node) -> None:
 
 
 def _check_text(data: bytes, label: str) -> None:
-    """Raise RobotError unless the bytes are UTF-8 text of a bounded size."""
+    """Raise RobotError unless the bytes are UTF-8 text of at most MAX_BYTES."""
     if len(data) > MAX_BYTES:
         raise RobotError(f"{label}: too large: {len(data)} bytes (limit {MAX_BYTES}); keep meshes in their own files.")
     try:
@@ -210,9 +210,9 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _expand(path: Path, name: str) -> bytes:
-    """The URDF of the robot `name` that a xacro file expands to, its includes relative to itself.
+    """The URDF of the robot `name` that a xacro file expands to, with includes relative to the file.
 
-    Its expressions are Python: expand only files you trust.
+    xacro evaluates Python expressions: expand only files that you trust.
     """
     try:
         from xacrodoc import XacroDoc, packages
@@ -222,7 +222,7 @@ def _expand(path: Path, name: str) -> bytes:
     include = escape(str(path.resolve()), _QUOTE)
     try:
         document = XacroDoc.from_includes([include], name=escape(name, _QUOTE), resolve_packages=False)
-    except Exception as error:  # xacro evaluates Python: a bad file can raise anything
+    except Exception as error:  # xacro evaluates Python, which can raise any exception
         raise RobotError(f"{path}: xacro cannot expand it ({type(error).__name__}: {error}); fix the file.") from error
     expanded: str = document.dom.toxml()
     return expanded.encode()

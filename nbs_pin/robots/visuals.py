@@ -1,6 +1,6 @@
-"""What a URDF says beyond the dynamics: the shapes and colours of its links, mimic joints and transmissions.
+"""Visual geometry, mimic joints and transmissions of a URDF.
 
-Pinocchio drops these; yourdfpy reads them here, from bytes that were validated before, and never the dynamics.
+Pinocchio drops these. yourdfpy reads them here from the checked bytes; it never reads the dynamics.
 """
 
 import io
@@ -28,21 +28,21 @@ GREY: Color = (0.70, 0.72, 0.75, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Visual:
-    """Triangles of one colour fixed to a link."""
+    """A triangle mesh of one colour, fixed to a link."""
 
     link: str
     placement: Float[np.ndarray, "4 4"]
-    """Pose of the shape in the link's frame."""
+    """Pose of the mesh in the link frame."""
     vertices: Float[np.ndarray, "v 3"]
-    """Corners [m]."""
+    """Vertex positions [m]."""
     faces: Int[np.ndarray, "f 3"]
-    """Indices of three corners each, counter-clockwise from outside."""
+    """Vertex indices of the triangles, counter-clockwise seen from outside."""
     color: Color
 
 
 @dataclass(frozen=True)
 class Mimic:
-    """`joint` is geared to `source`: q = multiplier · q_source + offset."""
+    """`joint` is coupled to `source`: q = multiplier · q_source + offset."""
 
     joint: str
     source: str
@@ -52,7 +52,7 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Transmission:
-    """A gearbox between an actuator and joints; `reduction` is motor turns per joint turn."""
+    """A gearbox between an actuator and joints; `reduction` is the number of motor turns per joint turn."""
 
     name: str
     joints: tuple[str, ...]
@@ -68,7 +68,7 @@ class Couplings:
 
 
 def read_couplings(robot: Robot) -> Couplings:
-    """The mimic joints and transmissions that the URDF states; locked joints have lost theirs."""
+    """The mimic joints, except locked ones, and the transmissions that the URDF states."""
     description, root = _parse(robot)
     mimics = tuple(
         Mimic(joint.name, joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
@@ -87,10 +87,12 @@ def read_couplings(robot: Robot) -> Couplings:
 
 
 def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple[Visual, ...]:
-    """The shapes of all links, ready to draw; rigid bodies without any get capsules from joint to joint.
+    """The visual geometry of all links; rigid bodies without any are drawn as capsules from joint to joint.
 
-    package_dirs: further folders that meshes may be read from. A mesh that cannot be drawn is named in a warning.
-    Raises RobotError where a visual element is malformed.
+    Meshes may also be read from `package_dirs`; one that cannot be drawn gives a warning.
+
+    Raises:
+        RobotError: If a visual, mimic or limit element is malformed.
     """
     description, _ = _parse(robot)
     materials = {material.name: material.color for material in description.robot.materials if material.color}
@@ -114,17 +116,17 @@ def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple
 
 
 def tip(robot: Robot) -> tuple[int, Float[np.ndarray, "3"]]:
-    """The last joint and, in its frame, where the arm ends [m]: its farthest link frame, else its centre of mass."""
+    """The last joint and the tip of the arm in its frame [m]: its farthest link frame, else its centre of mass."""
     last = robot.model.njoints - 1
     frames = [frame for frame in robot.model.frames if frame.type == pin.FrameType.BODY and frame.parentJoint == last]
     return last, _far_end(robot.model.inertias[last].lever, frames)
 
 
 def _parse(robot: Robot) -> tuple[yourdfpy.URDF, Any]:
-    """The description for yourdfpy, stripped of what is not drawn, and its lxml root."""
+    """The description for yourdfpy, without the elements that are not drawn, and its lxml root."""
     try:
         root = etree.fromstring(robot.urdf.xml, etree.XMLParser(resolve_entities=False, no_network=True))
-    except etree.XMLSyntaxError as error:  # yourdfpy would guess instead
+    except etree.XMLSyntaxError as error:  # yourdfpy would try to repair it
         raise RobotError(f"{robot.urdf.path} is not well-formed XML ({error}): correct it.") from error
     for link in root.iterfind("link"):
         for child in [*link.iterfind("collision"), *link.iterfind("inertial")]:
@@ -143,7 +145,7 @@ def _parse(robot: Robot) -> tuple[yourdfpy.URDF, Any]:
 
 
 def _parts(geometry: Any, urdf: Path, package_dirs: tuple[Path, ...]) -> tuple[Part, ...]:
-    """A URDF geometry as triangles."""
+    """A URDF geometry as triangle meshes."""
     if geometry.mesh is not None:
         scale = np.ones(3) if geometry.mesh.scale is None else np.broadcast_to(geometry.mesh.scale, (3,)).astype(float)
         return read_mesh(find_mesh(geometry.mesh.filename, urdf, package_dirs), scale)
@@ -156,7 +158,7 @@ def _parts(geometry: Any, urdf: Path, package_dirs: tuple[Path, ...]) -> tuple[P
 
 
 def _stated_color(material: Any, named: dict[str, Any]) -> Color | None:
-    """The colour a visual's material states, itself or by name."""
+    """The colour of a material, stated in it or by the material of the same name."""
     if material is None:
         return None
     color = material.color or named.get(material.name)
@@ -167,7 +169,7 @@ def _stated_color(material: Any, named: dict[str, Any]) -> Color | None:
 
 
 def _capsules(robot: Robot, drawn: set[str], bare: set[str]) -> list[Visual]:
-    """Capsules for the rigid bodies of which nothing was drawn, or a part could not be."""
+    """Capsules for the rigid bodies of which nothing is drawn or a mesh could not be drawn."""
     model = robot.model
     frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
     reach = sum(float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements)
@@ -191,7 +193,7 @@ def _capsules(robot: Robot, drawn: set[str], bare: set[str]) -> list[Visual]:
 
 
 def _far_end(lever: Float[np.ndarray, "3"], body: list[Any]) -> Float[np.ndarray, "3"]:
-    """The body's farthest link frame, or its centre of mass where all frames sit in the joint."""
+    """The body's farthest link frame [m], or its centre of mass if all frames are at the joint."""
     points = [np.asarray(frame.placement.translation) for frame in body]
     far = max(points, key=lambda point: float(np.linalg.norm(point)))
     return far if np.linalg.norm(far) > 1e-3 else np.asarray(lever)

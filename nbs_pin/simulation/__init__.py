@@ -1,4 +1,4 @@
-"""Plants, the sampled closed loop, and figures of its runs."""
+"""Plants, the sampled closed loop, and metrics of its runs."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""What a motion costs per second: small functions of the error, its rate and the torque asked for."""
+"""Stage costs: the cost per second as a function of the error, its rate and the commanded torque."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.robots.robot import Robot
 
 StageCost: TypeAlias = Callable[[Vectors, Vectors, Vectors], Scalars]
-"""l(z1, v − v_d, τ) [1/s]: error [rad] and its rate [rad/s] at the end of a control period, and the torque that the
-law asked for during it [N·m], before any limit. Differentiable; anything callable will do."""
+"""l(z1, v − v_d, τ) [1/s]: error [rad] and its rate [rad/s] at the end of a control period, and the torque commanded
+during it [N·m], before the effort limits. Any differentiable callable is accepted."""
 
 
 def squared_error(z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
-    """z1ᵀz1, the paper's: torque is free, and training buys its last tenth of a second with it (docs/theory.md §7)."""
+    """z1ᵀz1, the paper's cost: torque is free, so training uses much of it (docs/theory.md §7)."""
     return (z1 * z1).sum(-1)
 
 
@@ -26,10 +26,14 @@ def squared_error(z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
 class TorqueAware:
     """z1ᵀz1 + rate²·ż1ᵀż1 + excess·Σ max(|τ_i|/limit_i − 1, 0)² + effort·Σ (τ_i/limit_i)².
 
-    limit: torque per joint [N·m], a number or (n,); where it is inf the torque is free. rate [s]: how far ahead an
-    error counts. excess, effort [rad²]: the price of asking for more than the limit, and of torque as such. What
-    exceeds a limit is never applied and so has no gradient of its own: `excess` gives it one.
-    Raises ArgumentError for numbers out of range.
+    Args:
+        limit: Effort limit per joint [N·m], a number or (n,); torque costs nothing where it is inf.
+        rate: Weight of the error rate, as a time [s].
+        excess: Weight of commands above the limit [rad²]; the part above is not applied and has no other gradient.
+        effort: Weight of the torque [rad²].
+
+    Raises:
+        ArgumentError: If a number is out of range.
     """
 
     limit: Float[torch.Tensor, " n"]
@@ -48,7 +52,7 @@ class TorqueAware:
 
     @classmethod
     def for_robot(cls, robot: Robot) -> "TorqueAware":
-        """With the arm's effort limits."""
+        """The cost with the effort limits of the arm."""
         return cls(torch.as_tensor(robot.effort_limit))
 
     def __call__(self, z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
@@ -61,10 +65,14 @@ class TorqueAware:
 
 @dataclass(frozen=True)
 class TimeOutside:
-    """‖z1‖²/(‖z1‖² + threshold) + pull·‖z1‖²: about 1 outside the ball and 0 inside, so its integral is nearly a time.
+    """‖z1‖²/(‖z1‖² + threshold) + pull·‖z1‖², about 1 outside the ball and 0 inside: its integral is nearly a time.
 
-    threshold [rad²]: 0.01 is the paper's mark of convergence. pull [1/rad²]: what far errors, whose first term is flat,
-    still feel. Raises ArgumentError for numbers out of range.
+    Args:
+        threshold: Squared radius of the ball [rad²]; 0.01 is the paper's criterion of convergence.
+        pull: Weight of ‖z1‖² [1/rad²], a gradient for large errors, where the first term is flat.
+
+    Raises:
+        ArgumentError: If a number is out of range.
     """
 
     threshold: float = 0.01
@@ -82,11 +90,11 @@ class TimeOutside:
 
 
 CostName: TypeAlias = Literal["torque-aware", "squared-error", "time-outside"]
-"""What `stage_cost` knows."""
+"""Names of the costs in `stage_cost`."""
 
 
 def stage_cost(name: str, robot: Robot) -> StageCost:
-    """The stage cost of that name, with the arm's effort limits; raises ArgumentError for an unknown name."""
+    """The stage cost of that name with the arm's effort limits; raises ArgumentError for an unknown name."""
     known: dict[str, StageCost] = {
         "torque-aware": TorqueAware.for_robot(robot),
         "squared-error": squared_error,

@@ -1,4 +1,4 @@
-"""A dynamics provider integrated in time is a plant."""
+"""A plant from a dynamics model, integrated in time."""
 
 import numpy as np
 
@@ -14,12 +14,22 @@ from nbs_pin.simulation.plant import Plant
 
 
 class DynamicsPlant(Plant):
-    """M(q) v̇ + C(q, v) v + G(q) + friction(v) = τ for any provider, the torque held over each step.
+    """M(q) v̇ + C(q, v) v + G(q) + friction(v) = τ for any dynamics model, with the torque held over each step.
 
-    dynamics: the truth; with `PinocchioDynamics` the Pinocchio plant, with a learned model the learned plant.
-    integrator: "rk4", "semi_implicit_euler" or "euler" (`integrators.py`).
-    friction: joint friction of the plant, or None for none.
-    Raises ArgumentError for an unknown integrator or friction of another number of joints.
+    Args:
+        dynamics: The dynamics of the arm: `PinocchioDynamics` or any other model, a learned one included.
+        integrator: "rk4", "semi_implicit_euler" or "euler" (`integrators.py`).
+        friction: Joint friction, or None.
+
+    Raises:
+        ArgumentError: If integrator is unknown, or friction is for another number of joints.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(nbs.load_robot("two_link")))
+        >>> plant.step(np.zeros(2), np.zeros(2), np.ones(2), 0.001)[1].round(4)
+        array([-0.0108,  0.0128])
     """
 
     def __init__(
@@ -36,10 +46,10 @@ class DynamicsPlant(Plant):
     def for_robot(
         cls, robot: Robot, integrator: IntegratorName | None = None, joint_friction: str = "drop"
     ) -> "DynamicsPlant":
-        """Pinocchio's dynamics of the arm, by RK4 unless told otherwise, with the joint friction that its URDF states.
+        """Pinocchio's dynamics of the arm, RK4 by default; joint_friction "keep" adds the friction of the URDF.
 
         Raises:
-            ArgumentError: For an unknown integrator or a joint_friction other than "drop" and "keep".
+            ArgumentError: If integrator is unknown, or joint_friction is not "drop" or "keep".
         """
         if joint_friction not in ("drop", "keep"):
             raise ArgumentError(f"joint_friction '{joint_friction}' is unknown; give 'drop' or 'keep'.")
@@ -60,11 +70,10 @@ class DynamicsPlant(Plant):
         return self.dynamics.robot
 
     def step(self, q: Vectors, v: Vectors, tau: Vectors, duration: float) -> tuple[Vectors, Vectors]:
-        """State (q, v) after one integration step of `duration` [s] with τ [N·m] held (zero-order hold).
+        """State (q, v) after one step of `duration` [s] with τ [N·m] held; differentiable for tensors.
 
-        Numpy in, numpy out; torch in, differentiable torch out.
-
-        Raises SimulationDiverged when the result is not finite.
+        Raises:
+            SimulationDiverged: If the result is not finite.
         """
         dynamics, friction = self.dynamics, self.friction
 
@@ -72,12 +81,12 @@ class DynamicsPlant(Plant):
             net = tau if friction is None else tau - friction.torque(v)
             return dynamics.forward_dynamics(q, v, net)
 
-        with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below, with its cause
+        with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below
             q, v = self._step(acceleration, q, v, duration)
         if not (_finite(q) and _finite(v)):
             raise SimulationDiverged(
-                f"{self!r} left the finite numbers in a step of {duration:g} s; "
-                "take a shorter plant step, or look for an unstable controller."
+                f"{self!r} diverged to a state that is not finite in a step of {duration:g} s; "
+                "take a shorter plant step, or check the controller."
             )
         return q, v
 

@@ -1,4 +1,4 @@
-"""One step of ẏ = f(y) for a mechanical state (q, v) whose acceleration is a function of it."""
+"""Integrators: one step of a mechanical state (q, v) with the acceleration a(q, v)."""
 
 from collections.abc import Callable
 from typing import Literal, TypeAlias
@@ -14,7 +14,7 @@ IntegratorName: TypeAlias = Literal["rk4", "semi_implicit_euler", "euler"]
 
 
 def rk4(acceleration: Acceleration, q: Vector, v: Vector, h: float) -> tuple[Vector, Vector]:
-    """Classical fourth-order Runge–Kutta; the error of a fixed duration falls with h⁴."""
+    """Classical fourth-order Runge–Kutta; global error O(h⁴)."""
     a1 = acceleration(q, v)
     v2 = v + (0.5 * h) * a1
     a2 = acceleration(q + (0.5 * h) * v, v2)
@@ -26,15 +26,15 @@ def rk4(acceleration: Acceleration, q: Vector, v: Vector, h: float) -> tuple[Vec
 
 
 def semi_implicit_euler(acceleration: Acceleration, q: Vector, v: Vector, h: float) -> tuple[Vector, Vector]:
-    """v⁺ = v + h a, q⁺ = q + h v⁺: first order, what MuJoCo calls Euler."""
+    """v⁺ = v + h a, q⁺ = q + h v⁺: first order, called Euler in MuJoCo."""
     v = v + h * acceleration(q, v)
     return q + h * v, v
 
 
 def euler(acceleration: Acceleration, q: Vector, v: Vector, h: float) -> tuple[Vector, Vector]:
-    """q⁺ = q + h v, v⁺ = v + h a: first order, gains energy; the authors' plant (docs/theory.md §8)."""
+    """q⁺ = q + h v, v⁺ = v + h a: first order, gains energy; used by the paper's authors (docs/theory.md §8)."""
     return q + h * v, v + h * acceleration(q, v)
 
 
 INTEGRATORS: dict[str, Integrator] = {"rk4": rk4, "semi_implicit_euler": semi_implicit_euler, "euler": euler}
-"""Every integrator by the name a plant is given."""
+"""All integrators by name."""

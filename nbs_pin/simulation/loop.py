@@ -1,4 +1,4 @@
-"""A sampled control loop: when the law is asked, what it aims at, how the plant is stepped; all of it checked."""
+"""The sampled control loop: control instants, reference, plant steps, starts and effort limits, all checked."""
 
 import math
 from dataclasses import dataclass
@@ -13,25 +13,25 @@ from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.simulation.plant import Plant
 
 LONGEST_PLANT_STEP = 1e-3
-"""Plant step taken when none is given, or the nearest shorter one that divides the period [s]."""
+"""Default plant step [s], or the nearest shorter one that divides the period."""
 
 
 class Schedule(NamedTuple):
     """Control instants of a loop and the reference at them."""
 
     times: np.ndarray
-    """LoopSamples [s], (rows,)."""
+    """Control instants [s], (rows,)."""
     leads: np.ndarray
-    """How far ahead of each the law is evaluated [s], (rows,)."""
+    """How far ahead of each instant the law is evaluated [s], (rows,)."""
     desired: Reference
     """The reference at the instants, (rows, n) each."""
     target: Reference
-    """The reference the law aims at, `leads` later, (rows, n) each."""
+    """The reference `leads` later, for which the law is evaluated, (rows, n) each."""
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """What stays the same from step to step."""
+    """Constants of a sampled control loop."""
 
     plant: Plant
     period: float
@@ -57,7 +57,7 @@ class Loop:
         effort_limit: Any,
         lookahead: float | None,
     ) -> "Loop":
-        """The loop of a law for nv joints with `simulate`'s arguments; raises ArgumentError when they do not fit."""
+        """The loop of a law for nv joints with `simulate`'s arguments; raises ArgumentError if they do not match."""
         if nv != plant.nv:
             raise ArgumentError(f"the controller has {nv} joints and the plant {plant.nv}; build both for one arm.")
         return cls(
@@ -75,29 +75,20 @@ class Loop:
         return self.period / self.substeps
 
     def start(self, reference: DesiredMotion, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Start (q, v) of one batch shape: the reference's, or at rest in q0, unless v0 is given.
-
-        Raises ArgumentError for starts of another size or not finite.
-        """
+        """Start (q, v): the reference's, or q0 at rest unless v0 is given; ArgumentError if they do not match."""
         return _start(_sampled(reference, np.zeros(1), self.plant.nv), q0, v0)
 
     def schedule(self, reference: DesiredMotion, first: int = 0, steps: int | None = None) -> Schedule:
-        """The instants first, …, first + steps; without `steps`, to the end.
-
-        Raises ArgumentError when the reference gives another size or is not finite.
-        """
+        """Control instants first, …, first + steps, or to the end; ArgumentError if the reference is invalid there."""
         steps = self.steps - first if steps is None else steps
         times = self.period * np.arange(first, first + steps + 1.0)
-        # A motion is not asked for what comes after its end: at the last instant the law does not look ahead.
+        # The reference need not exist beyond the end, so the law does not look ahead at the last instant.
         seen = np.minimum(times + self.lead, self.period * self.steps)
         desired, target = (_sampled(reference, t, self.plant.nv) for t in (times, seen))
         return Schedule(times, seen - times, desired, target)
 
     def blank_run(self, times: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray, controller: str) -> Run:
-        """A run with its times, reference and start in place, and room for the rest.
-
-        desired: (rows, n) each, or (rows, *batch, n) where the starts (*batch, n) follow motions of their own.
-        """
+        """A run with the times, references (rows, n) or (rows, *batch, n) and start (*batch, n), else zeros."""
         rows, n = len(times), self.plant.nv
         shape, robot = (rows, *q0.shape), self.plant.robot
         aligned = (x if x.ndim == len(shape) else x.reshape(rows, *(1,) * (q0.ndim - 1), n) for x in desired)
@@ -145,7 +136,7 @@ def _sampled(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
         if rows.shape != (t.size, nv):
             raise ArgumentError(
                 f"the reference at {t.size} times gave {name} of shape {rows.shape}, expected ({t.size}, {nv}); "
-                f"give it one value for each of the {nv} joints and let it take arrays of times."
+                f"make it accept arrays of times and return one value for each of the {nv} joints."
             )
         if not np.isfinite(rows).all():
             k, joint = np.argwhere(~np.isfinite(rows))[0]

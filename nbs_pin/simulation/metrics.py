@@ -1,7 +1,7 @@
-"""What a run achieved and what it cost, aligned in time: row k of q is held against row k of q_ref.
+"""Metrics of a run, aligned in time: row k of q is compared with row k of q_ref.
 
-Every function gives one number per start (shape (*batch,)), or one per start and joint where it says so.
-Torque statistics leave out the last row, whose torque was computed but never applied.
+Every function returns one number per start, shape (*batch,), or one per start and joint where stated.
+Torque statistics exclude the last row, whose torque was computed but never applied.
 """
 
 from typing import Any, TypeAlias
@@ -18,7 +18,7 @@ from nbs_pin.robots.robot import configuration_difference
 Numbers: TypeAlias = Scalars | np.float64
 """One number per start: an array for a batch, a number for a single start."""
 PAPER_THRESHOLD = 0.01
-"""‖z1‖² below which the paper calls an arm converged [rad²]."""
+"""‖z1‖² below which the paper considers an arm converged [rad²]."""
 
 
 def error(run: Run) -> Float[np.ndarray, "rows *batch n"]:
@@ -27,10 +27,10 @@ def error(run: Run) -> Float[np.ndarray, "rows *batch n"]:
 
 
 def squared_error(run: Run, shift: int = 0) -> Float[np.ndarray, "rows *batch"]:
-    """‖z1‖² at every control instant [rad²].
+    """‖z1‖² at every control instant [rad²], comparing q in row k + `shift` with q_ref in row k.
 
-    shift: hold q of row k + shift against q_ref of row k. 0 is the tracking error; 1 is the score of the authors'
-    program: q(t + h) against q_d(t), which counts the reference's own motion in h as error (docs/theory.md §8).
+    With shift = 0 this is the tracking error. With shift = 1, the index of the authors' program, it is q(t + h) against
+    q_d(t), which counts the reference's own motion within h as error (docs/theory.md §8).
     """
     if not 0 <= shift < len(run.t):
         raise ArgumentError(f"shift is {shift}, expected 0 (aligned) or 1 (the authors' index) for {len(run.t)} rows.")
@@ -39,7 +39,16 @@ def squared_error(run: Run, shift: int = 0) -> Float[np.ndarray, "rows *batch"]:
 
 
 def steady_error(run: Run, last: float = 0.3, shift: int = 0) -> Numbers:
-    """Largest ‖z1‖² over the last fraction `last` of the time [rad²]; the paper's last 30 s of 100 s."""
+    """Largest ‖z1‖² over the last fraction `last` of the time [rad²]; the paper takes the last 30 s of 100 s.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> plant, law = nbs.DynamicsPlant.for_robot(robot), nbs.ComputedTorque.for_robot(robot)
+        >>> run = nbs.simulate(plant, law, nbs.Hold([0.3, 0.2]), duration=0.1, period=0.001)
+        >>> bool(nbs.metrics.steady_error(run) < 1e-12)
+        True
+    """
     if not 0.0 < last <= 1.0:
         raise ArgumentError(f"last is {last}, expected a fraction in (0, 1]; the paper's is 0.3.")
     values = squared_error(run, shift)
@@ -49,11 +58,11 @@ def steady_error(run: Run, last: float = 0.3, shift: int = 0) -> Numbers:
 
 
 def convergence_time(run: Run, threshold: float = PAPER_THRESHOLD, shift: int = 0) -> Numbers:
-    """First control instant from which ‖z1‖² stays below the threshold [rad²] to the end [s]; inf if it never does.
+    """First control instant [s] from which ‖z1‖² stays below the threshold [rad²] to the end; inf if there is none.
 
-    shift: as in `squared_error`; 1 is the authors' count, one period less than the aligned one.
+    `shift` is that of `squared_error`; with 1, the authors' index, the time is one period shorter.
     """
-    outside = ~(squared_error(run, shift) < threshold)  # what is not a number is outside
+    outside = ~(squared_error(run, shift) < threshold)  # NaN counts as outside
     rows = len(outside)
     last_outside = np.where(outside.any(axis=0), rows - 1 - np.argmax(outside[::-1], axis=0), -1)
     return np.append(run.t[:rows], np.inf)[last_outside + 1]
@@ -75,14 +84,14 @@ def joint_peak_torque(run: Run) -> Vectors:
 
 
 def rms_torque(run: Run) -> Numbers:
-    """Root mean square over time of ‖τ‖ applied [N·m]."""
+    """Root mean square over time of the applied ‖τ‖ [N·m]."""
     return np.sqrt(np.mean(np.sum(run.tau[:-1] ** 2, axis=-1), axis=0))
 
 
 def saturated_fraction(run: Run, after: float = 0.0) -> Numbers:
-    """Fraction of the holds that end after the time `after` [s] for which some joint's command exceeded its limit.
+    """Fraction of the control periods ending after `after` [s] in which the command of some joint exceeded its limit.
 
-    While it does, no Lyapunov argument holds (docs/theory.md §7).
+    No Lyapunov argument holds in these periods (docs/theory.md §7).
     """
     exceeded = np.any(np.abs(run.tau_command[:-1]) > run.effort_limit, axis=-1)
     _from(run, after)
@@ -90,16 +99,15 @@ def saturated_fraction(run: Run, after: float = 0.0) -> Numbers:
 
 
 def peak_torque_rate(run: Run) -> Numbers:
-    """Largest |Δτ_i| between control instants ÷ period, over time and joints [N·m/s]; 0 for a run of one period."""
+    """Largest |Δτ_i|/period between control instants, over time and joints [N·m/s]; 0 for a run of one period."""
     steps = np.abs(np.diff(run.tau[:-1], axis=0)) / run.period
     return np.max(steps, axis=(0, -1), initial=0.0)
 
 
 def summary(run: Run, after: float = 1.0) -> dict[str, Any]:
-    """Every figure above as numbers and lists that JSON can store, units in the keys, None for inf.
+    """All metrics above as JSON values, with units in the keys, None for inf and a list over a batch of starts.
 
-    after: time from which RMS error and saturation are counted too [s], at most the second half of a short run.
-    A batch of starts gives lists, one entry per start.
+    Figures with "late" in the key count from the time `after` [s] or half the duration, whichever is earlier.
     """
     after = min(after, 0.5 * float(run.t[-1]))
     figures = {
@@ -118,15 +126,11 @@ def summary(run: Run, after: float = 1.0) -> dict[str, Any]:
         "effort_limit_Nm": run.effort_limit,
     }
     times = {"duration_s": float(run.t[-1]), "period_s": run.period, "late_after_s": after}
-    return {
-        **times,
-        "joints": list(run.joint_names),
-        **plain({name: np.asarray(value) for name, value in figures.items()}),
-    }
+    return {**times, "joints": list(run.joint_names), **plain({k: np.asarray(x) for k, x in figures.items()})}
 
 
 def _from(run: Run, after: float) -> np.ndarray:
-    """The rows from the time `after` on."""
+    """The rows from the time `after` [s] on."""
     if not 0.0 <= after < run.t[-1]:
         raise ArgumentError(f"after is {after} s, expected a time in [0, {run.t[-1]:g}) s, inside the run.")
     return run.t >= after - 1e-9 * run.period

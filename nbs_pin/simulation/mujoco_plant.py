@@ -1,4 +1,4 @@
-"""MuJoCo as a plant, built from the same URDF bytes as the Pinocchio model (the only room that imports mujoco)."""
+"""MuJoCo as a plant, built from the same URDF bytes as the Pinocchio model; the only module that imports mujoco."""
 
 import logging
 from collections.abc import Callable
@@ -25,26 +25,36 @@ _INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
 _OFF = mujoco.mjtDisableBit
-# Left on, autoreset silently puts a diverged arm back to its start, and a warm start makes a step depend on the last.
+# Autoreset would silently reset a diverged arm; a warm start would make a step depend on the one before.
 _ALWAYS_OFF = _OFF.mjDSBL_AUTORESET | _OFF.mjDSBL_WARMSTART | _OFF.mjDSBL_ACTUATION
 _ALL_BUT_FRICTION = _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_CONTACT | _OFF.mjDSBL_EQUALITY  # dry friction is a constraint
-# MuJoCo's default lets a tenth of the free acceleration through dry friction, so that a light joint never really
-# sticks nor slides; its hardest setting is Coulomb friction to 1e-4 of the torque.
+# By default a tenth of the free acceleration passes dry friction, so that a light joint neither sticks nor slides; with
+# the hardest setting it is Coulomb friction to 1e-4 of the torque.
 _DRY_FRICTION_SOLREF = (0.002, 1.0)
 _DRY_FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 
 class MujocoPlant(Plant):
-    """The arm in MuJoCo: same inertias, joint axes and gravity; no contacts, position limits or effort clamps.
+    """The arm in MuJoCo, without contacts, position limits or effort limits, which `simulate` applies.
 
-    integrator: "rk4" (fourth order), "euler" (semi-implicit) or "implicitfast" (semi-implicit, damping implicit); None
-    takes "rk4" without friction and "implicitfast" with it, since joint damping can be too stiff for explicit steps.
-    joint_friction: "drop" leaves out the URDF's damping and dry friction, as Pinocchio does; "keep" has MuJoCo apply
-    both, the dry friction as its hardest constraint; a `JointFriction` takes their place (its transition is not used).
-    Effort limits belong to `simulate`. MuJoCo's own warnings become SimulationDiverged here; for the whole process they
-    go to the logger "nbs_pin.mujoco" in place of a file in the working directory. Each plant owns one scratch
-    `mujoco.MjData`: use one plant per thread.
-    Raises ArgumentError for an unknown choice and RobotError for an arm that MuJoCo cannot build.
+    MuJoCo's warnings raise SimulationDiverged; for the whole process they go to the logger "nbs_pin.mujoco" instead of
+    a file in the working directory. Each plant owns a scratch `mujoco.MjData`: use one plant per thread.
+
+    Args:
+        robot: The arm.
+        integrator: "rk4", "euler" (semi-implicit) or "implicitfast" (semi-implicit, damping implicit). None takes "rk4"
+            without friction, else "implicitfast", since joint damping can be too stiff for explicit steps.
+        joint_friction: "drop" omits the damping and dry friction of the URDF, as Pinocchio does; "keep" applies both,
+            dry friction as MuJoCo's hardest constraint; a `JointFriction` replaces them (its transition is not used).
+
+    Raises:
+        ArgumentError: If integrator or joint_friction is unknown.
+        RobotError: If MuJoCo cannot build the arm.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.MujocoPlant(nbs.load_robot("panda"), joint_friction="keep")
+        MujocoPlant(panda, implicitfast, joint_friction=keep)
     """
 
     def __init__(
@@ -69,16 +79,16 @@ class MujocoPlant(Plant):
 
     def _bind(self) -> None:
         self._data = mujoco.MjData(self.model)
-        # Live arrays, fetched once: every access through the data would make them anew.
+        # Views, fetched once: every access through MjData would create new ones.
         self._qpos, self._qvel, self._torque = self._data.qpos, self._data.qvel, self._data.qfrc_applied
         self._warnings = self._data.warning.number
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled and copied: everything but MuJoCo's scratch data, which is no part of the plant's value."""
+        """State for pickle and copy: everything but MuJoCo's scratch data."""
         return {name: value for name, value in self.__dict__.items() if name not in _SCRATCH}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Back from a pickle, with scratch data of its own."""
+        """Restore the state, with new scratch data."""
         self.__dict__.update(state)
         mujoco.set_mju_user_warning(_LOGGER.info)
         self._bind()
@@ -99,7 +109,8 @@ class MujocoPlant(Plant):
     def step(self, q: Vectors, v: Vectors, tau: Vectors, duration: float) -> tuple[Vectors, Vectors]:
         """State (q, v) after one MuJoCo step of `duration` [s] with τ [N·m] held.
 
-        Raises SimulationDiverged when an input or the result is not finite or MuJoCo counts a warning.
+        Raises:
+            SimulationDiverged: If an input or the result is not finite, or MuJoCo issues a warning.
         """
         self.model.opt.timestep = duration
         if q.ndim == 1:
@@ -108,7 +119,7 @@ class MujocoPlant(Plant):
         return result[..., 0, :], result[..., 1, :]
 
     def acceleration(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
-        """v̇ [rad/s²] that MuJoCo's forward dynamics gives the torque τ [N·m]."""
+        """v̇ [rad/s²] for the torque τ [N·m], by MuJoCo's forward dynamics."""
         return _stack(lambda *row: self._forward(*row).qacc[self._at_v].copy(), q, v, tau)
 
     def bias(self, q: Vectors, v: Vectors) -> Vectors:
@@ -137,15 +148,15 @@ class MujocoPlant(Plant):
         row = self._qpos[self._at_q].copy(), self._qvel[self._at_v].copy()
         if not (all_finite(row[0]) and all_finite(row[1])):
             raise SimulationDiverged(
-                f"{self!r} left the finite numbers; take a shorter plant step, or look for an unstable controller."
+                f"{self!r} diverged to a state that is not finite; take a shorter plant step, or check the controller."
             )
         return row
 
     def _set(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
-        # MuJoCo reads a torque that is not a number as zero and goes on, so it must never see one.
+        # MuJoCo silently treats a NaN torque as zero, so it must never receive one.
         if not (all_finite(q) and all_finite(v) and all_finite(tau)):
             raise SimulationDiverged(
-                f"{self!r} was given q = {q}, v = {v}, torque = {tau}, expected finite numbers; look for their source."
+                f"{self!r} was given q = {q}, v = {v}, torque = {tau}, expected finite numbers; find where they arise."
             )
         self._qpos[self._at_q] = q
         self._qvel[self._at_v] = v
@@ -156,15 +167,13 @@ class MujocoPlant(Plant):
             kind = int(np.flatnonzero(self._warnings)[0])
             cause = mujoco.mju_warningText(kind, int(self._data.warning.lastinfo[kind]))
             mujoco.mj_resetData(self.model, self._data)
-            raise SimulationDiverged(
-                f"{self!r}: {cause} Take a shorter plant step, or look for an unstable controller."
-            )
+            raise SimulationDiverged(f"{self!r}: {cause} Take a shorter plant step, or check the controller.")
 
 
 def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: JointFrictionChoice) -> mujoco.MjModel:
-    """MuJoCo's model of the arm, from its URDF without shapes; raises RobotError when it cannot be built.
+    """MuJoCo's model of the arm, from its URDF without shapes; raises RobotError if it cannot be built.
 
-    It goes through `MjSpec` and never through MuJoCo's own XML, which prints six digits.
+    It is built with `MjSpec`, as MuJoCo's XML writer keeps only six digits.
     """
     other: dict[str, tuple[float, float]] = {}
     if isinstance(joint_friction, JointFriction):
@@ -189,12 +198,12 @@ def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: Join
 
 
 def _in_order(addresses: np.ndarray) -> np.ndarray | slice:
-    """The addresses, or for 0, 1, 2, … the whole slice, which needs no gathering."""
+    """The addresses, or slice(None) for 0, 1, 2, …, which avoids fancy indexing."""
     return slice(None) if np.array_equal(addresses, np.arange(addresses.size)) else addresses
 
 
 def _stack(function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
-    """`function` of each row of arrays of one batch shape, stacked with that shape."""
+    """`function` of each row of arrays with one batch shape, stacked with that shape."""
     first = arrays[0]
     if first.ndim == 1:
         return function(*arrays)

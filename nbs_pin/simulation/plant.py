@@ -1,4 +1,4 @@
-"""The protocol of every plant: the truth that a controller acts on."""
+"""The interface of all plants: the simulated arm on which a controller acts."""
 
 from abc import ABC, abstractmethod
 
@@ -7,7 +7,7 @@ from nbs_pin.robots.robot import Robot
 
 
 class Plant(ABC):
-    """A mechanical system that moves under joint torques; state in, state out, nothing kept between calls."""
+    """A mechanical system driven by joint torques; it keeps no state between calls."""
 
     @property
     @abstractmethod
@@ -17,11 +17,12 @@ class Plant(ABC):
     @property
     @abstractmethod
     def robot(self) -> Robot | None:
-        """The arm this plant simulates, or None for one without a URDF."""
+        """The simulated arm, or None for a plant without a URDF."""
 
     @abstractmethod
     def step(self, q: Vectors, v: Vectors, tau: Vectors, duration: float) -> tuple[Vectors, Vectors]:
         """State (q, v) after one integration step of `duration` [s] with the torque τ [N·m] held constant.
 
-        Raises SimulationDiverged when the result is not finite or the engine reports a warning.
+        Raises:
+            SimulationDiverged: If the result is not finite, or the engine reports a warning.
         """

@@ -1,4 +1,4 @@
-"""Plants by name: what the shell offers, and `build_plant` makes."""
+"""Plants by name, for the command line and `build_plant`."""
 
 from typing import TYPE_CHECKING
 
@@ -12,23 +12,23 @@ PLANTS: dict[str, Entry] = {
     "mujoco": Entry("nbs_pin.simulation.mujoco_plant:MujocoPlant"),
     "pinocchio": Entry("nbs_pin.simulation.dynamics_plant:DynamicsPlant.for_robot"),
 }
-"""Every plant by name. A function here takes a robot, integrator and joint_friction."""
+"""All plants by name; each entry takes a robot, integrator and joint_friction."""
 INTEGRATORS = ("rk4", "euler", "implicitfast", "semi_implicit_euler")
-"""The integrators that one plant or another knows."""
+"""All integrators that some plant supports."""
 
 
 def build_plant(name: str, robot: "Robot", *, integrator: str | None = None, joint_friction: str = "drop") -> "Plant":
-    """The arm as the plant of that name.
+    """The plant of that name for the arm.
 
     Args:
         name: One of `PLANTS`.
         robot: The arm.
-        integrator: One that the plant knows; None takes its usual one.
-        joint_friction: "keep" lets the friction of the URDF act, "drop" leaves it out.
+        integrator: One that the plant supports; None takes its default.
+        joint_friction: "keep" applies the joint friction of the URDF, "drop" omits it.
 
     Raises:
-        ArgumentError: For an unknown name or integrator.
-        RobotError: For an arm that the engine cannot build.
+        ArgumentError: If name or integrator is unknown.
+        RobotError: If the engine cannot build the arm.
     """
     plant: Plant = entry("plant", name, PLANTS, ", or build one").make(
         robot, integrator=integrator, joint_friction=joint_friction

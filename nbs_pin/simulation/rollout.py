@@ -1,4 +1,4 @@
-"""The closed loop as one differentiable function: parameters and starts in, motions out."""
+"""The closed loop as a differentiable function from parameters and starts to motions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,10 +25,10 @@ from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.loop import Loop
 
 Engine: TypeAlias = Literal["kernels", "torch"]
-"""Compiled kernels with adjoints written by hand, or the law and the plant in torch as they are written."""
+"""Compiled kernels with hand-written adjoints, or the law and the plant in torch."""
 
 
-_BATCH = 256  # gradients of so many starts are kept apart, so that no thread waits and their sum is always the same
+_BATCH = 256  # starts with gradients stored apart: threads do not wait, and the order of summation is fixed
 
 
 class Motions(NamedTuple):
@@ -39,18 +39,18 @@ class Motions(NamedTuple):
     v: Float[torch.Tensor, "B T+1 n"]
     """Velocities [rad/s]."""
     command: Float[torch.Tensor, "B T n"]
-    """Torques asked for [N·m], before the limits."""
+    """Commanded torques [N·m], before the effort limits."""
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What B closed-loop motions begin with and aim at; `of` makes it."""
+    """Starts, references and disturbances of B closed-loop motions; made by `of`."""
 
     loop: Loop
     leads: Float[np.ndarray, " T"]
     """How far ahead of each instant the law is evaluated [s]."""
     aims: Float[np.ndarray, "B T 4 n"]
-    """a_d now, and q_d, v_d, a_d where the law looks."""
+    """a_d at the instant, and q_d, v_d, a_d at the instant plus its lead."""
     desired: Float[np.ndarray, "B T+1 3 n"]
     """q_d, v_d, a_d at the control instants."""
     q0: Float[np.ndarray, "B n"]
@@ -64,7 +64,7 @@ class Batch:
     def of(cls, loop: Loop, reference: DesiredMotion, q0: Any = None, v0: Any = None, tau_d: Any = None) -> "Batch":
         """Motions along one reference from q0, v0 (B, n): at rest without v0, on the reference without both.
 
-        tau_d: a constant torque, a number or (n,), or None. Raises ArgumentError for starts that do not fit.
+        tau_d is a constant torque, a number or (n,). Raises ArgumentError if starts or torque do not match the loop.
         """
         _, leads, desired, target = loop.schedule(reference)
         q, v = (np.array(x).reshape(-1, loop.plant.nv) for x in loop.start(reference, q0, v0))
@@ -75,7 +75,7 @@ class Batch:
 
     @classmethod
     def joined(cls, batches: Sequence["Batch"]) -> "Batch":
-        """All motions of batches of one loop, one after the other."""
+        """The motions of all batches of one loop, concatenated."""
         named = ("aims", "desired", "q0", "v0", "tau_d")
         joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in batches]) for name in named}
         return replace(batches[0], **joined)
@@ -92,7 +92,7 @@ class Batch:
 
 
 def engine_for(controller: Controller, loop: Loop) -> Engine:
-    """The fastest engine that computes this very loop: kernels where law, belief and plant have them."""
+    """The fastest engine for this loop: "kernels" if law, model and plant have them, else "torch"."""
     return "torch" if _scene(controller, loop) is None or not _on_cpu(controller) else "kernels"
 
 
@@ -104,9 +104,14 @@ def motions(
 ) -> Motions:
     """The motions of the batch under the controller, differentiable in its parameters and in the disturbance.
 
-    engine: None takes `engine_for`; the two agree to 1e-9, in values and in gradients. tau_d: takes the place of the
-    batch's disturbance [N·m].
-    Raises ArgumentError for kernels where there are none, or a plant that cannot be differentiated.
+    Args:
+        controller: The control law.
+        batch: Starts, references and disturbances.
+        engine: None takes `engine_for`; both engines agree to 1e-9, in values and in gradients.
+        tau_d: Replaces the disturbance of the batch [N·m].
+
+    Raises:
+        ArgumentError: If the loop has no kernels for engine "kernels", or its plant is not differentiable.
     """
     check_plant(batch.loop)
     engine = engine_for(controller, batch.loop) if engine is None else engine
@@ -114,21 +119,21 @@ def motions(
     if torque.shape != batch.tau_d.shape or torque.dtype != torch.float64:
         raise ArgumentError(
             f"tau_d is {torque.dtype} of shape {tuple(torque.shape)}, expected float64 of shape {batch.tau_d.shape};"
-            " give a torque for every motion, period and joint."
+            " give one torque per motion, period and joint."
         )
     if engine == "torch":
         return _by_torch(controller, batch, torque)
     scene = _scene(controller, batch.loop)
     if scene is None or not _on_cpu(controller):
         raise ArgumentError(
-            f"{type(controller).__name__} on {batch.loop.plant!r} has no kernels; take engine='torch', as any law can."
+            f"{type(controller).__name__} on {batch.loop.plant!r} has no kernels; take engine='torch', it runs any law."
         )
     law = controller.packed_law(numpy=False)
     return Motions(*_ByKernels.apply(law.weights, torque, law.layout, batch, scene))  # type: ignore[no-untyped-call]
 
 
 def running_cost(motion: Motions, batch: Batch, cost: StageCost) -> Float[torch.Tensor, " B"]:
-    """∫ l(z1, v − v_d, τ) dt of each motion: the state a period leads to, and the torque asked for during it."""
+    """∫ l(z1, v − v_d, τ) dt of each motion, from the state after each period and the torque commanded during it."""
     robot = batch.loop.plant.robot
     q_ref, v_ref = (torch.as_tensor(batch.desired[:, 1:, k]).to(motion.q) for k in (0, 1))
     z1 = configuration_difference(motion.q[:, 1:], q_ref, None if robot is None else robot.continuous)
@@ -136,7 +141,7 @@ def running_cost(motion: Motions, batch: Batch, cost: StageCost) -> Float[torch.
 
 
 def recorded(motion: Motions, batch: Batch, controller: str) -> Run:
-    """The motions as a run, one start beside the other; its last row repeats the last torque."""
+    """The motions as a run with a batch axis for the starts; its last row repeats the last torque."""
     loop = batch.loop
     q, v, command = (x.detach().cpu().numpy().swapaxes(0, 1) for x in motion)
     desired = Reference(*np.moveaxis(batch.desired, 2, 0).swapaxes(1, 2))
@@ -149,11 +154,11 @@ def recorded(motion: Motions, batch: Batch, controller: str) -> Run:
 
 
 def check_plant(loop: Loop) -> None:
-    """Raises ArgumentError unless the plant is one that can be differentiated."""
+    """Raises ArgumentError unless the plant is differentiable."""
     if not isinstance(loop.plant, DynamicsPlant):
         raise ArgumentError(
-            f"{loop.plant!r} has no derivatives; train on DynamicsPlant(PinocchioDynamics(robot)), whose motions are"
-            " MuJoCo's to 1e-10, and try the result on this plant."
+            f"{loop.plant!r} has no derivatives; train on DynamicsPlant(PinocchioDynamics(robot)), which agrees with"
+            " MuJoCo to 1e-10, and test the result on this plant."
         )
 
 
@@ -162,7 +167,7 @@ def _on_cpu(controller: Any) -> bool:
 
 
 def _constant_torque(tau_d: Any, nv: int) -> np.ndarray:
-    """The torque as an array; raises ArgumentError unless it is finite, a number or one per joint."""
+    """The torque as an array; raises ArgumentError unless it is one finite number or one per joint."""
     torque = floats("disturbance", 0.0 if tau_d is None else tau_d)
     if torque.shape not in ((), (nv,)) or not np.isfinite(torque).all():
         raise ArgumentError(f"disturbance is {tau_d}, expected one finite torque or {nv}, one per joint [N·m].")
@@ -170,7 +175,7 @@ def _constant_torque(tau_d: Any, nv: int) -> np.ndarray:
 
 
 def _scene(controller: Controller, loop: Loop) -> Scene | None:
-    """What the kernels need to know of this loop, or None when one of its parts has no kernel."""
+    """Constants of the loop for the kernels, or None if one of its parts has no kernel."""
     plant = loop.plant
     if type(plant) is not DynamicsPlant or not controller.packable:
         return None
@@ -195,7 +200,7 @@ def _scene(controller: Controller, loop: Loop) -> Scene | None:
 
 
 class _ByKernels(torch.autograd.Function):
-    """One rollout per start, each on any core; a start's share of the gradient is its own until all are summed."""
+    """One rollout per start, in parallel; the gradients of the starts are stored apart and then summed."""
 
     @staticmethod
     def forward(
@@ -246,7 +251,7 @@ class _ByKernels(torch.autograd.Function):
 
 
 def _by_torch(controller: Controller, batch: Batch, tau_d: torch.Tensor) -> Motions:
-    """The same loop as it is written, one torch operation after the other."""
+    """The same loop in torch operations."""
     loop, plant = batch.loop, cast(DynamicsPlant, batch.loop.plant)
     parameters: list[Any] = list(controller.parameters()) if isinstance(controller, nn.Module) else []
     device = parameters[0].device if parameters else torch.device("cpu")

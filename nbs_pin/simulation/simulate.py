@@ -1,4 +1,4 @@
-"""The one time loop: a controller, a reference and a plant make a Run."""
+"""The simulation of a sampled control loop, recorded as a Run."""
 
 import math
 import os
@@ -43,26 +43,39 @@ def simulate(
     workers: int = 1,
     progress: bool = False,
 ) -> Run:
-    """The motion of `plant` under `controller` following `reference` for `duration` [s].
+    """The motion of the plant under the controller, sampled at the control instants.
 
-    Every `period` [s] the controller, in its compiled form, sees the state and the reference; its torque is clipped to
-    the effort limits and held until the next instant, while the plant takes steps of `plant_step` [s] under τ + τ_d.
+    Every period the compiled controller receives the state and the reference. Its torque is clipped to the effort
+    limits and held until the next instant, while the plant takes its steps under τ + τ_d.
 
-    duration: a whole number of periods. period: a whole number of plant steps; without `plant_step`, the longest step
-    of at most 1 ms that divides it.
-    q0, v0: start [rad], [rad/s]. Without q0 the start is the reference's (q and v); with q0 and no v0 it is at rest.
-    Leading axes of q0 simulate many starts at once.
-    effort_limit: largest |τ| [N·m], a number or one per joint; None takes the arm's (`plant.robot`), inf for none.
-    disturbance: τ_d(t, q, v) [N·m], evaluated at every plant step and held over it (`motions/disturbances.py`, any callable).
-    lookahead: how far [s] ahead the controller is evaluated, on the reference of that time and the state predicted with
-    the reference's acceleration. A held torque acts half a period late on average, so None takes half a period, which
-    removes that lag (the tracking error of a panda at 1 kHz falls tenfold); 0 is the plain sampled law.
-    workers: processes that share the starts along the first axis of q0. `TorqueNoise` is then the one of all starts
-    together; any other disturbance is called with the starts of its own process.
-    progress: show a progress bar when it takes longer than 2 s at a terminal.
+    Args:
+        plant: The simulated arm.
+        controller: The control law.
+        reference: The desired motion.
+        duration: A whole number of periods [s].
+        period: Control period [s], a whole number of plant steps.
+        q0: Start (..., n) [rad]; leading axes simulate many starts at once. None takes the reference's q and v.
+        v0: Start [rad/s]; None is at rest if q0 is given.
+        plant_step: Plant step [s]; None takes the longest one of at most 1 ms that divides the period.
+        effort_limit: Largest |τ| [N·m], a number or one per joint, inf for none; None takes that of the arm.
+        disturbance: Any callable τ_d(t, q, v) [N·m]; evaluated at every plant step and held over it.
+        lookahead: How far ahead [s] the law is evaluated, on the reference of that time and the state predicted with
+            its acceleration. A held torque acts half a period late on average; None takes half a period, which removes
+            that lag (the tracking error of panda at 1 kHz falls tenfold). 0 is the plain sampled law.
+        workers: Processes that share the starts along the first axis of q0. `TorqueNoise` is the same for any number;
+            another disturbance is called with the starts of one process at a time.
+        progress: Show a progress bar on a terminal after 2 s.
 
-    Raises ArgumentError for arguments that do not fit each other, and SimulationDiverged, naming the time, when the
-    controller's torque or the state is not finite or the engine warns.
+    Raises:
+        ArgumentError: If arguments are out of range or do not match.
+        SimulationDiverged: If a torque or the state is not finite, or the engine warns; it states the time.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> plant, law = nbs.MujocoPlant(robot), nbs.NeuralBackstepping.for_robot(robot)
+        >>> nbs.simulate(plant, law, nbs.Hold([0.3, 0.2]), duration=0.1, period=0.001).q.shape
+        (101, 2)
     """
     if workers < 1 or workers != int(workers):
         raise ArgumentError(f"workers is {workers}, expected a whole number of processes ≥ 1; correct it.")
@@ -74,15 +87,15 @@ def simulate(
 
 
 def _shared(loop: "_Closed", reference: DesiredMotion, start: tuple[np.ndarray, np.ndarray], workers: int) -> Run:
-    """The run of slices of the starts in processes of their own, joined along the first batch axis."""
+    """The run of all starts, simulated in slices by several processes and joined along the first batch axis."""
     q0, v0 = start
     if q0.ndim < 2:
-        raise ArgumentError(f"workers share starts, and q0 has shape {q0.shape}; give q0 of shape (starts, ..., nv).")
+        raise ArgumentError(f"workers share starts, but q0 has shape {q0.shape}; give q0 of shape (starts, ..., nv).")
     bounds = np.linspace(0, len(q0), min(workers, len(q0)) + 1).astype(int).tolist()
     shares = list(pairwise(bounds))
     shape = (len(_RECORDED), loop.steps + 1, *q0.shape)
     with tempfile.TemporaryDirectory(dir=_roomy(8 * math.prod(shape))) as folder:
-        # One file that every process writes its starts into; its pages stay while the run refers to them.
+        # Every process writes its starts into this file; its pages stay mapped while the run refers to them.
         file = str(Path(folder) / "run.npy")
         rows = np.lib.format.open_memmap(file, mode="w+", dtype=float, shape=shape)
         jobs = [
@@ -91,17 +104,18 @@ def _shared(loop: "_Closed", reference: DesiredMotion, start: tuple[np.ndarray, 
         ]
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
             runs = joblib.Parallel(n_jobs=workers)(jobs)
-    references = {name: _tiled(getattr(runs[0], name), rows[0].shape) for name in ("q_ref", "v_ref", "a_ref")}
+    stored = {name: getattr(runs[0], name) for name in ("q_ref", "v_ref", "a_ref")}
+    references = {name: np.array(np.broadcast_to(x, rows[0].shape)) for name, x in stored.items()}
     return replace(runs[0], **{name: np.asarray(row) for name, row in zip(_RECORDED, rows, strict=True)}, **references)
 
 
 def _roomy(size: int) -> str | None:
-    """Memory as a folder if there is one with room for `size` bytes, else None for the usual place."""
+    """A folder in memory with room for `size` bytes, or None for the default place."""
     return _MEMORY if os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > 2 * size else None
 
 
 def _of_starts(loop: "_Closed", first: int, end: int, count: int) -> "_Closed":
-    """The loop for some of `count` starts: noise is the one those starts have among all of them."""
+    """The loop for some of `count` starts, which have the same noise as among all of them."""
     noise = loop.disturbance
     return replace(loop, disturbance=replace(noise, share=(first, end, count))) if type(noise) is TorqueNoise else loop
 
@@ -109,17 +123,13 @@ def _of_starts(loop: "_Closed", first: int, end: int, count: int) -> "_Closed":
 def _share(
     file: str, share: tuple[int, int], loop: "_Closed", reference: DesiredMotion, q0: np.ndarray, v0: np.ndarray
 ) -> Run:
-    """One worker's simulation: what differs from start to start goes into the file, the first start comes back."""
+    """The simulation of one worker: writes its starts into the file and returns the first of them."""
     own = slice(*share)
     run, _ = _block(loop, reference, 0, loop.steps, (q0[own], v0[own]), None, False)
     rows = np.lib.format.open_memmap(file, mode="r+")
     for row, name in zip(rows, _RECORDED, strict=True):
         row[:, own] = getattr(run, name)
     return replace(run, **{name: getattr(run, name)[:, :1] for name in (*_RECORDED, "q_ref", "v_ref", "a_ref")})
-
-
-def _tiled(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    return np.array(np.broadcast_to(x, shape))
 
 
 def stream(
@@ -138,11 +148,18 @@ def stream(
     lookahead: float | None = None,
     progress: bool = False,
 ) -> Iterator[Run]:
-    """`simulate` without keeping what is past: one Run per `block` control periods, for hours of motion.
+    """`simulate` with bounded memory, for hours of motion: one Run per `block` control periods.
 
-    Each run begins at the instant and in the state in which the one before ended, and all of them together are the run
-    that `simulate` gives, for a controller whose `step` depends on its arguments alone: at the border of two blocks it
-    is asked twice. Arguments and errors are those of `simulate`.
+    Each run begins at the instant and state in which the one before ended. Together they are the run of `simulate`, if
+    `controller.step` depends only on its arguments: it is called twice at the border of two blocks. All other arguments
+    and the errors are those of `simulate`.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> plant, law = nbs.DynamicsPlant.for_robot(robot), nbs.PD.for_robot(robot)
+        >>> [len(run.t) for run in nbs.stream(plant, law, nbs.Hold([0.3, 0.2]), 0.2, 0.001, block=100)]
+        [101, 101]
     """
     loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
     if block < 1:
@@ -156,13 +173,13 @@ def _blocks(
     memory = None
     for first in tracked(range(0, loop.steps, block), "simulating", progress):
         run, memory = _block(loop, reference, first, min(block, loop.steps - first), state, memory, False)
-        state = run.q[-1].copy(), run.v[-1].copy()  # the run itself is its reader's
+        state = run.q[-1].copy(), run.v[-1].copy()  # copies, since the reader may modify the run
         yield run
 
 
 @dataclass(frozen=True, eq=False)
 class _Closed(Loop):
-    """A loop with what closes it."""
+    """A loop with its controller and disturbance."""
 
     law: Controller
     name: str
@@ -185,7 +202,7 @@ def _closed(
 
 
 def _compiled(controller: Controller) -> Controller:
-    """The compiled form; the controller itself where `compile` is another base's method, as torch.nn.Module's."""
+    """The compiled form; the controller itself if `compile` is that of another base, such as torch.nn.Module."""
     law = controller.compile()
     return law if isinstance(law, Controller) else controller
 
@@ -199,35 +216,33 @@ def _block(
     memory: Any,
     progress: bool,
 ) -> tuple[Run, Any]:
-    """The rows of `steps` periods from the instant number `first` on, and the controller's memory at their end."""
+    """The rows of `steps` periods from the control instant `first` on, and the controller's memory at their end."""
     times, ahead, desired, target = loop.schedule(reference, first, steps)
     leads = ahead.tolist()
     run = loop.blank_run(times, desired, *start, controller=loop.name)
     memory = loop.law.initial_memory(run.q[0]) if first == 0 else memory
-    # Overflow needs no warning here: every torque and every state is checked, and reported with its time.
+    # No overflow warnings: every torque and state is checked, and reported with its time.
     with np.errstate(over="ignore", invalid="ignore"):
         for k in tracked(range(steps), "simulating", progress):
             tau, memory = _control(loop, run, k, leads[k], target, memory)
             run.q[k + 1], run.v[k + 1] = _advance(loop, run, k, tau)
-        _control(
-            loop, run, steps, leads[steps], target, memory
-        )  # recorded, and asked for again by whoever goes on from here
+        _control(loop, run, steps, leads[steps], target, memory)  # recorded; a following block computes it again
     return run, memory
 
 
 def _control(loop: _Closed, run: Run, k: int, lead: float, target: Reference, memory: Any) -> tuple[np.ndarray, Any]:
-    """The torque of row k, seen `lead` [s] ahead and written into the run, and the memory after it."""
+    """The torque of row k, evaluated `lead` [s] ahead and recorded in the run, and the memory after it."""
     q, v, tau, dv = run.q[k], run.v[k], run.tau[k], lead * run.a_ref[k]
     aim = Reference(target.q[k], target.v[k], target.a[k])
     command, memory = loop.law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, loop.period)
-    # Finite before clipped: a clip can turn a torque that is not a number into full effort.
+    # Checked before clipping, which can turn NaN into full effort.
     run.tau_command[k] = command = _checked(command, q.shape, loop.name, float(run.t[k]))
     np.maximum(np.minimum(command, loop.limit, out=tau), -loop.limit, out=tau)
     return tau, memory
 
 
 def _advance(loop: _Closed, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The state one period after row k; the disturbance at its start goes into the run."""
+    """The state one period after row k; records the disturbance at its start."""
     q, v, t, step = run.q[k], run.v[k], float(run.t[k]), loop.step
     try:
         for j in range(loop.substeps):
@@ -248,12 +263,12 @@ def _checked(command: Any, shape: tuple[int, ...], name: str, t: float) -> np.nd
     if command.shape != shape:
         raise ArgumentError(
             f"{name} gave a torque of shape {command.shape} at t = {t:g} s, expected {shape}; "
-            "a controller returns one torque per joint for every start."
+            "return one torque per joint for every start."
         )
     if not all_finite(command):
         raise SimulationDiverged(
-            f"{name} asked for the torque {command} at t = {t:g} s, expected finite numbers; "
-            "look for a division by zero or an unstable gain."
+            f"{name} commanded the torque {command} at t = {t:g} s, expected finite numbers; "
+            "check for a division by zero or an unstable gain."
         )
     return command
 

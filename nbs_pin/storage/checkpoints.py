@@ -1,7 +1,7 @@
-"""Controllers and models in files: settings and weights, the arm they are for, and where a training stood.
+"""Checkpoints: controllers and models in files, with their settings, weights and arm, and the state of a training.
 
 A file holds `controller.json` (settings, arm, versions), `controller.safetensors` (the `state_dict`, float64) and, for
-a training that can be resumed, `training.json` and `training.safetensors`, sealed as `base/archives.py` has it. No pickle.
+a training that can be resumed, `training.json` and `training.safetensors`, sealed by `base/archives.py`. No pickle.
 """
 
 import json
@@ -23,56 +23,69 @@ from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.descriptions import Settings, Stored, describe, described_robot, rebuild
 
 FORMAT = "nbs_pin checkpoint 1"
-"""What the manifest of a checkpoint says."""
+"""Format name in the manifest of a checkpoint."""
 _CONTROLLER, _TRAINING = "controller", "training"
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingState:
-    """What a training needs beside the controller to go on as if it had never stopped."""
+    """What a training needs, besides the controller, to resume bit for bit."""
 
     tensors: dict[str, torch.Tensor] = field(default_factory=dict)
-    """Such as an optimiser's moments, of any kind of number."""
+    """Such as the moments of an optimiser, of any dtype."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """What JSON can store: epoch, best cost, history, random state as integers."""
+    """JSON values: epoch, best cost, history, random state as integers."""
 
 
 class Checkpoint(NamedTuple):
-    """What a checkpoint holds."""
+    """Contents of a checkpoint."""
 
     controller: Any
-    """The same law or model with the same weights: a `Controller` or a `DynamicsProvider`."""
+    """The stored `Controller` or `DynamicsProvider`."""
     training: TrainingState | None
-    """Where its training stood, if it was written during one."""
+    """State of the training during which it was written, or None."""
 
 
 def save(controller: Stored, path: str | Path, *, info: Mapping[str, Any] | None = None) -> None:
-    """Write a controller or a model to one file, which `load` turns into one of bit for bit the same torques.
+    """Write a controller or a model to one file, from which `load` restores the same torques bit for bit.
 
-    The file holds the old one or the new one, whatever interrupts the writing; missing folders are made.
-    info: free notes (seed, what it was trained for), stored as JSON and given back by `about`.
-    Raises ArgumentError for one with parts from outside the package or weights that are not finite.
+    Args:
+        controller: A controller or a dynamics model, all of whose parts are from this package.
+        path: The file, replaced atomically; missing folders are created.
+        info: Notes, such as the seed, stored as JSON and returned by `about`.
+
+    Raises:
+        ArgumentError: If a part is not from this package or cannot be stored, or a weight is not finite.
+
+    Example:
+        >>> import tempfile
+        >>> import nbs_pin as nbs
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     nbs.save(nbs.PD.for_robot(nbs.load_robot("two_link")), f"{folder}/pd.nbs")
+        ...     nbs.load(f"{folder}/pd.nbs").kd.round(1)
+        array([81.6, 36.5])
     """
     write_checkpoint(path, controller, info=info)
 
 
 def load(path: str | Path, robot: Robot | None = None) -> Any:
-    """The `Controller` or the `DynamicsProvider` that `save` wrote to the file; a model's report becomes a dict.
+    """The `Controller` or `DynamicsProvider` that `save` wrote to the file; the report of a model becomes a dict.
 
-    robot: the arm it is for, with effort limits as wished; None loads it as it was loaded then, with the limits it had.
-    A PID still saturates at its own `effort_limit`, and one built without an arm is for its number of joints alone.
-    Raises FileNotFoundError for no file, FileFormatError for one that is damaged or no checkpoint, ArgumentError for
-    another arm than the file is for, RobotNotFound when its description is no longer there, and RobotError when that
-    has changed.
+    Args:
+        path: The file.
+        robot: The arm that it is for, with any effort limits (a PID keeps its own); None loads the arm as stored.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        FileFormatError: If the file is damaged or not a checkpoint.
+        ArgumentError: If robot is not the arm of the file or, if that has none, has another number of joints.
+        RobotError: If the description of the arm has changed or, as RobotNotFound, no longer exists.
     """
     return read_checkpoint(path, robot).controller
 
 
 def about(path: str | Path) -> dict[str, Any]:
-    """What the file says of itself, nothing being built: `controller` (settings and arm), `versions` and `info`.
-
-    Raises as `load` does for files that cannot be read.
-    """
+    """`controller` (settings, arm), `versions` and `info` of a file, without building anything; raises as `load`."""
     return _document(path, read_archive(path, FORMAT))
 
 
@@ -83,7 +96,7 @@ def write_checkpoint(
     *,
     info: Mapping[str, Any] | None = None,
 ) -> None:
-    """`save`, with where a training stands; raises ArgumentError for facts JSON cannot store or tensors not finite."""
+    """`save` with the state of a training; ArgumentError also for facts that JSON cannot store."""
     try:
         settings, tensors = describe(controller)
     except ArgumentError as error:
@@ -97,7 +110,7 @@ def write_checkpoint(
 
 
 def read_checkpoint(path: str | Path, robot: Robot | None = None) -> Checkpoint:
-    """The controller that `write_checkpoint` wrote, and where its training stood; robot and errors as in `load`."""
+    """The controller and training state that `write_checkpoint` wrote; robot and errors as in `load`."""
     entries = read_archive(path, FORMAT)
     settings = _document(path, entries)["controller"]
     with _refusing(path):
@@ -116,24 +129,22 @@ def read_checkpoint(path: str | Path, robot: Robot | None = None) -> Checkpoint:
 def _entries(name: str, document: dict[str, Any], tensors: dict[str, torch.Tensor]) -> dict[str, bytes]:
     for key, x in tensors.items():
         if not torch.isfinite(x).all():
-            raise ArgumentError(f"tensor '{key}' of the {name} is not finite, and nothing was saved; go back a step.")
+            raise ArgumentError(f"tensor '{key}' of the {name} is not finite, nothing was saved; use an earlier one.")
     try:
         text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
     except (TypeError, ValueError) as error:
-        raise ArgumentError(
-            f"the {name} cannot be stored as JSON ({error}); keep to finite numbers and text."
-        ) from error
+        raise ArgumentError(f"the {name} cannot be stored as JSON ({error}); use finite numbers and text.") from error
     return {f"{name}.json": text.encode(), f"{name}.safetensors": safetensors.torch.save(tensors)}
 
 
 def _document(path: str | Path, entries: Mapping[str, bytes]) -> dict[str, Any]:
-    """`controller.json`; raises FileFormatError unless the file has just the entries of a checkpoint."""
+    """`controller.json`; raises FileFormatError unless the file has exactly the entries of a checkpoint."""
     expected = {f"{name}.{kind}" for name in (_CONTROLLER, _TRAINING) for kind in ("json", "safetensors")}
     if entries.keys() not in (expected, {name for name in expected if name.startswith(_CONTROLLER)}):
-        raise FileFormatError(f"{path}: holds {', '.join(entries)}, not what a checkpoint holds; save it again.")
+        raise FileFormatError(f"{path}: holds {', '.join(entries)}, not the entries of a checkpoint; save it again.")
     document = parse_json(path, f"{_CONTROLLER}.json", entries[f"{_CONTROLLER}.json"])
     if document.keys() != {"controller", "versions", "info"}:
-        raise FileFormatError(f"{path}: controller.json says {', '.join(document)}, not what we write; save it again.")
+        raise FileFormatError(f"{path}: controller.json has {', '.join(document)}, expected other keys; save it again.")
     return document
 
 
@@ -141,11 +152,11 @@ def _tensors(path: str | Path, name: str, entries: Mapping[str, bytes]) -> dict[
     try:
         return safetensors.torch.load(entries[f"{name}.safetensors"])
     except (SafetensorError, ValueError, RuntimeError) as error:
-        raise FileFormatError(f"{path}: '{name}.safetensors' is damaged ({error}); take an older copy.") from error
+        raise FileFormatError(f"{path}: '{name}.safetensors' is damaged ({error}); use an older copy.") from error
 
 
 def _arm(path: str | Path, stored: Settings, given: Robot | None) -> Robot:
-    """The arm that is described, with the effort limits of then, or the one given if it is the same."""
+    """The arm described, with its stored effort limits, or `given` if that is the same arm."""
     robot = _loaded(path, stored) if given is None else given
     if robot.sha256 != stored["sha256"]:
         message = (
@@ -153,7 +164,7 @@ def _arm(path: str | Path, stored: Settings, given: Robot | None) -> Robot:
             f"({robot.source}, {robot.sha256:.12}) has other links, joints, limits or gravity; "
         )
         if given is None:
-            raise RobotError(f"{message}that file was changed: give the arm as it was then as robot=….")
+            raise RobotError(f"{message}that file was changed: give the original arm as robot=….")
         raise ArgumentError(f"{message}give that arm, or build a controller for this one.")
     limits = [math.inf if limit is None else limit for limit in stored["effort_limit"]]
     if given is not None or robot.effort_limit.tolist() == limits:
@@ -179,7 +190,7 @@ def _loaded(path: str | Path, stored: Settings) -> Robot:
 
 @contextmanager
 def _refusing(path: str | Path) -> Iterator[None]:
-    """What is wrong with the contents is wrong with the file."""
+    """Turns an ArgumentError about the contents into a FileFormatError about the file."""
     try:
         yield
     except ArgumentError as error:

@@ -1,6 +1,6 @@
-"""A controller or a model as settings that JSON can store and tensors, and the same one back.
+"""Conversion of controllers and models to JSON settings and tensors, and back.
 
-Every part of it is its class and the arguments of its constructor. The class says where each argument is found
+Every part is stored as its class and its constructor arguments. The class states where each argument is found
 (`base/storable.py`): plain settings and further parts in the description, arrays among the tensors of the `state_dict`.
 """
 
@@ -26,13 +26,13 @@ Settings: TypeAlias = dict[str, Any]
 """A part in JSON: its `kind`, its settings by name, and its own parts."""
 
 Stored: TypeAlias = Controller | DynamicsProvider
-"""What files hold: a law, or what one believes of an arm."""
+"""What files hold: a controller or a dynamics model."""
 
 
 def describe(stored: Stored) -> tuple[Settings, Tensors]:
-    """The controller or model in JSON and copies of the tensors of its `state_dict`: `rebuild` makes the same of them.
+    """JSON settings and copies of the `state_dict` tensors, from which `rebuild` makes the same controller or model.
 
-    Raises ArgumentError for one with parts that are not the package's own, or numbers that are not finite.
+    Raises ArgumentError if a part is not from this package, or a number is not finite.
     """
     settings = cast(Settings, _described(stored))
     state = stored.state_dict() if isinstance(stored, nn.Module) else {}
@@ -46,17 +46,17 @@ def describe(stored: Stored) -> tuple[Settings, Tensors]:
 
 
 def described_robot(description: Any) -> Settings | None:
-    """The description of the arm that a controller or model is for, None where it knows no arm.
+    """The description of the arm that a controller or model is for, or None if it has no arm.
 
-    Raises ArgumentError for a description that `describe` would not give.
+    Raises ArgumentError for a description that `describe` would not produce.
     """
     if not issubclass(cast(type, _kind_of(description).make), Controller | DynamicsProvider):
-        raise ArgumentError(f"a {description['kind']} is no controller and no model")
+        raise ArgumentError(f"a {description['kind']} is neither a controller nor a model")
     robot = _robot_in(description)
     if robot is None:
         return None
     if _kind_of(robot).make is not Robot:
-        raise ArgumentError(f"the arm is a {robot['kind']}")
+        raise ArgumentError(f"the arm is a {robot['kind']}, not a Robot")
     kinds = {"name": str, "source": str, "options": dict, "sha256": str, "effort_limit": list}
     wrong = [name for name, kind in kinds.items() if not isinstance(robot[name], kind)]
     if wrong:
@@ -65,7 +65,7 @@ def described_robot(description: Any) -> Settings | None:
 
 
 def _robot_in(description: Any) -> Any:
-    """The arm of a law is its model's, that of a model which corrects another is the other's."""
+    """The described arm; that of a law is its model's, that of a model correcting another is the other's."""
     kind = _kind_of(description)
     if "robot" in kind.parts:
         return description["robot"]
@@ -74,15 +74,14 @@ def _robot_in(description: Any) -> Any:
 
 
 def rebuild(description: Settings, tensors: Mapping[str, torch.Tensor], robot: Robot | None) -> Stored:
-    """What `describe` described, with these tensors as its `state_dict`.
+    """The controller or model that `describe` described, with these tensors as `state_dict` and `robot` as its arm.
 
-    robot: stands where the description has an arm. Raises ArgumentError when description and tensors do not make one
-    controller or model: a setting or tensor too many or too few, of another shape or kind, or out of its range.
+    Raises ArgumentError if a setting or tensor is missing, superfluous, of another shape or type, or out of range.
     """
     try:
         stored = _rebuild(description, Tensors(tensors), robot)
-    except (AttributeError, TypeError, ValueError, RuntimeError) as error:  # constructors given what is none of theirs
-        raise ArgumentError(f"settings and tensors make no controller or model: {error}") from error
+    except (AttributeError, TypeError, ValueError, RuntimeError) as error:  # from constructors given wrong arguments
+        raise ArgumentError(f"settings and tensors do not form a controller or model: {error}") from error
     module = stored if isinstance(stored, nn.Module) else nn.Module()
     _check_tensors(tensors, module)
     module.load_state_dict(tensors)
@@ -100,7 +99,7 @@ def _described(part: Any) -> Settings | None:
     kind = RECIPES.get(type(part).__name__)
     if kind is None or kind.make is not type(part):
         known = ", ".join(_recipes())
-        raise ArgumentError(f"a {type(part).__name__} cannot be stored, only {known} and no subclass")
+        raise ArgumentError(f"a {type(part).__name__} cannot be stored, only {known}, without subclasses")
     settings = {name: _plain(attrgetter(place)(part)) for name, place in kind.settings.items()}
     parts = {name: _described(attrgetter(place)(part)) for name, place in kind.parts.items()}
     return {"kind": type(part).__name__, **settings, **parts}
@@ -119,7 +118,7 @@ def _rebuild(description: Any, tensors: Tensors, robot: Robot | None) -> Any:
 
 
 def _kind_of(description: Any) -> Recipe:
-    """The kind of part that is described; raises ArgumentError unless it is a known one with just its settings."""
+    """The recipe of a described part; raises ArgumentError unless it is known and has exactly its settings."""
     name = description.get("kind") if isinstance(description, dict) else None
     kind = RECIPES.get(str(name)) or _recipes().get(str(name))
     if kind is None:
@@ -131,7 +130,7 @@ def _kind_of(description: Any) -> Recipe:
 
 
 def _check_tensors(tensors: Mapping[str, torch.Tensor], module: nn.Module) -> None:
-    """Raise ArgumentError unless they are a state of the module, its fixed numbers included."""
+    """Raises ArgumentError unless the tensors are a `state_dict` of the module, with its own buffers."""
     expected, fixed = module.state_dict(), dict(module.named_buffers())
     wrong = sorted(tensors.keys() ^ expected.keys())
     if wrong:
@@ -149,7 +148,7 @@ def _check_tensors(tensors: Mapping[str, torch.Tensor], module: nn.Module) -> No
 
 
 def _plain(value: Any) -> Any:
-    """Numbers, text, lists and records for JSON, which has no infinity: null stands for it."""
+    """Numbers, text, lists and records for JSON; null stands for infinity, which JSON lacks."""
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
@@ -166,7 +165,7 @@ def _revived(values: list[Any], sequence: Callable[[list[Any]], Any]) -> Any:
 
 
 def _recipes() -> dict[str, Recipe]:
-    """The recipes of all laws, models and networks by name, their modules imported."""
+    """The recipes of all laws, models and networks by name, after importing their modules."""
     for entry in (*LAWS.values(), *PROVIDERS.values(), *NETWORKS.values()):
         entry.load()
     return RECIPES

@@ -1,1 +1,1 @@
-"""Controllers trained through the closed loop."""
+"""Training of controllers through the closed loop."""

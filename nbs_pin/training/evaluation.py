@@ -1,4 +1,4 @@
-"""What a controller does from starts that its training never saw."""
+"""Evaluation of a controller from starts that its training did not use."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,15 +15,15 @@ from nbs_pin.simulation.loop import Loop
 from nbs_pin.simulation.rollout import Batch, Motions, motions, recorded
 
 FRESH_STARTS = 20
-"""Starts per reference on which a controller is compared with what it was before."""
+"""Starts per reference for comparing a trained controller with the untrained one."""
 
 
 def fresh_batch(
     loop: Loop, references: Sequence[DesiredMotion], start_error: float, seed: int, starts: int = FRESH_STARTS
 ) -> Batch:
-    """So many motions along each reference, at rest within ±start_error [rad] of its start.
+    """Motions along each reference from `starts` random starts at rest within ±start_error [rad] of its start.
 
-    They are drawn apart from those of `train`, whose seed is the number alone.
+    The random stream of a seed differs from that of `train`.
     """
     draw, batches = np.random.default_rng((seed, 1)), []
     for reference in references:
@@ -34,24 +34,24 @@ def fresh_batch(
 
 
 def compared(controller: Controller, batch: Batch) -> Run:
-    """The motions of a batch as a run; what diverges is NaN from there on, or as a whole without kernels."""
+    """The motions of a batch as a run; a diverging motion is NaN from there on or, without kernels, entirely."""
     with torch.no_grad():
         try:
             motion = motions(controller, batch)
-        except SimulationDiverged:  # without kernels the plant refuses to go on, and takes every start along
+        except SimulationDiverged:  # without kernels one diverging start stops the whole batch
             motion = Motions(*(torch.cat(parts) for parts in zip(*_one_by_one(controller, batch), strict=True)))
     return recorded(motion, batch, type(controller).__name__)
 
 
 def fresh_figures(run: Run) -> dict[str, float]:
-    """Figures over the starts of a run, units in the keys; inf where there is no time of convergence.
+    """Metrics over all starts of a run, with units in the keys.
 
-    Median and worst time of convergence; the largest ‖z1‖² of the last 30 % of the time; the largest torque, the root
-    mean square over starts and time of ‖τ‖, and the fraction of the time for which some joint is at its limit: NaN for
-    these four when some motion is not finite, which has not converged either.
+    Median and worst convergence time, inf for a motion that does not converge or is not finite; largest ‖z1‖² in the
+    last 30 % of the time, largest torque, root mean square of ‖τ‖ over starts and time, and fraction of the time with
+    a saturated joint: NaN if some motion is not finite.
     """
     finite = np.isfinite(run.q).all(axis=(0, -1)) & np.isfinite(run.tau_command).all(axis=(0, -1))
-    with np.errstate(over="ignore", invalid="ignore"):  # of motions on their way out of the finite numbers
+    with np.errstate(over="ignore", invalid="ignore"):  # from diverging motions
         times = np.where(finite, metrics.convergence_time(run), np.inf)
         steady, peak, rms, saturated = (
             np.where(finite, measure(run), np.nan)
@@ -68,7 +68,7 @@ def fresh_figures(run: Run) -> dict[str, float]:
 
 
 def _one_by_one(controller: Controller, batch: Batch) -> list[Motions]:
-    """The motions of a batch, each by itself; NaN for one that diverges."""
+    """The motions of a batch, computed one by one; NaN for one that diverges."""
     names, done = ("aims", "desired", "q0", "v0", "tau_d"), []
     for k in range(len(batch)):
         one = replace(batch, **{name: getattr(batch, name)[k : k + 1] for name in names})

@@ -1,4 +1,4 @@
-"""How parameters move: optimisers by name, each with its schedule, and their state as plain tensors and numbers."""
+"""Optimisers by name, their learning rate schedules, and their state as tensors and JSON values."""
 
 from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias
@@ -9,26 +9,26 @@ from nbs_pin.base.checks import positive
 from nbs_pin.base.exceptions import ArgumentError
 
 OptimiserName: TypeAlias = Literal["adam-backtracking", "adam", "lbfgs"]
-"""Adam that goes back to the best parameters with half the step whenever the cost has risen by `RISE` of theirs;
+"""Adam that returns to the best parameters with half the step whenever the cost exceeds the lowest by the share `RISE`;
 Adam with its step halved after every fifth of the epochs, as in the paper; or L-BFGS with a strong Wolfe line search.
 
-A sampled loop has cliffs, where gains become too high for the period and the cost leaps. Adam steps over them and then
-searches on the far side; a line search stops before them for good."""
+The cost of a sampled loop jumps where gains become too high for the period. Adam may step across such a jump and then
+search on the wrong side; a line search stops in front of it (docs/theory.md §7)."""
 LEARNING_RATES: dict[str, float] = {"adam-backtracking": 1e-2, "adam": 1e-2, "lbfgs": 1.0}
-"""Step of each unless another is asked for; the paper takes 1e-3 for Adam."""
+"""Default learning rates; the paper uses 1e-3 for Adam."""
 RISE = 0.02
 """Share of the lowest cost by which "adam-backtracking" lets the cost rise."""
 STAGES = 5
 
 
 def optimiser(name: str, parameters: Sequence[torch.nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
-    """The optimiser of that name; raises ArgumentError for an unknown one or a rate that is not positive."""
+    """The optimiser of that name; raises ArgumentError for an unknown name or a rate that is not positive."""
     positive("learning_rate", learning_rate, "")
     if name in ("adam", "adam-backtracking"):
         return torch.optim.Adam(parameters, lr=learning_rate)
     if name == "lbfgs":
-        # One iteration per epoch; its line search takes as many evaluations of the cost as it needs, mostly one.
-        # torch's own tolerances are for costs of about one; costs here are a thousandth, and it would stand still.
+        # One iteration per epoch; its line search usually needs one evaluation of the cost.
+        # With torch's default tolerances it would stop at once, as costs here are of the order of 1e-3.
         return torch.optim.LBFGS(
             parameters,
             lr=learning_rate,
@@ -42,12 +42,12 @@ def optimiser(name: str, parameters: Sequence[torch.nn.Parameter], learning_rate
 
 
 def scheduled_rate(name: str, learning_rate: float, epoch: int, epochs: int) -> float:
-    """Adam's step at an epoch: halved after every fifth of the epochs (the paper: every 40 of 200)."""
+    """Learning rate at an epoch; for "adam" halved after every fifth of the epochs (the paper: every 40 of 200)."""
     return learning_rate * 0.5 ** (epoch * STAGES // epochs) if name == "adam" else learning_rate
 
 
 def packed_state(state: Any, tensors: dict[str, torch.Tensor], path: str = "optimiser") -> Any:
-    """The nested state of an optimiser as JSON can hold it, its tensors moved into `tensors` under their paths."""
+    """The nested state of an optimiser as JSON values, with its tensors moved into `tensors` under their paths."""
     if isinstance(state, torch.Tensor):
         tensors[path] = state.detach().clone()
         return {"tensor": path}
@@ -59,7 +59,7 @@ def packed_state(state: Any, tensors: dict[str, torch.Tensor], path: str = "opti
 
 
 def unpacked_state(packed: Any, tensors: dict[str, torch.Tensor]) -> Any:
-    """What `packed_state` was given."""
+    """The inverse of `packed_state`."""
     ((kind, content),) = packed.items()
     if kind == "tensor":
         return tensors[content].clone()

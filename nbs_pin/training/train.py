@@ -1,4 +1,4 @@
-"""Training a controller through the closed loop: any parameters are stable, so take the best."""
+"""Training of a controller through the closed loop; every parameter value is stable."""
 
 import copy
 import math
@@ -50,23 +50,38 @@ def train(
     engine: Engine | None = None,
     progress: bool = False,
 ) -> Training:
-    """The controller whose parameters make the mean of ∫ l(z1, v − v_d, τ) dt + regulariser smallest over many motions.
+    """Minimise the mean of ∫ l(z1, v − v_d, τ) dt over many motions, plus the regulariser, over the parameters.
 
-    The loop is that of `simulate`, with its arguments `duration`, `period`, `effort_limit` and `lookahead`, and the
-    gradient is the exact one, through law, model, torque limits and integrator. Source: paper eq. (13), theory.md §7.
+    The loop is that of `simulate`, with its `duration`, `period`, `effort_limit` and `lookahead`; the gradient is exact
+    (paper eq. (13), docs/theory.md §7). Ctrl-C ends the training and keeps the best epoch.
 
-    plant: a `DynamicsPlant`. references: each is followed from every start. starts: configurations (starts, n) at rest,
-    a pair (q0, v0), or how many to draw, each joint within ±start_error [rad] of the reference's start. held_out: the
-    same for motions that are never trained on and that choose the best epoch; None draws a quarter as many (none when
-    starts are given). plant_step [s]: None takes one step per period, unlike `simulate`. disturbance: constant torque.
-    cost: l; None takes `TorqueAware` with the effort limits. gains: whether S, Λ and D₀ are trained too, never below
-    their `least_share`. optimiser: "adam-backtracking", "adam" or "lbfgs" (`training/optimisers.py`). patience: epochs without a
-    better held-out cost after which to stop. seed: of the starts drawn. checkpoint: a file kept up to date, from which
-    `resume` goes on bit for bit. engine: None takes the fastest (`closed_loop.engine_for`).
-    Ctrl-C ends training early and keeps the best, from the first epoch on.
+    Args:
+        plant: A `DynamicsPlant`.
+        references: Desired motions, each followed from every start.
+        starts: Configurations (starts, n) at rest, a pair (q0, v0), or the number of random starts per reference.
+        held_out: As starts, only to choose the best epoch; None draws a quarter as many, or none if starts are given.
+        start_error: Random starts are within ±start_error [rad] of the reference in each joint.
+        plant_step: Plant step [s]; None is the period, unlike in `simulate`.
+        disturbance: Constant torque [N·m], a number or (n,).
+        cost: l; None takes `TorqueAware` with the effort limits.
+        regulariser: Cost of the parameters themselves, a function of the controller.
+        gains: Whether gains, such as S, Λ and D₀, are trained as well, never below their least_share.
+        optimiser: "adam-backtracking", "adam" or "lbfgs" (`training/optimisers.py`).
+        patience: Epochs without a lower held-out cost after which to stop; None runs all epochs.
+        seed: Seed of the random starts.
+        checkpoint: File kept up to date, from which `resume` continues bit for bit.
+        engine: "kernels" or "torch"; None takes the faster one that applies.
 
-    Raises ArgumentError for arguments that do not fit, a checkpoint of another training or a plant without
-    derivatives, and SimulationDiverged when the first motions leave the finite numbers.
+    Raises:
+        ArgumentError: If arguments do not match, plant has no derivatives, or checkpoint is of another training.
+        SimulationDiverged: If the motions diverge before the first step.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> law = nbs.SlotineLi.for_robot(nbs.load_robot("two_link"), period=0.01)
+        >>> task = {"starts": 2, "duration": 0.1, "epochs": 2}
+        >>> len(nbs.train(law, nbs.DynamicsPlant(law.dynamics), [nbs.Hold([0.3, 0.2])], **task).history)
+        3
     """
     if not isinstance(controller, nn.Module):
         raise ArgumentError(f"{type(controller).__name__} has no parameters to train; give one of the package's laws.")
@@ -74,26 +89,11 @@ def train(
         raise ArgumentError(f"epochs is {epochs}, expected a whole number ≥ 1; the paper takes 200.")
     if patience is not None and patience < 1:
         raise ArgumentError(f"patience is {patience} epochs, expected at least one; None takes all epochs.")
-    loop = Loop.of(
-        plant,
-        controller.nv,
-        duration,
-        period,
-        plant_step=period if plant_step is None else plant_step,
-        effort_limit=effort_limit,
-        lookahead=lookahead,
-    )
+    step = period if plant_step is None else plant_step
+    settings = {"plant_step": step, "effort_limit": effort_limit, "lookahead": lookahead}
+    loop = Loop.of(plant, controller.nv, duration, period, **settings)
     check_plant(loop)
-    if not references:
-        raise ArgumentError("references is empty; give at least one motion to follow.")
-    if not 0.0 <= start_error < math.inf:
-        raise ArgumentError(f"start_error is {start_error} rad, expected a finite angle ≥ 0; 0.5 is usual.")
-    draw = np.random.default_rng(seed)
-    training = _motions(loop, references, starts, start_error, disturbance, draw)
-    if held_out is None:
-        held_out = math.ceil(starts / 4) if isinstance(starts, int | np.integer) else 0
-    kept = None if isinstance(held_out, int | np.integer) and held_out == 0 else held_out
-    checking = None if kept is None else _motions(loop, references, kept, start_error, disturbance, draw)
+    training, checking = _batches(loop, references, starts, held_out, start_error, disturbance, seed)
     task = Task(
         controller=copy.deepcopy(controller),
         training=training,
@@ -112,6 +112,22 @@ def train(
     return Trainer(task, resume, progress).run(progress)
 
 
+def _batches(
+    loop: Loop, references: Sequence[DesiredMotion], starts: Any, held_out: Any, error: float, tau_d: Any, seed: int
+) -> tuple[Batch, Batch | None]:
+    """The training and the held-out motions."""
+    if not references:
+        raise ArgumentError("references is empty; give at least one motion to follow.")
+    if not 0.0 <= error < math.inf:
+        raise ArgumentError(f"start_error is {error} rad, expected a finite angle ≥ 0; 0.5 is usual.")
+    draw = np.random.default_rng(seed)
+    training = _motions(loop, references, starts, error, tau_d, draw)
+    if held_out is None:
+        held_out = math.ceil(starts / 4) if isinstance(starts, int | np.integer) else 0
+    kept = None if isinstance(held_out, int | np.integer) and held_out == 0 else held_out
+    return training, None if kept is None else _motions(loop, references, kept, error, tau_d, draw)
+
+
 def _motions(
     loop: Loop,
     references: Sequence[DesiredMotion],
@@ -120,13 +136,13 @@ def _motions(
     disturbance: Any,
     draw: np.random.Generator,
 ) -> Batch:
-    """Every reference from every start; drawn starts differ from reference to reference."""
+    """Motions along every reference from every start; random starts differ between references."""
     batches = []
     for reference in references:
         q0, v0 = starts if isinstance(starts, tuple) else (starts, None)
         if isinstance(starts, int | np.integer):
             if starts < 1:
-                raise ArgumentError(f"{starts} starts were asked for, expected at least one; 32 is usual.")
+                raise ArgumentError(f"the number of starts is {starts}, expected at least one; 32 is usual.")
             begin = loop.schedule(reference, 0, 0).desired.q[0]
             q0 = begin + draw.uniform(-start_error, start_error, (starts, loop.plant.nv))
         batches.append(Batch.of(loop, reference, q0, v0, disturbance))

@@ -1,4 +1,4 @@
-"""The epochs of a training: steps, retreats, checkpoints and the best so far."""
+"""The epochs of a training: optimiser steps, backtracking, checkpoints and the best controller so far."""
 
 import copy
 import hashlib
@@ -25,7 +25,7 @@ from nbs_pin.storage.descriptions import describe
 from nbs_pin.training.optimisers import RISE, optimiser, packed_state, scheduled_rate, unpacked_state
 
 Regulariser: TypeAlias = Callable[[Any], torch.Tensor]
-"""A price on the controller itself, added to the mean cost of the motions: controller -> scalar tensor."""
+"""Cost of the controller itself, added to the mean cost of the motions: controller -> scalar tensor."""
 Stop: TypeAlias = Literal["epochs", "patience", "interrupted"]
 """Why training ended: all epochs done, no progress on the held-out motions, or Ctrl-C."""
 SAVE_EVERY = 10
@@ -34,25 +34,25 @@ SAVE_EVERY = 10
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """What training gave."""
+    """Result of a training."""
 
     controller: Any
-    """The controller as it was at its best epoch; the one given to `train` is left alone."""
+    """The controller of the best epoch; the one given to `train` is unchanged."""
     history: Float[np.ndarray, " epochs"]
     """Mean cost of the training motions, regulariser included, before each epoch's step and after the last."""
     held_out: Float[np.ndarray, " checked"]
-    """Mean cost of the held-out motions alone, at the same instants; empty without any."""
+    """Mean cost of the held-out motions without regulariser, at the same epochs; empty without any."""
     best_epoch: int
-    """Row of the controller that is given: the lowest held-out cost, or the lowest cost without held-out motions."""
+    """Row of `controller`: that of the lowest held-out cost, or of the lowest cost without held-out motions."""
     stopped: Stop
-    """Why it ended."""
+    """Why the training ended."""
     seconds: float
-    """Wall time, that before a resume included [s]."""
+    """Wall time, including that before a resume [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is to be made small, and how."""
+    """Cost to minimise, and settings of the optimiser."""
 
     controller: Any
     training: Batch
@@ -72,26 +72,26 @@ class Task:
         """Mean cost of the motions of a batch."""
         try:
             motion = motions(self.controller, batch, self.engine)
-        except SimulationDiverged:  # the torch engine's plant; the kernels give NaN
+        except SimulationDiverged:  # raised by the torch engine's plant; the kernels give NaN
             return torch.tensor(math.nan, dtype=torch.float64)
         return running_cost(motion, batch, self.cost).mean()
 
     def loss(self) -> torch.Tensor:
-        """What the optimiser sees."""
+        """Cost to minimise: mean cost of the training motions plus regulariser."""
         value = self.value(self.training)
         return value if self.regulariser is None else value + self.regulariser(self.controller)
 
     def warm_up(self) -> None:
-        """Run one period of one motion there and back, so that whatever has to be compiled is."""
+        """Compile everything: run one period of one motion, and its gradient."""
         if self.engine == "kernels":
             first = self.training.beginning()
             motions(self.controller, first, self.engine).command.sum().backward()  # type: ignore[no-untyped-call]
 
     def fingerprint(self) -> str:
-        """Of what a resumed training must have in common with the one that wrote the checkpoint.
+        """Hash of what a resumed training must share with the one that wrote the checkpoint.
 
-        Cost, regulariser, model and plant may be anything callable: they are known by the numbers they give at first.
-        Raises ArgumentError for a controller that no checkpoint can hold.
+        Cost, regulariser, model and plant may be any callables; they are identified by the initial costs.
+        Raises ArgumentError if the controller cannot be stored.
         """
         digest = hashlib.sha256()
         for batch in (self.training, self.held_out):
@@ -112,7 +112,7 @@ class Task:
 
 @dataclass(eq=False)
 class _Progress:
-    """Where training stands between two epochs."""
+    """State of a training between two epochs."""
 
     epoch: int = 0
     rate_scale: float = 1.0
@@ -138,13 +138,13 @@ class Trainer:
         self.first: float | None = None
         with waiting("compiling, once on a machine", progress):
             task.warm_up()
-        # Before anything is trained: a controller that no checkpoint can hold is known now and not at the first save.
+        # Before training, so that a controller that cannot be stored raises now and not at the first save.
         self.fingerprint = "" if task.checkpoint is None else task.fingerprint()
         if resume:
             self._restore()
 
     def run(self, progress: bool) -> Training:
-        """The epochs that are left."""
+        """Runs the remaining epochs."""
         stopped: Stop = "epochs"
         mark = self._mark()
         began, before = time.perf_counter(), self.at.seconds
@@ -166,7 +166,7 @@ class Trainer:
         self.at.seconds = before + time.perf_counter() - began
         try:
             self._save()
-        except KeyboardInterrupt:  # the file holds the epoch it held before, and the result is still given
+        except KeyboardInterrupt:  # the file keeps its previous epoch, and the result is returned all the same
             stopped = "interrupted"
         return self._result(stopped)
 
@@ -175,7 +175,7 @@ class Trainer:
         return f"training, cost {history[-1]:.4g} from {history[0]:.4g}" if history else "training"
 
     def _epoch(self) -> None:
-        """One step of the optimiser, or a retreat to the best parameters."""
+        """One step of the optimiser, or a return to the best parameters."""
         at, task = self.at, self.task
         for group in self.optimiser.param_groups:
             group["lr"] = at.rate_scale * scheduled_rate(task.optimiser, task.learning_rate, at.epoch, task.epochs)
@@ -183,7 +183,7 @@ class Trainer:
         try:
             self.optimiser.step(self._closure)
             sound = True
-        except _NotFinite:  # at these parameters, or where a line search looked
+        except _NotFinite:  # at these parameters, or within a line search
             sound = False
         at.epoch += 1
         stepped = [p.detach().clone() for p in self.parameters]
@@ -196,7 +196,7 @@ class Trainer:
             self._set(stepped)
 
     def _has_risen(self, value: float) -> bool:
-        """Whether "adam-backtracking" goes back from this cost."""
+        """Whether "adam-backtracking" rejects this cost."""
         lowest = self.at.history[self.at.best_epoch]
         return self.task.optimiser == "adam-backtracking" and lowest is not None and value - lowest > RISE * abs(lowest)
 
@@ -213,9 +213,9 @@ class Trainer:
         return value
 
     def _note(self, row: int, value: float) -> None:
-        """Write the cost of the present parameters down, and keep them when they are the best so far."""
+        """Record the cost of the present parameters, and keep them if they are the best so far."""
         at, task = self.at, self.task
-        del at.history[row:], at.held_out[row:]  # the last of a training that had ended and goes on
+        del at.history[row:], at.held_out[row:]  # the final row of a training that had ended and is resumed
         at.history.append(value if math.isfinite(value) else None)
         score = value
         if task.held_out is not None:
@@ -225,21 +225,21 @@ class Trainer:
         if not at.best and not math.isfinite(score):
             which = "training" if task.held_out is None or not math.isfinite(value) else "held-out"
             raise SimulationDiverged(
-                f"the {which} motions left the finite numbers before anything was trained; take a shorter period or"
-                " plant step, starts nearer to the reference, or softer gains."
+                f"the {which} motions diverge before any training; take a shorter period or plant step, starts nearer"
+                " to the reference, or lower gains."
             )
         if score < at.best_score:
             at.best_score, at.best_epoch = score, len(at.history) - 1
             at.best = {k: x.detach().clone() for k, x in task.controller.state_dict().items()}
 
     def _retreat(self) -> None:
-        """Back to the best parameters with half the step."""
+        """Return to the best parameters with half the step."""
         self.at.rate_scale *= 0.5
         self.task.controller.load_state_dict(self.at.best)
         self.optimiser = self._fresh()
 
     def _mark(self) -> tuple[_Progress, list[torch.Tensor], Any, dict[str, torch.Tensor]]:
-        """Where training stands, as `_go_back` takes it: Ctrl-C may come in the middle of a step."""
+        """State of the training for `_go_back`, since Ctrl-C may come in the middle of a step."""
         tensors: dict[str, torch.Tensor] = {}
         state = packed_state(self.optimiser.state_dict(), tensors)
         at = replace(self.at, history=[*self.at.history], held_out=[*self.at.held_out])
@@ -281,14 +281,12 @@ class Trainer:
     def _restore(self) -> None:
         path = self.task.checkpoint
         if path is None:
-            raise ArgumentError(
-                "resume was asked for without a checkpoint; give the file of the training to go on with."
-            )
+            raise ArgumentError("resume was given without a checkpoint; give the file of the training to resume.")
         law = self.task.controller
         saved, state = read_checkpoint(path, law.dynamics.robot if isinstance(law, ModelLaw) else None)
         if state is None or state.facts["fingerprint"] != self.fingerprint:
             raise ArgumentError(
-                f"{path} is not a checkpoint of this training; give the settings it was begun with, or start afresh."
+                f"{path} is not a checkpoint of this training; give its original settings, or start a new training."
             )
         self.task.controller.load_state_dict(saved.state_dict())
         facts = dict(state.facts)
@@ -299,4 +297,4 @@ class Trainer:
 
 
 class _NotFinite(ArithmeticError):
-    """A cost that is not a number: the motions left the finite numbers."""
+    """A cost or gradient that is not finite, because the motions diverged."""

@@ -1,0 +1,43 @@
+"""What the studies share: records as CSV and JSON, spreads over the seeds, tasks on all cores, the noise."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.plain import plain
+from nbs_pin.base.progress import tracked
+from nbs_pin.identification.measurement import Noise
+from nbs_pin.kernels.threads import cores
+from nbs_pin.reports.markdown import short
+
+NOISE = Noise(encoder=2.0**-16, torque=0.5)
+"""Noise of the sensors: encoder resolution [turn] and torque [N·m]."""
+
+
+def write_records(path: Path, records: Sequence[Any]) -> list[dict[str, Any]]:
+    """Write named tuples of one class to a CSV file; returns them as JSON can store them."""
+    write_csv(path, records[0]._fields, records)
+    return [plain(record._asdict()) for record in records]
+
+
+def spread(values: Sequence[float] | np.ndarray, form: Callable[[float], str] = short) -> str:
+    """The least, **median** and greatest value, or the only one."""
+    if len(values) == 1:
+        return form(float(values[0]))
+    low, middle, high = (form(float(of(values))) for of in (np.min, np.median, np.max))
+    return f"{low} – **{middle}** – {high}"
+
+
+def on_all_cores(
+    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], label: str, progress: bool
+) -> Iterator[Any]:
+    """function(*task) of every task in order, each in a process on one thread, with a progress bar."""
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        pool = joblib.Parallel(n_jobs=min(cores(), len(tasks)), return_as="generator")
+        results = iter(pool(joblib.delayed(function)(*task) for task in tasks))
+        for _ in tracked(tasks, label, progress):
+            yield next(results)
