@@ -4,8 +4,8 @@
     python tools/mutants.py --count 20 --seed 3 --show
 
 Each mutant is one edit of one expression: a sign flipped, a term dropped, arguments swapped, a bound or an index moved.
-The tests named for its file run in a copy of the tree until one fails. A mutant that survives is in `EQUIVALENT`, with the
-reason why no test can tell it from the original, or it is a gap in the tests; with any gap the exit code is 1.
+The tests named for its file run in a copy of the tree until one fails. A mutant that survives is in `EQUIVALENT`, with
+the reason why no test can tell it from the original, or it is a gap in the tests; with any gap the exit code is 1.
 """
 
 import argparse

@@ -49,7 +49,7 @@ def whole(total: float, part: float, total_name: str, part_name: str) -> int:
     ratio = total / part
     if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-9):
         raise ArgumentError(
-            f"{total_name} {total:g} s is {ratio:.6g} times the {part_name} {part:g} s, expected a whole number; "
+            f"{total_name} {total:.12g} s is {ratio:.12g} times the {part_name} {part:g} s, expected a whole number; "
             f"take for instance {max(1, round(ratio)) * part:.12g} s for the {total_name}."
         )
     return round(ratio)
