@@ -1,6 +1,7 @@
 """Documentation is read by tests: citations, links, examples and docstrings."""
 
 import ast
+import doctest
 import inspect
 import re
 from importlib import import_module
@@ -111,6 +112,21 @@ def test_the_readmes_python_runs(tmp_path, monkeypatch):
     namespace = {"__name__": "readme"}
     for number, block in enumerate(blocks, 1):
         exec(compile(block, f"README.md, block {number}", "exec"), namespace)
+
+
+EXAMPLES = sorted(file for file in ROOT.glob("nbs_pin/**/*.py") if ">>> " in file.read_text())
+
+
+@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
+def test_the_example_of_a_docstring_runs_and_prints_what_it_says(file, tmp_path, monkeypatch):
+    """Docstring by docstring, each in a namespace of its own."""
+    monkeypatch.chdir(tmp_path)
+    module = import_module(".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"))
+    found = [test for test in doctest.DocTestFinder().find(module, globs={}) if test.examples]
+    assert found
+    for test in found:
+        outcome = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test)
+        assert outcome.failed == 0, f"{test.name}: see the output above"
 
 
 def assigned_docstrings(module: str) -> set[str]:

@@ -181,6 +181,25 @@ def test_seed_makes_the_weights_and_nothing_else_does():
     assert first.terms(z, z)[0] == second.terms(z, z)[0] != other.terms(z, z)[0]
 
 
+def test_initial_weights_of_the_potential_are_those_of_the_theory():
+    """U(−0.1, 0.2) (docs/theory.md §8)."""
+    network = Potential(np.eye(4), widths=(40, 40), seed=1).network
+    weights = np.concatenate([p.numpy(force=True).ravel() for p in network.parameters()])
+    assert weights.min() == pytest.approx(-0.1, rel=0.05)
+    assert weights.max() == pytest.approx(0.2, rel=0.05)
+
+
+@given(seed=st.integers(0, 2**31), radius=st.floats(0.01, 3.0), scale=st.floats(0.1, 10.0))
+@settings(max_examples=30, deadline=None)
+def test_for_one_joint_the_range_of_damping_holds_all_its_values(seed, radius, scale):
+    damping = Damping(1, floor=np.array([[1.0]]), scale=np.array([scale]), seed=seed)
+    z = np.linspace(-radius, radius, 501)[:, None]
+    more, found = damping.matrix(z)[:, 0, 0] - 1.0, damping.excess(radius)
+    assert found.low <= more.min() <= more.max() <= found.high
+    plain = Damping(1, floor=np.array([[1.0]]), seed=seed).excess(scale * radius)
+    assert found.high == pytest.approx(scale**2 * plain.high, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

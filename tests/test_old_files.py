@@ -28,6 +28,17 @@ def test_a_controller_gives_its_torques(name):
         np.testing.assert_allclose(torques(form), EXPECTED[f"law {name}"], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("form", ["smooth", "paper"])
+def test_a_seed_gives_the_networks_it_gave(form):
+    old = nbs.load(OLD / ("nbs.nbs" if form == "smooth" else "nbs-paper.nbs"))
+    new = nbs.NeuralBackstepping.for_robot(
+        nbs.load_robot("two_link"), potential=form, damping="bounded" if form == "smooth" else "paper", seed=3
+    )
+    for name, weights in old.named_parameters():
+        if ".w" in name:
+            assert weights.equal(new.get_parameter(name)), name
+
+
 @pytest.mark.parametrize("name", [key.removeprefix("model ") for key in EXPECTED if key.startswith("model ")])
 def test_a_model_gives_its_torques_and_inertias(name):
     model, (q, v, w, a, _) = nbs.load(OLD / f"{name}.nbs"), STATES

@@ -3,6 +3,7 @@
 import math
 import re
 import warnings
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ from hypothesis import given, settings, strategies as st
 
 import nbs_pin as nbs
 from nbs_pin.base.checks import whole
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.benchmarks.serial_chains import serial_chain
+from nbs_pin.certificates import one_joint as one_joint_bounds
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.margins import effort_margin, position_margin, sampled_control
+from nbs_pin.certificates.margins import check_box, effort_margin, position_margin, sampled_control
 from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.gains import check_sampling, pd_gains, warn_if_too_fast
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -37,7 +39,7 @@ def warned(call) -> str:
 
 
 def refused(call) -> str:
-    with pytest.raises(ArgumentError) as caught:
+    with pytest.raises((ArgumentError, CertificateRefused)) as caught:
         call()
     return str(caught.value)
 
@@ -143,6 +145,35 @@ def test_room_to_a_stop_is_measured_at_both_ends(side, joint):
         assert condition.name.startswith(f"room of {robot.joint_names[joint]} ")
         assert condition.left == pytest.approx(gap)
         assert (condition.right, condition.holds) == (error, holds)
+
+
+@given(low=st.floats(-2.0, 0.9), size=st.floats(0.0, 0.5), joint=st.integers(0, 2))
+@settings(max_examples=30, deadline=None)
+def test_the_excess_over_a_box_that_is_told_is_what_the_box_lacks(low, size, joint):
+    positions = np.zeros((5, 3))
+    positions[3, joint] = 1.0
+    high = np.full(3, 10.0)
+    high[joint] = low
+    message = refused(lambda: check_box(positions, -high - 9.0, high, error=size))
+    assert f"at joint {joint + 1} " in message
+    lacking = told(message, f"at joint {joint + 1} by")
+    for share, holds in ((1.01, True), (0.99, False)):
+        high[joint] = low + share * lacking
+        if holds:
+            assert check_box(positions, -high - 9.0, high, error=size).value >= 0.0
+        else:
+            refused(lambda: check_box(positions, -high - 9.0, high, error=size))
+
+
+def test_a_bound_of_one_joint_starts_from_a_speed_that_is_rounded_up(monkeypatch):
+    """½Mv² ≥ V in exact arithmetic, where v comes from √(2V/M)."""
+    asked = []
+    monkeypatch.setattr(one_joint_bounds, "worst_error", lambda *arguments: asked.append(arguments) or math.inf)
+    law = one_joint(2.0, 3.0, 0.5)
+    for disturbance in np.random.default_rng(0).uniform(0.1, 1.0, 20):
+        certificate = nbs.certify(law, disturbance)
+        loop, *_, within = asked[-1]
+        assert Fraction(within.z2) ** 2 * Fraction(loop.inertia) / 2 >= Fraction(certificate.storage)
 
 
 @pytest.mark.parametrize("norm", [False, True])
