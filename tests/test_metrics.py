@@ -103,6 +103,15 @@ def test_saturation_is_read_from_the_command_and_from_a_time_on():
     assert metrics.saturated_fraction(run, after=1.0) == 0.0
 
 
+def test_a_period_that_ends_at_the_given_time_does_not_count_whatever_the_rounding_of_times():
+    assert any(k * PERIOD > k / 100 for k in range(1000))
+    for k in range(1, 1000):
+        command = np.zeros((1001, 2))
+        command[:k] = 9.0
+        run = make_run(decay(), np.clip(command, -2.0, 5.0), command=command, limit=(2.0, 5.0))
+        assert metrics.saturated_fraction(run, after=k / 100) == 0.0
+
+
 def test_a_batch_gives_what_its_starts_give_alone():
     rng = np.random.default_rng(0)
     z1 = np.stack([decay(rate, start) for rate in (0.2, 1.0) for start in (0.5, 1.0, 2.0)], axis=1).reshape(
