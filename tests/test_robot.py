@@ -48,6 +48,15 @@ def test_limits_beyond_a_turn_are_sampled_as_they_are():
     assert (lower < upper).all()
 
 
+def test_distinct_configurations_span_one_turn_at_most():
+    robot = load_robot("kinova")
+    (lower, upper), (low, high) = robot.sampling_range, robot.one_turn_range
+    np.testing.assert_allclose(high - low, np.minimum(upper - lower, 2.0 * np.pi))
+    np.testing.assert_allclose(low + high, lower + upper, atol=1e-12)
+    within = (upper - lower) < 2.0 * np.pi
+    np.testing.assert_array_equal(low[within], lower[within])
+
+
 @pytest.mark.parametrize("limit", [3.0, np.inf, [5.0, np.inf], np.array([1.0, 2.0])])
 def test_other_effort_limits_make_the_same_arm(limit):
     robot = load_robot("two_link")

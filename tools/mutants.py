@@ -98,6 +98,10 @@ EQUIVALENT: dict[tuple[str, str], str] = {
         "controllers/part_claims",
         "size, slope, _ = phi.terms((zero) - (1.0), zero)",
     ): "any state other than 0 gives the size of Φ that rounding at 0 is measured by",
+    (
+        "motions/disturbances",
+        "interval = (math).ceil(t / self.period + 1e-9)  # t = k·period may be rounded into the interval before",
+    ): "numbers the intervals from one; the random numbers of each are as good",
 }
 """(file, mutated line) of mutants that no test can find, and why."""
 
