@@ -48,8 +48,9 @@ def test_limits_beyond_a_turn_are_sampled_as_they_are():
     assert (lower < upper).all()
 
 
-def test_distinct_configurations_span_one_turn_at_most():
-    robot = load_robot("kinova")
+@pytest.mark.parametrize("name", ["kinova", "ur5"])
+def test_distinct_configurations_span_one_turn_at_most(name):
+    robot = load_robot(name)
     (lower, upper), (low, high) = robot.sampling_range, robot.one_turn_range
     np.testing.assert_allclose(high - low, np.minimum(upper - lower, 2.0 * np.pi))
     np.testing.assert_allclose(low + high, lower + upper, atol=1e-12)
