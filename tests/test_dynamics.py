@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nbs_pin.base.arrays import matvec
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.dynamics import equations
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.chain import Chain
@@ -270,3 +270,13 @@ def test_a_provider_called_directly_checks_its_arguments():
     dynamics = PinocchioDynamics(load_robot("ur5"))
     with pytest.raises(ArgumentError, match=r"q has shape \(5,\), expected \(\.\.\., 6\)"):
         dynamics.gravity(np.zeros(5))
+
+
+def test_a_model_that_is_no_longer_its_arms_is_refused():
+    robot = load_robot("panda")
+    dynamics = PinocchioDynamics(robot)
+    assert dynamics.structure_claims() is not None
+    dynamics._model = robot.model.copy()
+    dynamics._model.armature = np.full(robot.nv, 0.1)
+    with pytest.raises(CertificateRefused, match="the model is no longer that of the arm panda"):
+        dynamics.structure_claims()

@@ -13,6 +13,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.rounding import down, largest_eigenvalue, least_eigenvalue, up
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
+from nbs_pin.dynamics.structure import rigid_tree_claims
 from nbs_pin.inertia import multipliers
 from nbs_pin.inertia.bounds import (
     determinant_bound,
@@ -179,6 +180,27 @@ def test_lever_arms_are_those_of_the_poses():
         arms = [np.cross(frame.rotation[:, 2], point - frame.translation) for frame in list(data.oMi)[1:]]
         found = max(found, float(weights @ np.sum(np.square(arms), axis=1)))
     assert found <= claimed <= 1.25 * found
+
+
+@pytest.mark.parametrize("angle", np.linspace(0.0, np.pi / 24.0, 7))
+def test_lever_arms_reach_between_the_corners_of_their_polygons(angle):
+    """Of two parallel axes a distance 1 apart, a point 1 beyond the second is at most 2 from the first."""
+    model = pin.Model()
+    for i, place in enumerate((np.zeros(3), np.array([np.cos(angle), np.sin(angle), 0.0]))):
+        model.addJoint(i, pin.JointModelRZ(), pin.SE3(np.eye(3), place), f"joint{i}")
+        model.appendBodyToJoint(i + 1, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0])))
+    claimed = float(lever_arms(RigidTree.of(pack_model(model)), np.array([1.0, 0.0]))[-1](np.array([1.0, 0.0, 0.0])))
+    assert 4.0 <= claimed <= 1.1 * 4.0
+
+
+def test_a_rotor_alone_is_an_inertia():
+    """A body without inertia about its own axis leaves M̂ ≻ 0 to its rotor."""
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), "joint")
+    model.appendBodyToJoint(1, pin.Inertia(1.0, np.array([0.0, 0.0, 0.2]), np.zeros((3, 3))), pin.SE3.Identity())
+    assert rigid_tree_claims(pack_model(model)) is None
+    model.armature = np.array([0.3])
+    assert rigid_tree_claims(pack_model(model)).positive.value == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("kinds", ["rrrr", "rprp", "pprr"])

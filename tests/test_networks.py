@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.intervals import Interval
 from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
 from nbs_pin.controllers.convex import FICNN
 from nbs_pin.controllers.damping import Damping
@@ -47,6 +48,16 @@ def test_activation_derivatives_by_finite_differences(activation):
     assert (slope >= 0.0).all()
     assert (curvature >= 0.0).all()
     assert (np.diff(value) >= 0.0).all()
+
+
+@pytest.mark.parametrize("activation", [SmoothedReLU(0.3), Squareplus(0.7)])
+def test_the_range_of_a_curvature_holds_all_its_values(activation):
+    low, size = np.random.default_rng(0).uniform([[-1.0], [0.0]], [[0.5], [0.6]], (2, 500))
+    found = activation.curvature_range(Interval(low, low + size))
+    values = activation.derivatives(low + np.linspace(0.0, 1.0, 101)[:, None] * size)[2]
+    assert (found.low <= values.min(axis=0) + 1e-12).all()
+    assert (values.max(axis=0) <= found.high + 1e-12).all()
+    assert (found.high <= activation.derivatives(np.linspace(-2.0, 2.0, 4001))[2].max() + 1e-12).all()
 
 
 def test_smoothed_relu_is_the_paper_one():
