@@ -63,14 +63,7 @@ class Browser:
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()
-
     def close(self):
-        """Ends the browser and forgets its profile."""
         self._process.terminate()
         self._process.wait(20)
         os.close(self._in)
@@ -101,7 +94,6 @@ class Browser:
             if time.monotonic() > end:
                 raise RuntimeError(f"the page did not come up: {self.complaints()}")
             time.sleep(0.05)
-        return self
 
     def evaluate(self, expression):
         """The value of a JavaScript expression, promises awaited."""
@@ -110,13 +102,9 @@ class Browser:
             raise RuntimeError(f"{expression}: {answer['exceptionDetails']}")
         return answer["result"].get("value")
 
-    def drawn(self):
-        """Waits until two more pictures were drawn."""
-        self.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(0))))")
-
     def screenshot(self):
-        """The page as PNG bytes."""
-        self.drawn()
+        """The page as PNG bytes, two pictures on."""
+        self.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(0))))")
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
     def click(self, selector):

@@ -1,7 +1,11 @@
 """In the contract tests every call into the package checks its array shapes, as they are annotated."""
 
+import os
+
 import pytest
 from jaxtyping import config, install_import_hook
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch's threads wait for each other beside those of other workers
 
 CONTRACTS = {"test_dynamics", "test_controllers", "test_compiled", "test_plants", "test_networks", "test_lyapunov_laws"}
 """Test files that execute the annotations; elsewhere the checks would take more time than the tests."""

@@ -15,9 +15,13 @@ from nbs_pin.base.claims import Claim, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.certificates import one_joint
 from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.attack import worst_of
 from nbs_pin.certificates.claims import Condition
 from nbs_pin.certificates.comparison_system import _STEEPNESS, ComparisonSystem, _growth, decay, level, reach
+from nbs_pin.certificates.torque_waves import random_disturbances
 from nbs_pin.controllers.gains import gains_for_robot
+from nbs_pin.dynamics.registry import make_network
+from tests.test_run_files import SIGNALS
 
 POSITIVE = st.floats(0.05, 20.0)
 CONSTANTS = st.builds(
@@ -233,9 +237,6 @@ def test_the_bound_grows_in_proportion_to_the_disturbance():
 
 def test_no_random_disturbance_breaks_a_bound():
     """Two arms, both kinds of damping; the thousand of each arm are `nbs-pin reproduce --part certificates`."""
-    from nbs_pin.certificates.attack import worst_of
-    from nbs_pin.certificates.torque_waves import random_disturbances
-
     for name, damping in (("two_link", "inertial"), ("two_link", "bounded"), ("three_link", "bounded")):
         robot = nbs.load_robot(name)
         law = nbs.NeuralBackstepping.for_robot(robot, damping=damping, seed=3)
@@ -272,14 +273,8 @@ def test_what_follows_is_known_no_better_than_what_it_rests_on():
     robot = nbs.load_robot("two_link")
     paper = nbs.certify(nbs.paper_controller(nbs.PinocchioDynamics(robot), m=1.0), 1.0)
     assert paper.label is Label.EMPIRICAL
-    learned = nbs.LagrangianDynamics(nbs_network(robot), robot)
+    learned = nbs.LagrangianDynamics(make_network("cholesky", [False] * robot.nv, seed=0), robot)
     assert nbs.certify(nbs.NeuralBackstepping.for_robot(robot, learned), 1.0).label is Label.EMPIRICAL
-
-
-def nbs_network(robot):
-    from nbs_pin.dynamics.registry import make_network
-
-    return make_network("cholesky", [False] * robot.nv, seed=0)
 
 
 def test_theorem_4_for_a_model_of_other_masses():
@@ -298,11 +293,8 @@ def test_theorem_4_for_a_model_of_other_masses():
     assert theorem.holds
     assert theorem.left < 1.0
     assert np.linalg.norm(run.q[-1] - run.q_ref[-1], axis=-1).max() <= certificate.error
-    few = mismatch(belief, truth, dataclasses.replace(run, **{f: getattr(run, f)[:, :1] for f in PER_START}))
+    few = mismatch(belief, truth, dataclasses.replace(run, **{f: getattr(run, f)[:, :1] for f in SIGNALS}))
     assert nbs.certify(law, np.zeros(2), reference=reference, duration=0.3, mismatch=few).label is Label.EMPIRICAL
-
-
-PER_START = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
 
 
 def test_a_closed_form_of_other_masses_is_no_proof():
@@ -330,34 +322,31 @@ def test_the_overshoot_grows_from_the_bound_at_rest():
     assert certificate.from_start(4.0 * certificate.potential)[0] == far[0]
 
 
-def test_a_start_beyond_what_the_joints_can_do_proves_nothing():
+@pytest.mark.parametrize("name", ["kinova", "panda"])
+def test_a_start_beyond_what_the_joints_can_do_proves_nothing(name):
     """Errors that wrap, and joints that meet their stops."""
-    kinova, panda = nbs.load_robot("kinova"), nbs.load_robot("panda")
-    for robot, away in ((kinova, 2.5), (panda, 2.5)):
-        law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Hold(nbs.Sinusoid.for_robot(robot)(0.0).q)
-        near, far = (
-            nbs.certify(law, np.full(robot.nv, 0.01), reference=motion, q0=motion(0.0).q + x) for x in (1e-4, away)
-        )
-        assert near.label is Label.PROVED
-        assert near.overshoot[0] < far.overshoot[0]
-        assert far.label is Label.EMPIRICAL
-        assert far.void
+    robot = nbs.load_robot(name)
+    law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Hold(nbs.Sinusoid.for_robot(robot)(0.0).q)
+    starts = (motion(0.0).q + away for away in (1e-4, 2.5))
+    near, far = (nbs.certify(law, np.full(robot.nv, 0.01), reference=motion, q0=q0) for q0 in starts)
+    assert near.label is Label.PROVED
+    assert near.overshoot[0] < far.overshoot[0]
+    assert far.label is Label.EMPIRICAL
+    assert far.void
 
 
-def test_a_reference_that_leaves_the_limits_is_refused():
-    robot = nbs.load_robot("panda")
-    law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid(np.full(7, 3.0), 1.0)
-    with pytest.raises(CertificateRefused, match="with its error leaves the joint limits"):
-        nbs.certify(law, 1.0, reference=motion)
-
-
-def test_limits_that_do_not_hold_take_the_proof_away():
-    robot = nbs.load_robot("two_link")
-    law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot, 1.0)
-    assert nbs.certify(law, 1.0, reference=motion).label is Label.PROVED
-    strong = nbs.certify(law, np.full(2, 1e4), reference=motion)
-    assert strong.label is Label.EMPIRICAL
-    assert any("effort limit" in name for name in strong.void)
+@pytest.mark.parametrize(
+    ("name", "sizes", "speed", "condition"),
+    [("two_link", (1.0, 1e4), 1.0, "effort limit"), ("kinova", (0.1, 1e3), None, "continuous")],
+)
+def test_a_disturbance_that_breaks_a_condition_takes_the_proof_away(name, sizes, speed, condition):
+    """Torques beyond the effort limits, and errors beyond half a turn of a continuous joint."""
+    robot = nbs.load_robot(name)
+    law, motion = nbs.NeuralBackstepping.for_robot(robot), speed and nbs.Sinusoid.for_robot(robot, speed)
+    fine, wild = (nbs.certify(law, np.full(robot.nv, size), reference=motion) for size in sizes)
+    assert fine.label is Label.PROVED
+    assert wild.label is Label.EMPIRICAL
+    assert any(condition in name for name in wild.void)
 
 
 def test_a_disturbance_is_bounded_in_one_way():
@@ -375,32 +364,22 @@ def test_a_model_too_wrong_for_theorem_4_is_refused_with_both_sides():
         nbs.certify(law, 1.0, reference=reference, mismatch=wrong)
 
 
-def test_errors_beyond_half_a_turn_of_a_continuous_joint_prove_nothing():
-    robot = nbs.load_robot("kinova")
-    law = nbs.NeuralBackstepping.for_robot(robot)
-    fine, wild = nbs.certify(law, np.full(robot.nv, 0.1)), nbs.certify(law, np.full(robot.nv, 1e3))
-    assert fine.label is Label.PROVED
-    assert wild.label is Label.EMPIRICAL
-    assert not next(c for c in wild.conditions if "continuous" in c.name).holds
-
-
 def test_arguments_that_do_not_fit_are_refused():
     robot = nbs.load_robot("two_link")
     law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot, 1.0)
     for wrong in (-1.0, np.nan, np.array([1.0]), np.ones(3), np.array([1.0, np.inf]), "five", 1e200, 1e-200):
         with pytest.raises(ArgumentError, match="disturbance"):
             nbs.certify(law, wrong)
-    with pytest.raises(ArgumentError, match="give the reference too"):
-        nbs.certify(law, 1.0, q0=np.zeros(2))
-    with pytest.raises(ArgumentError, match="v0 was given without q0"):
-        nbs.certify(law, 1.0, reference=reference, v0=np.zeros(2))
-    with pytest.raises(ArgumentError, match="period"):
-        nbs.certify(law, 1.0, period=0.0)
-    for q0 in (np.zeros(3), np.zeros((4, 2)), np.array([0.0, np.nan])):
-        with pytest.raises(ArgumentError, match="q0 is"):
-            nbs.certify(law, 1.0, reference=reference, q0=q0)
-    with pytest.raises(ArgumentError, match="give its own arm"):
-        nbs.certify(law, 1.0, robot=nbs.load_robot("ur5"))
+    starts = (np.zeros(3), np.zeros((4, 2)), np.array([0.0, np.nan]))
+    for wrong, words in (
+        ({"q0": np.zeros(2)}, "give the reference too"),
+        ({"reference": reference, "v0": np.zeros(2)}, "v0 was given without q0"),
+        ({"period": 0.0}, "period"),
+        *(({"reference": reference, "q0": q0}, "q0 is") for q0 in starts),
+        ({"robot": nbs.load_robot("ur5")}, "give its own arm"),
+    ):
+        with pytest.raises(ArgumentError, match=words):
+            nbs.certify(law, 1.0, **wrong)
     with pytest.raises(CertificateRefused):
         nbs.certify(nbs.PD.for_robot(robot), 1.0)
 

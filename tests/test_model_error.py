@@ -22,6 +22,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.excitation import configuration_box
 from nbs_pin.reports import error_charts
 from tests.test_plotting import drawn, png_size
+from tests.test_run_files import SIGNALS
 
 ARM = nbs.load_robot("three_link")
 TRUTH = nbs.PinocchioDynamics(ARM)
@@ -61,12 +62,17 @@ def perturbed(name="three_link", size=0.05, seed=0):
     return nbs.PinocchioDynamics(dataclasses.replace(robot, model=model))
 
 
-def closed_loop(model, truth, starts, *, seed=0, duration=0.5):
+def closed_loop(model, truth, starts, *, seed=0, duration=0.5, friction=None):
     """Computed torque on the model, the truth as plant, from random starts."""
-    law = nbs.ComputedTorque(model, kp=100.0, kd=20.0)
+    law, plant = nbs.ComputedTorque(model, kp=100.0, kd=20.0), nbs.DynamicsPlant(truth, friction=friction)
     away = np.random.default_rng(seed).uniform(-0.3, 0.3, (starts, truth.nv))
     reference = nbs.Sinusoid(np.full(truth.nv, 0.5), 2.0)
-    return nbs.simulate(nbs.DynamicsPlant(truth), law, reference, duration, 0.01, q0=away, effort_limit=np.inf)
+    return nbs.simulate(plant, law, reference, duration, 0.01, q0=away, effort_limit=np.inf)
+
+
+def chosen(run, starts):
+    """The run of these starts of a batch alone, or of the only one without a batch."""
+    return dataclasses.replace(run, **{name: getattr(run, name)[:, starts] for name in SIGNALS})
 
 
 # Errors over the box.
@@ -82,12 +88,6 @@ def test_the_truth_has_no_error(truth):
     np.testing.assert_array_equal(found.motion.drift, found.motion.floor)
     assert found.torque_nmse == 0.0
     assert not found.torque_rms.any()
-
-
-def test_two_engines_agree():
-    found = compare(TWO, nbs.PinocchioDynamics(nbs.load_robot("two_link", gravity=9.8)), samples=200)
-    assert max(found.errors) < 1e-11
-    assert abs(found.scale.factor - 1.0) < 1e-12
 
 
 def test_relative_errors_are_frobenius_ones_over_the_samples():
@@ -209,22 +209,17 @@ def test_energy_strays_by_the_work_of_the_torque_the_model_forgets():
     model = Altered(TRUTH, gravity=lambda q: -TRUTH.gravity(q))
     q, v, _ = Box.of_robot(ARM, 3, 2.0).states(np.random.default_rng(0), 4)
     motion = free_motion(model, TRUTH, q, v, duration=0.4)
-    states = [(q, v)]
-    plant = nbs.DynamicsPlant(model)
-    for _ in range(100):
-        states.append(plant.step(*states[-1], np.zeros_like(q), 0.004))
-    potential = np.array([TRUTH.potential_energy(q) for q, _ in states])
-    scale = free_scale(q, v, 100)
+    potential = np.array([TRUTH.potential_energy(q) for q, _ in free_states(model, q, v)])
+    scale = np.max([nbs.kinetic_energy(TRUTH, q, v) for q, v in free_states(TRUTH, q, v)], axis=0)
     np.testing.assert_allclose(motion.drift, np.abs(potential - potential[0]) / scale, atol=1e-6)
     assert motion.drift.max() > 0.1
 
 
-def free_scale(q, v, steps):
-    plant, kinetic = nbs.DynamicsPlant(TRUTH), []
-    for _ in range(steps + 1):
-        kinetic.append(nbs.kinetic_energy(TRUTH, q, v))
-        q, v = plant.step(q, v, np.zeros_like(q), 0.004)
-    return np.max(kinetic, axis=0)
+def free_states(model, q, v):
+    states, plant = [(q, v)], nbs.DynamicsPlant(model)
+    for _ in range(100):
+        states.append(plant.step(*states[-1], np.zeros_like(q), 0.004))
+    return states
 
 
 def test_the_floor_is_the_integrator():
@@ -305,41 +300,31 @@ def test_the_chance_is_the_binomial_tail(trajectories, chance):
         assert epsilon <= chance < mismatch.violation_chance(trajectories - 1)
 
 
-def test_too_few_trajectories_say_nothing(run):
+def test_too_few_trajectories_say_nothing():
     assert [mismatch.violation_chance(n) for n in (1, 2, 3)] == [1.0, 1.0, 1.0]
-    one = nbs.Run(**{**vars(run), **{k: getattr(run, k)[:, 0] for k in (
-        "q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")}})  # fmt: skip
-    found = mismatch.mismatch(perturbed(), TRUTH, one)
-    assert (found.violation, found.trajectories) == (1.0, 1)
 
 
 def test_copies_of_a_start_count_once(run):
-    def copied(columns):
-        names = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
-        return dataclasses.replace(run, **{name: getattr(run, name)[:, columns] for name in names})
-
-    model = perturbed()
-    found, twice, one = (
-        mismatch.mismatch(model, TRUTH, copied(columns))
-        for columns in (np.arange(12), np.tile(np.arange(12), 2), np.zeros(374, dtype=int))
+    found, twice, one, alone = (
+        mismatch.mismatch(perturbed(), TRUTH, chosen(run, starts))
+        for starts in (np.arange(12), np.tile(np.arange(12), 2), np.zeros(374, dtype=int), 0)
     )
-    assert (found.trajectories, twice.trajectories, one.trajectories) == (12, 12, 1)
+    assert (found.trajectories, twice.trajectories, one.trajectories, alone.trajectories) == (12, 12, 1, 1)
     assert twice.violation == found.violation < 1.0
-    assert one.violation == 1.0
+    assert one.violation == alone.violation == 1.0
     assert (twice.a, twice.b, twice.c) == pytest.approx((found.a, found.b, found.c))
 
 
 def test_friction_of_the_plant_is_no_error_of_the_model():
     friction = nbs.JointFriction(np.array([0.8, 0.5, 0.3]), np.array([0.4, 0.3, 0.2]), 0.1)
-    plant, model = nbs.DynamicsPlant(TRUTH, friction=friction), perturbed()
-    law, away = nbs.ComputedTorque(model, kp=100.0, kd=20.0), np.random.default_rng(0).uniform(-0.3, 0.3, (5, 3))
-    run = nbs.simulate(plant, law, nbs.Sinusoid(np.full(3, 0.5), 2.0), 0.3, 0.01, q0=away, effort_limit=np.inf)
+    model = perturbed()
+    run = closed_loop(model, TRUTH, 5, duration=0.3, friction=friction)
     told, untold = (compare(model, TRUTH, 20, run=run, motions=0, friction=x) for x in (friction, None))
     np.testing.assert_array_equal(told.mismatch.rms, mismatch.mismatch(model, TRUTH, run, friction=friction).rms)
     assert (np.abs(told.mismatch.rms / untold.mismatch.rms - 1.0) > 0.01).any()
     states = [x[:-1].reshape(-1, 3) for x in (run.q, run.v)]
     a = mismatch.accelerations(TRUTH, run, friction).reshape(-1, 3)
-    assert told.along_run.inverse == pytest.approx(judge(model, TRUTH, *states, a).errors.inverse)
+    assert told.along_run == pytest.approx(judge(model, TRUTH, *states, a).errors)
     assert untold.along_run.inverse != pytest.approx(told.along_run.inverse)
 
 
@@ -367,30 +352,21 @@ def test_fresh_closed_loops_keep_the_bound_as_often_as_promised():
     assert 0.0 < outside.mean() <= fitted.violation < 0.1
 
 
-def test_errors_along_a_run_are_those_of_its_states(run):
-    model = perturbed()
-    found = compare(model, TRUTH, samples=50, run=run, motions=0).along_run
-    q, v = (x[:-1].reshape(-1, 3) for x in (run.q, run.v))
-    assert found.gravity == pytest.approx(judge(model, TRUTH, q, v, 0.0 * q).errors.gravity)
-    assert found.mass_matrix == pytest.approx(judge(model, TRUTH, q, v, 0.0 * q).errors.mass_matrix)
-
-
 # Maps.
 
 
 def test_a_cell_of_the_map_is_the_error_there():
     box, model = Box.of_robot(ARM, 3, 2.0), perturbed()
     heat = error_map(model, TRUTH, box, (2, 1), points=6, draws=3, seed=4)
-    q, v, a = box.states(np.random.default_rng(4), 3)
+    q, v, _ = box.states(np.random.default_rng(4), 3)
     q[:, 2], q[:, 1] = heat.x[4], heat.y[1]
-    whole = judge(model, TRUTH, *everywhere(box, heat)).each
     here = matvec(model.coriolis_matrix(q, v), v) - matvec(TRUTH.coriolis_matrix(q, v), v)
-    states = everywhere(box, heat)
-    size = np.linalg.norm(matvec(TRUTH.coriolis_matrix(states[0], states[1]), states[1]), axis=1)
+    q, v, a = everywhere(box, heat)
+    size = np.linalg.norm(matvec(TRUTH.coriolis_matrix(q, v), v), axis=1)
     expected = np.sqrt(np.mean(np.sum(here**2, axis=1))) / np.sqrt(np.mean(size**2))
     assert heat.errors.coriolis[1, 4] == pytest.approx(expected)
+    whole = judge(model, TRUTH, q, v, a).each
     assert np.sqrt(np.mean(heat.errors.gravity**2)) == pytest.approx(np.sqrt(np.mean(whole.gravity**2)))
-    assert a.shape == (3, 3)
 
 
 def everywhere(box, heat):

@@ -1,11 +1,7 @@
 """The studies of learned models: what they judge by is right, and the page says what the files hold."""
 
 import csv
-import json
-import math
-import subprocess
-import sys
-from pathlib import Path
+from itertools import product
 
 import numpy as np
 import pytest
@@ -14,12 +10,12 @@ from nbs_pin.accuracy.compare import compare
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.identification.collect import collect
-from nbs_pin.reports.markdown import Section
 from nbs_pin.reproduction import model_study
 from nbs_pin.reproduction.inverse_mlp import fit_mlp
 from nbs_pin.reproduction.model_noise import Noisy, _medians, _ranking, _ratios, friction_of, noise_section
 from nbs_pin.reproduction.model_structure import structure_section
 from nbs_pin.reproduction.model_trials import MLP, SPEED, Judge, Trial, attempt, chosen, column
+from nbs_pin.reproduction.paper import _one_thread
 from nbs_pin.robots.robot import load_robot
 from tests.test_plotting import png_size
 
@@ -35,6 +31,7 @@ SMALL = model_study.Scale(
     structure_samples=(100, 200),
     structures={"chain": {}, "cholesky": {"widths": (4,), "iterations": 2}},
 )
+MODELS, RECIPES = ("chain", "identified"), ("uniform", "excited")
 
 
 @pytest.fixture(scope="module")
@@ -53,20 +50,17 @@ def rough(arm):
     return Judge.of(arm, friction_of(arm), 200)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    with _one_thread():
+        yield
+
+
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """Folder and sections of a small study, made in a process of its own, where annotations are not executed."""
+    """Folder and sections of a small study."""
     folder = tmp_path_factory.mktemp("models")
-    code = f"""
-import json
-from pathlib import Path
-from nbs_pin.reproduction.model_study import reproduce_models
-from tests.test_model_study import SMALL
-print(json.dumps(reproduce_models(Path({str(folder)!r}), seed=3, scale=SMALL)))
-"""
-    root = Path(__file__).parent.parent
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root).stdout
-    return folder, [Section(*section) for section in json.loads(said)]
+    return folder, model_study.reproduce_models(folder, seed=3, scale=SMALL)
 
 
 def rows(path):
@@ -166,14 +160,6 @@ def test_a_model_with_friction_is_judged_with_it(arm, rough):
     assert with_it.mass_matrix < 1e-3
 
 
-def test_a_plain_network_has_no_inertia(arm, judge):
-    data = collect(arm, "uniform", 200, seed=0)
-    trial = attempt(MLP, data, 0, arm, judge, steps=2, widths=(4,))
-    assert math.isnan(trial.mass_matrix)
-    assert trial.torque_excited > 0.0
-    assert trial.seconds > 0.0
-
-
 # The page.
 
 
@@ -194,15 +180,15 @@ def test_the_study_writes_its_files_and_says_what_they_hold(small):
 def test_the_study_has_every_model_seed_and_size(small):
     folder, _ = small
     clean, noise, structure = (rows(folder / f"models_{name}.csv") for name in ("clean", "noise", "structure"))
-    assert {(r["model"], r["data"], r["seed"]) for r in clean} == {
-        (m, d, s) for m in ("chain", "identified") for d in ("uniform", "excited") for s in "34"
-    }
-    assert {(r["model"], r["samples"], r["seed"]) for r in noise} == {
-        (m, n, s) for m in ("chain", "identified", "mlp") for n in ("150", "300") for s in "3"
-    }
-    assert {(r["model"], r["samples"], r["seed"]) for r in structure} == {
-        (m, n, s) for m in ("chain", "cholesky") for n in ("100", "200") for s in "34"
-    }
+    assert {(r["model"], r["data"], r["seed"]) for r in clean} == set(product(MODELS, RECIPES, "34"))
+    assert {(r["model"], r["samples"], r["seed"]) for r in noise} == set(product([*MODELS, MLP], ("150", "300"), "3"))
+    assert {(r["model"], r["samples"], r["seed"]) for r in structure} == set(
+        product(("chain", "cholesky"), ("100", "200"), "34")
+    )
+    for row in noise:
+        assert (row["mass_matrix"] == "nan") == (row["model"] == MLP)  # a plain network has no inertia
+        assert float(row["torque_excited"]) > 0.0
+        assert float(row["seconds"]) > 0.0
 
 
 def test_clean_data_give_the_arm(small):

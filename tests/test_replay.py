@@ -4,6 +4,8 @@ import json
 import re
 import struct
 import warnings
+from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -14,10 +16,8 @@ from nbs_pin.base.records import Run
 from nbs_pin.reports.replay import body_poses, replay
 from nbs_pin.robots.meshes import MeshError, find_mesh, read_mesh
 from nbs_pin.robots.robot import load_robot
-from nbs_pin.robots.visuals import STEEL, Mimic, Transmission, link_visuals, read_couplings, tip
+from nbs_pin.robots.visuals import STEEL, Transmission, link_visuals, read_couplings, tip
 from tests.browser import Browser, find_chromium
-
-needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium: install it or set $CHROMIUM")
 
 BARE = """<robot name="bare"><link name="base"/>
   <link name="a&lt;/script>"><inertial><origin xyz="0 0 .2"/><mass value="1"/>
@@ -32,7 +32,7 @@ BARE = """<robot name="bare"><link name="base"/>
 
 def bare_robot(folder, visual="", more=""):
     path = folder / "bare.urdf"
-    path.write_text(BARE.format(visual=visual, more=more).replace("{{data}}", "{{data}}"))
+    path.write_text(BARE.format(visual=visual, more=more))
     return load_robot(path)
 
 
@@ -73,7 +73,9 @@ def tip_link(robot):
 
 @pytest.fixture(scope="module")
 def browser():
-    with Browser(640, 480) as page:
+    if find_chromium() is None:
+        pytest.skip("no Chromium: install it or set $CHROMIUM")
+    with closing(Browser(640, 480)) as page:
         yield page
 
 
@@ -85,7 +87,6 @@ def save(run, folder, **options):
 
 
 @pytest.mark.browser
-@needs_chromium
 @pytest.mark.parametrize("name", ["two_link", "panda", "bare"])
 def test_links_are_where_the_run_says_at_any_time(name, browser, tmp_path):
     robot = bare_robot(tmp_path) if name == "bare" else load_robot(name)
@@ -105,7 +106,6 @@ def test_links_are_where_the_run_says_at_any_time(name, browser, tmp_path):
 
 
 @pytest.mark.browser
-@needs_chromium
 def test_pictures_differ_in_time_and_show_the_arm(browser, tmp_path):
     browser.open(save(moving_run(load_robot("two_link")), tmp_path), "#t=0")
     early = browser.screenshot()
@@ -117,7 +117,6 @@ def test_pictures_differ_in_time_and_show_the_arm(browser, tmp_path):
 
 
 @pytest.mark.browser
-@needs_chromium
 def test_play_pause_and_scrub(browser, tmp_path):
     browser.open(save(moving_run(load_robot("two_link"), t0=1.0), tmp_path))
     assert browser.evaluate("replay.playing")
@@ -147,7 +146,6 @@ def test_play_pause_and_scrub(browser, tmp_path):
 
 
 @pytest.mark.browser
-@needs_chromium
 def test_names_are_shown_as_they_are_and_nothing_is_fetched_or_complained_about(browser, tmp_path):
     robot = bare_robot(tmp_path)
     browser.open(save(moving_run(robot), tmp_path), "#t=1")
@@ -163,7 +161,6 @@ def test_names_are_shown_as_they_are_and_nothing_is_fetched_or_complained_about(
 
 
 @pytest.mark.browser
-@needs_chromium
 def test_readout_is_the_error_of_the_run(browser, tmp_path):
     robot = load_robot("two_link")
     run = moving_run(robot)
@@ -180,10 +177,8 @@ def test_readout_is_the_error_of_the_run(browser, tmp_path):
 def test_page_is_self_contained_and_small(tmp_path):
     text = save(moving_run(load_robot("panda")), tmp_path).read_text()
     assert len(text) < 12e6
-    licence = re.search(r'<script type="text/plain" id="licence">.*?</script>', text, re.S)[
-        0
-    ]  # names its authors' pages
-    addresses = set(re.findall(r"https?://[^\s\"'<>)]+", text.replace(licence, "")))
+    text = re.sub(r'<script type="text/plain" id="licence">.*?</script>', "", text, count=1, flags=re.S)
+    addresses = set(re.findall(r"https?://[^\s\"'<>)]+", text))
     assert addresses <= {"http://www.w3.org/1999/xhtml"}, addresses
     assert not re.search(r"<(script|img|iframe|link)[^>]+(src|href)=\"(?!data:)", text)
     assert "default-src 'none'" in text
@@ -213,11 +208,11 @@ def test_the_chosen_start_of_a_batch_is_shown(tmp_path):
     ],
 )
 def test_runs_that_cannot_be_shown_are_refused_and_leave_the_file_alone(change, message, tmp_path):
-    page = save(moving_run(load_robot("two_link")), tmp_path)
-    before = page.read_bytes()
     run = moving_run(load_robot("two_link"))
+    page = save(run, tmp_path)
+    before = page.read_bytes()
     with pytest.raises(ArgumentError, match=message):
-        save(Run(**{**vars(run), **change}), tmp_path)
+        save(replace(run, **change), tmp_path)
     assert page.read_bytes() == before
 
 
@@ -236,7 +231,7 @@ def test_an_arm_without_a_name_is_shown(tmp_path):
 
 def test_a_given_robot_needs_no_name_in_the_run(tmp_path):
     robot = load_robot("two_link")
-    run = Run(**{**vars(moving_run(robot)), "robot": "", "robot_sha256": ""})
+    run = replace(moving_run(robot), robot="", robot_sha256="")
     assert save(run, tmp_path, robot=robot).is_file()
 
 
@@ -314,6 +309,7 @@ endsolid x
         ("package://other/../../outside.stl", STL, "leaves the robot's folder"),
         ("file:///etc/outside.stl", None, "leaves the robot's folder"),
         ("http://example.org/a.stl", None, "not a file on this machine"),
+        ("package://file:///etc/a.stl", None, "not a file"),
         ("mesh.ply", STL, "unknown kind"),
         ("broken.dae", b"<COLLADA", "cannot be read"),
         ("lying.stl", bytes(80) + struct.pack("<I", 4_000_000_000) + bytes(50), "mesh"),
@@ -340,18 +336,8 @@ def test_u22_meshes_stay_inside_their_roots(tmp_path):
     (folder / "link.stl").symlink_to(tmp_path / "outside.stl")
     urdf = folder / "x.urdf"
     assert find_mesh("a.STL", urdf) == find_mesh("package://pkg/a.STL", urdf) == (folder / "a.STL").resolve()
-    for uri in (
-        "../outside.stl",
-        "package://../outside.stl",
-        "link.stl",
-        "file:///etc/a.stl",
-        f"{tmp_path}/outside.stl",
-    ):
+    for uri in ("package://../outside.stl", "link.stl", f"{tmp_path}/outside.stl"):
         with pytest.raises(MeshError, match="leaves the robot's folder"):
-            find_mesh(uri, urdf)
-    refused = {"http://x/a.stl": "not a file on", "package://file:///etc/a.stl": "not a file", "a.exe": "unknown kind"}
-    for uri, words in {**refused, "gone.stl": "not found"}.items():
-        with pytest.raises(MeshError, match=words):
             find_mesh(uri, urdf)
 
 
@@ -386,7 +372,6 @@ def test_couplings_are_what_the_urdf_states(tmp_path):
     assert couplings.mimics == ()
     talos = read_couplings(load_robot("talos_left_arm")).mimics
     assert all(mimic.source == "gripper_left_joint" and abs(mimic.multiplier) == 1.0 for mimic in talos)
-    assert all(isinstance(mimic, Mimic) for mimic in talos)
 
 
 def test_no_arm_of_the_catalogue_draws_with_a_warning():

@@ -3,8 +3,6 @@
 import csv
 import json
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from nbs_pin.commands import reproduce
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.motions.references import paper_reference
 from nbs_pin.reports.markdown import Section, page, short
-from nbs_pin.reproduction import paper
+from nbs_pin.reproduction import paper, paper_alpha
 from nbs_pin.reproduction.authors import PERIOD, AuthorsLaw, follow_authors, train_authors
 from nbs_pin.reproduction.paper_alpha import LARGEST_INERTIA, corrected_bound, regulariser, swept_controller
 from nbs_pin.reproduction.paper_table import COLUMNS, PRINTED, Row
@@ -29,43 +27,33 @@ SMALL = paper.Scale(seeds=2, epochs=3, alphas=4, duration=5.0)
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """Folder and sections of a small reproduction."""
+    """Folder and sections of a small reproduction; waves of half a minute reach as far as those of a whole one."""
     folder = tmp_path_factory.mktemp("reproduced")
-    return folder, paper.reproduce_paper(folder, seed=0, scale=SMALL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_alpha, "SQUARE_DURATION", 30.0)
+        return folder, paper.reproduce_paper(folder, seed=0, scale=SMALL)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+    with paper._one_thread():
+        yield
 
 
 # The paper's program.
 
 
 def test_seed_3_of_the_papers_program_gives_the_papers_digits():
-    """Table I, rows 2 and 3; in a process of its own, where annotations are not executed at every step."""
-    code = """
-import torch
-from nbs_pin import metrics
-from nbs_pin.reproduction.authors import AuthorsLaw, follow_authors, train_authors
-torch.set_num_threads(1)
-law = AuthorsLaw([3])
-before = follow_authors(law, 100.0)
-train_authors(law)
-after = follow_authors(law, 2.0)
-print(metrics.steady_error(before, shift=1)[0], metrics.steady_error(before)[0])
-for run in before, after:
-    print(metrics.convergence_time(run, shift=1)[0], metrics.peak_torque(run)[0])
-"""
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    steady, aligned, untrained, low, trained, high = (float(x) for x in said.split())
-    assert steady == pytest.approx(1.30e-6, abs=0.005e-6)
-    assert aligned < 0.1e-6
-    assert (untrained, trained) == pytest.approx((5.72, 0.13), abs=0.005)
-    assert low < 50.0 < 800.0 < high < 1000.0
+    """Table I, rows 2 and 3."""
+    law = AuthorsLaw([3])
+    before = follow_authors(law, 100.0)
+    train_authors(law)
+    after = follow_authors(law, 2.0)
+    assert metrics.steady_error(before, shift=1)[0] == pytest.approx(1.30e-6, abs=0.005e-6)
+    assert metrics.steady_error(before)[0] < 0.1e-6
+    times = [metrics.convergence_time(run, shift=1)[0] for run in (before, after)]
+    assert times == pytest.approx([5.72, 0.13], abs=0.005)
+    assert metrics.peak_torque(before)[0] < 50.0 < 800.0 < metrics.peak_torque(after)[0] < 1000.0
 
 
 def unrolled_cost(law, torque):
@@ -84,7 +72,7 @@ def unrolled_cost(law, torque):
     return cost
 
 
-def test_the_programs_gradient_is_that_of_its_chain_of_operations(one_thread):
+def test_the_programs_gradient_is_that_of_its_chain_of_operations():
     law, twin = AuthorsLaw([0, 5], m=0.3), AuthorsLaw([0, 5], m=0.3)
     train_authors(law, epochs=1, torque=[1.0, 1.0])
     unrolled_cost(twin, [1.0, 1.0]).backward()
@@ -93,7 +81,7 @@ def test_the_programs_gradient_is_that_of_its_chain_of_operations(one_thread):
     assert law.weights["x1"].grad.abs().max() > 1e-3
 
 
-def test_seeds_side_by_side_are_each_alone(one_thread):
+def test_seeds_side_by_side_are_each_alone():
     both, alone = AuthorsLaw([1, 2]), AuthorsLaw([2])
     for law in (both, alone):
         train_authors(law, epochs=3)
@@ -163,10 +151,8 @@ def test_every_row_is_on_the_page_with_the_numbers_of_the_files(small):
     assert len(rows) == 9
     with (folder / "table1.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
-    table = [x for x in text.splitlines() if x.startswith("| ") and not x.startswith("| **")][
-        2:
-    ]  # below head and ruler
-    for row, cells in zip(rows, (x.split(" | ") for x in table), strict=True):
+    _, _, *table = [x.split(" | ") for x in text.splitlines() if x.startswith("| ") and not x.startswith("| **")]
+    for row, cells in zip(rows, table, strict=True):
         own = [line for line in lines if (line["row"], line["how"]) == (row["row"], row["how"])]
         assert [int(line["seed"]) for line in own if line["seed"]] == row["seeds"]
         assert cells[0] == f"| {row['how']}"

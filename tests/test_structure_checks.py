@@ -1,7 +1,8 @@
 """Structure is read from the object, not believed: every broken controller and model is caught, no sound one is."""
 
-import copy
 import re
+from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,8 @@ from tests.test_networks import randomise
 ROBOT, OTHER = load_robot("three_link"), load_robot("two_link")
 GANTRY = Path(__file__).parent / "data" / "gantry.urdf"
 SEEDS = range(3)
+TURNING = [False] * 3
+"""Whether the joints of `ROBOT` slide."""
 
 
 def law(form="smooth", **settings) -> NeuralBackstepping:
@@ -64,12 +67,24 @@ def believing(dynamics) -> NeuralBackstepping:
     return by_hand(0, dynamics=dynamics)
 
 
+def learned_by(network) -> NeuralBackstepping:
+    return believing(LagrangianDynamics(network))
+
+
 def with_tensor(module, name, change):
     """The module with one parameter or buffer changed in place."""
     with torch.no_grad():
         tensor = module.get_parameter(name) if name in dict(module.named_parameters()) else module.get_buffer(name)
         tensor.copy_(change(tensor))
     return module
+
+
+def with_attribute(owner, name, value):
+    """The object with one attribute, by its dotted name, replaced even if it is frozen."""
+    *path, last = name.split(".")
+    part = reduce(getattr, path, owner)
+    (setattr if isinstance(part, torch.nn.Module) else object.__setattr__)(part, last, value)
+    return owner
 
 
 def labels(controller) -> set[Label]:
@@ -81,8 +96,7 @@ def labels(controller) -> set[Label]:
 
 def negative_weight(seed):
     """W^(y) of either sign reaches the network as it is."""
-    broken = law("paper", seed=seed)
-    broken.potential.network._nonnegative = lambda weight: weight
+    broken = with_attribute(law("paper", seed=seed), "potential.network._nonnegative", lambda weight: weight)
     return with_tensor(broken, f"potential.network.wy{1 + seed % 3}", lambda w: w - 0.1)
 
 
@@ -94,40 +108,23 @@ def biased_paper(seed):
     return with_tensor(broken, "potential.network.b2", lambda b: abs(b) + 0.1)
 
 
-def squareplus_paper(seed):
-    return by_hand(seed, potential=Potential(np.eye(3), form="paper", activation=Squareplus(0.1 + seed), seed=seed))
-
-
-def smooth_called_paper(seed):
-    broken = law(seed=seed)
-    broken.potential.form = "paper"
-    return broken
-
-
-def unknown_form(seed):
-    broken = law(seed=seed)
-    (broken.potential, broken.damping)[seed % 2].form = "Paper"
-    return broken
-
-
 def asymmetric(seed):
-    def change(s):
-        s = s.clone()
-        s[0, 1 + seed % 2] += 0.01
-        return s
+    name = ("potential.stiffness", "damping.floor")[seed % 2] + ".nominal"
+    return with_tensor(law(seed=seed), name, lambda s: s + 0.01 * torch.ones(3, 3).triu(1 + seed % 2))
 
-    return with_tensor(law(seed=seed), ("potential.stiffness", "damping.floor")[seed % 2] + ".nominal", change)
+
+def stiffness(matrix, seed):
+    return with_tensor(law(seed=seed), "potential.stiffness.nominal", lambda s: torch.from_numpy(matrix))
 
 
 def indefinite_stiffness(seed):
     root = np.random.default_rng(seed).normal(size=(3, 3))
-    matrix = root + root.T - 3.0 * np.eye(3)
-    return with_tensor(law(seed=seed), "potential.stiffness.nominal", lambda s: torch.from_numpy(matrix))
+    return stiffness(root + root.T - 3.0 * np.eye(3), seed)
 
 
 def singular_stiffness(seed):
     root = np.random.default_rng(seed).normal(size=(3, 2))
-    return with_tensor(law(seed=seed), "potential.stiffness.nominal", lambda s: torch.from_numpy(root @ root.T))
+    return stiffness(root @ root.T, seed)
 
 
 def not_a_number(seed):
@@ -173,15 +170,11 @@ EXPONENTIAL = Shape(lambda x: 2.0**x, lambda x: np.log(2.0) * 2.0**x, lambda x: 
 LEAKY = Shape(lambda x: 0.5 * (x + (x * x + 1.0) ** 0.5), lambda x: 0.5 + 0.0 * x, lambda x: 0.0 * x)
 
 
-def bad_activation(seed, activation=None):
-    chosen = (ARTANH, SQUARE, RELU, SWISH, EXPONENTIAL, LEAKY)[seed] if activation is None else activation
-    return by_hand(seed, potential=Potential(np.eye(3), widths=(8, 8), activation=chosen, seed=seed))
+UNSOUND = (ARTANH, SQUARE, RELU, SWISH, EXPONENTIAL, LEAKY)
 
 
-def negative_width(seed):
-    broken = law("paper", seed=seed)
-    object.__setattr__(broken.potential.network.activation, "d", (-0.01, 0.0, np.nan)[seed])
-    return broken
+def activated(activation, seed=0):
+    return by_hand(seed, potential=Potential(np.eye(3), widths=(8, 8), activation=activation, seed=seed))
 
 
 def negative_scale(seed):
@@ -189,61 +182,17 @@ def negative_scale(seed):
     return with_tensor(law(seed=seed), f"{part}.scale", lambda r: r * torch.tensor([1.0, -1.0, 0.0]))
 
 
-def negative_floor(seed):
-    return with_tensor(law(seed=seed), "damping.floor.nominal", lambda d: (-1.0, 0.0, -1e-6)[seed] * d)
-
-
-def no_floor(seed):
-    broken = law(seed=seed)
-    broken.damping.floor = None
-    return broken
-
-
-def paper_damping(seed):
-    return by_hand(seed, damping=Damping(3, form="paper", m=(0.001, 0.1, 1.0)[seed], seed=seed))
-
-
-def paper_damping_without_m(seed):
-    broken = paper_damping(seed)
-    broken.damping.m = (0.0, -1.0, np.nan)[seed]
-    return broken
-
-
 def negative_rate(seed):
     return with_tensor(law(seed=seed), "rate.nominal", lambda x: x * torch.tensor([1.0, (-1.0, 0.0, -1e-9)[seed], 1.0]))
 
 
-def bad_omega(seed):
-    broken = law(seed=seed)
-    broken.inertial_rate = (-1.0, np.nan, np.inf)[seed]
-    return broken
+def paper_damping(seed, m):
+    return by_hand(seed, damping=Damping(3, form="paper", m=m, seed=seed))
 
 
 def bad_share(seed):
     gain = ("rate", "potential.stiffness", "damping.floor")[seed]
     return with_tensor(law(seed=seed), f"{gain}.least_share", lambda s: 0.0 * s + (1.0, -0.5, 1.5)[seed])
-
-
-def another_arms_parts(seed):
-    broken = law(seed=seed)
-    if seed == 0:
-        broken.dynamics = PinocchioDynamics(OTHER)
-    elif seed == 1:
-        broken.potential = Potential(np.eye(2))
-    else:
-        broken.damping = Damping(2, floor=np.eye(2))
-    return broken
-
-
-def another_kind_of_part(seed):
-    broken = law(seed=seed)
-    if seed == 0:
-        broken.potential = torch.nn.Linear(3, 1).double()
-    elif seed == 1:
-        broken.rate = torch.nn.Identity()
-    else:
-        broken.inertial_rate = np.array([1.0, 2.0, 3.0])
-    return broken
 
 
 def another_law(seed):
@@ -258,28 +207,19 @@ def another_law(seed):
     )[seed]
 
 
-class Harder(NeuralBackstepping):
-    """Pushes away."""
+def with_torque(extra):
+    """A law that adds a torque of its own, extra(law, errors, q)."""
 
-    def torque(self, q, v, q_ref, v_ref, a_ref):
-        e = self.errors(q, v, q_ref, v_ref, a_ref)
-        return super().torque(q, v, q_ref, v_ref, a_ref) + 2.0 * self.damping.force(e.z2)
+    class Other(NeuralBackstepping):
+        def torque(self, q, *rest):
+            return super().torque(q, *rest) + extra(self, self.errors(q, *rest), q)
 
-
-class WithoutGravity(NeuralBackstepping):
-    def torque(self, q, v, q_ref, v_ref, a_ref):
-        return super().torque(q, v, q_ref, v_ref, a_ref) - self.dynamics.gravity(q)
+    return Other
 
 
-class Softer(NeuralBackstepping):
-    """Adds dissipation: sound, but not by structure."""
-
-    def torque(self, q, v, q_ref, v_ref, a_ref):
-        return super().torque(q, v, q_ref, v_ref, a_ref) - self.errors(q, v, q_ref, v_ref, a_ref).z2
-
-
-def another_torque(seed):
-    return by_hand(seed, kind=(Harder, WithoutGravity, Softer)[seed])
+PUSHING_AWAY = with_torque(lambda law, e, q: 2.0 * law.damping.force(e.z2))
+WITHOUT_GRAVITY = with_torque(lambda law, e, q: -law.dynamics.gravity(q))
+SOFTER = with_torque(lambda law, e, q: -e.z2)  # adds dissipation: sound, but not by structure
 
 
 def patched_torque(seed):
@@ -289,16 +229,13 @@ def patched_torque(seed):
     return broken
 
 
-class Concave(Potential):
-    def terms(self, z, dz):
-        value, gradient, product = super().terms(z, dz)
-        return -value, -gradient, -product
+class Scaled(Potential):
+    """Φ, ∇Φ and ∇²Φ dz, each times a factor."""
 
+    factors = (1.0, 1.0, 1.0)
 
-class WrongHessian(Potential):
     def terms(self, z, dz):
-        value, gradient, product = super().terms(z, dz)
-        return value, gradient, 0.5 * product
+        return tuple(factor * x for factor, x in zip(self.factors, super().terms(z, dz), strict=True))
 
 
 class Dented(FICNN):
@@ -309,7 +246,8 @@ class Dented(FICNN):
 
 def another_potential(seed):
     if seed < 2:
-        return by_hand(seed, potential=(Concave, WrongHessian)[seed](np.eye(3)))
+        factors = ((-1.0, -1.0, -1.0), (1.0, 1.0, 0.5))[seed]
+        return by_hand(seed, potential=with_attribute(Scaled(np.eye(3)), "factors", factors))
     broken = by_hand(seed)
     broken.potential.network.__class__ = Dented
     return broken
@@ -335,10 +273,6 @@ class SameDamping(Damping):
         return super().force(z)
 
 
-def another_damping(seed):
-    return by_hand(seed, damping=(Driving, Indefinite, SameDamping)[seed](3, floor=np.eye(3)))
-
-
 class Stribeck(JointFriction):
     def torque(self, v):
         return super().torque(v) * np.exp(-abs(v))
@@ -348,8 +282,7 @@ def bad_friction(seed):
     if seed == 2:
         return by_hand(0, friction=Stribeck(np.ones(3), np.ones(3)))
     friction = JointFriction(np.ones(3), np.ones(3))
-    object.__setattr__(friction, ("viscous", "coulomb")[seed], -np.ones(3))
-    return by_hand(seed, friction=friction)
+    return by_hand(seed, friction=with_attribute(friction, ("viscous", "coulomb")[seed], -np.ones(3)))
 
 
 # Broken models.
@@ -357,20 +290,12 @@ def bad_friction(seed):
 
 def no_floor_in_mass(seed):
     """ε at or below zero in each family."""
-    network = (CholeskyNetwork([False] * 3), HomogenisedPicnn([False] * 3), Chain(ROBOT.parents, ROBOT.prismatic))[seed]
+    network = (CholeskyNetwork(TURNING), HomogenisedPicnn(TURNING), Chain(ROBOT.parents, ROBOT.prismatic))[seed]
     if seed == 2:
         network.epsilon = -1e-3
     else:
         with_tensor(network, "scales.epsilon", lambda e: (0.0, -1.0)[seed] * e)
-    return believing(LagrangianDynamics(network))
-
-
-def not_quadratic(seed):
-    return believing(LagrangianDynamics(PaperPicnn([False] * 3, widths=(8, 8), seed=seed)))
-
-
-def unstructured(seed):
-    return believing(LagrangianDynamics(UnconstrainedLagrangian([False] * 3, widths=(8, 8), seed=seed)))
+    return learned_by(network)
 
 
 class Ungated(PICNN):
@@ -380,10 +305,10 @@ class Ungated(PICNN):
 
 def no_gate(seed):
     """The gate of the paper's network as the paper prints it, not clipped at 0."""
-    network = HomogenisedPicnn([False] * 3, widths=(16, 16), seed=seed)
+    network = HomogenisedPicnn(TURNING, widths=(16, 16), seed=seed)
     network.convex.__class__ = Ungated
     randomise(network, seed, gain=6.0)
-    return believing(LagrangianDynamics(network))
+    return learned_by(network)
 
 
 class PaperCoriolis(PinocchioDynamics):
@@ -404,13 +329,8 @@ class Tilted(PinocchioDynamics):
         return super().reference_torque(q, v, v_r, a_r) + 0.1
 
 
-def another_model(seed):
-    return believing((PaperCoriolis, Hollow, Tilted)[seed](ROBOT))
-
-
 def impossible_body(seed):
-    robot = copy.copy(ROBOT)
-    object.__setattr__(robot, "model", ROBOT.model.copy())
+    robot = replace(ROBOT, model=ROBOT.model.copy())
     if seed == 0:
         robot.model.inertias[2].mass = -1.0
     elif seed == 1:
@@ -422,11 +342,7 @@ def impossible_body(seed):
 
 def stale_code(seed):
     """Weights changed behind the back of the machine code made from them."""
-    network = (
-        CholeskyNetwork([False] * 3),
-        Chain(ROBOT.parents, ROBOT.prismatic),
-        Chain(ROBOT.parents, ROBOT.prismatic, seed=1),
-    )[seed]
+    network = CholeskyNetwork(TURNING) if seed == 2 else Chain(ROBOT.parents, ROBOT.prismatic, seed=seed)
     model = LagrangianDynamics(network)
     model.reference_torque(*np.ones((4, 3)))
     model.packed_tree()
@@ -438,80 +354,107 @@ def stale_code(seed):
 def another_arm(seed):
     """A model that says it is of an arm and is of another."""
     if seed == 0:
-        model = PinocchioDynamics(ROBOT)
-        model._robot = load_robot("three_link", gravity=1.0)
-        return believing(model)
-    slides = [False, False, True]
-    network = Chain([0, 1, 1], [False] * 3) if seed == 1 else CholeskyNetwork(slides)
+        return believing(with_attribute(PinocchioDynamics(ROBOT), "_robot", load_robot("three_link", gravity=1.0)))
+    network = Chain([0, 1, 1], TURNING) if seed == 1 else CholeskyNetwork([False, False, True])
     return believing(LagrangianDynamics(network, robot=ROBOT))
 
 
 def residual_without_nominal(seed):
     model = ResidualDynamics(ResidualNetwork(PinocchioDynamics(ROBOT), widths=(8,)))
-    if seed == 2:
-        model.network.nominal = Hollow(ROBOT)
-    else:
-        model.network.share = (-0.1, 1.0)[seed]
-    return believing(model)
+    changes = (("network.share", -0.1), ("network.share", 1.0), ("network.nominal", Hollow(ROBOT)))
+    return believing(with_attribute(model, *changes[seed]))
 
 
 def other_closed_form(seed):
-    model = AnalyticDynamics()
-    if seed == 0:
-        model.masses = (1.0, -1.0)
-    elif seed == 1:
-        model._coupling = 3.0
-    else:
-        model.lengths = (2.0, 1.0)
+    changes = (("masses", (1.0, -1.0)), ("_coupling", 3.0), ("lengths", (2.0, 1.0)))
+    model = with_attribute(AnalyticDynamics(), *changes[seed])
     return NeuralBackstepping(model, Potential(np.eye(2)), Damping(2, floor=np.eye(2)))
 
 
+TWO_JOINTS = (
+    ("dynamics", PinocchioDynamics(OTHER)),
+    ("potential", Potential(np.eye(2))),
+    ("damping", Damping(2, floor=np.eye(2))),
+)
+OTHER_PARTS = (
+    ("potential", torch.nn.Linear(3, 1).double()),
+    ("rate", torch.nn.Identity()),
+    ("inertial_rate", np.array([1.0, 2.0, 3.0])),
+)
 BROKEN = {
-    negative_weight: r"W\^\(y\)",
-    biased_paper: r"Φ\(0\)",
-    squareplus_paper: r"Φ\(0\)",
-    smooth_called_paper: r"Φ\(0\)",
-    unknown_form: "form 'Paper'",
-    asymmetric: "not symmetric",
-    indefinite_stiffness: "stiffness S has the eigenvalue",
-    singular_stiffness: "stiffness S has the eigenvalue|not symmetric",
-    not_a_number: "not finite",
-    bad_activation: "activation Shape|Shape is an activation",
-    negative_width: "width",
-    negative_scale: "scale R",
-    negative_floor: "floor D₀ has the eigenvalue",
-    no_floor: "no floor",
-    paper_damping: "no floor",
-    paper_damping_without_m: "no floor D₀, and m is",
-    negative_rate: "rate Λ has the eigenvalue",
-    bad_omega: "ω is",
-    bad_share: "least share",
-    another_arms_parts: "joints and|is for",
-    another_kind_of_part: "of the controller is a|ω is",
-    another_law: "no Lyapunov function",
-    another_torque: "not the law that its parts describe|is not known",
-    patched_torque: "not the law that its parts describe|'torque' of this",
-    another_potential: "convex|∇²Φ dz",
-    another_damping: "D is not symmetric|SameDamping is not",
-    bad_friction: "falls with velocity",
-    no_floor_in_mass: "εI must be positive",
-    not_quadratic: "not quadratic",
-    unstructured: "UnconstrainedLagrangian",
-    no_gate: "not positive definite|Ungated",
-    another_model: "Ṁ − 2C is not skew|not positive definite|reference torque",
-    impossible_body: "body behind joint",
-    stale_code: "machine code|reference torque",
-    another_arm: "arm",
-    residual_without_nominal: "share κ|not positive definite",
-    other_closed_form: "two-link model",
+    "negative weight": (negative_weight, r"W\^\(y\)"),
+    "biased paper": (biased_paper, r"Φ\(0\)"),
+    "squareplus paper": (
+        lambda k: by_hand(k, potential=Potential(np.eye(3), form="paper", activation=Squareplus(0.1 + k), seed=k)),
+        r"Φ\(0\)",
+    ),
+    "smooth called paper": (lambda k: with_attribute(law(seed=k), "potential.form", "paper"), r"Φ\(0\)"),
+    "unknown form": (
+        lambda k: with_attribute(law(seed=k), ("potential.form", "damping.form")[k % 2], "Paper"),
+        "form 'Paper'",
+    ),
+    "asymmetric": (asymmetric, "not symmetric"),
+    "indefinite stiffness": (indefinite_stiffness, "stiffness S has the eigenvalue"),
+    "singular stiffness": (singular_stiffness, "stiffness S has the eigenvalue|not symmetric"),
+    "not a number": (not_a_number, "not finite"),
+    "bad activation": (lambda k: activated(UNSOUND[k], k), "activation Shape|Shape is an activation"),
+    "negative width": (
+        lambda k: with_attribute(law("paper", seed=k), "potential.network.activation.d", (-0.01, 0.0, np.nan)[k]),
+        "width",
+    ),
+    "negative scale": (negative_scale, "scale R"),
+    "negative floor": (
+        lambda k: with_tensor(law(seed=k), "damping.floor.nominal", lambda d: (-1.0, 0.0, -1e-6)[k] * d),
+        "floor D₀ has the eigenvalue",
+    ),
+    "no floor": (lambda k: with_attribute(law(seed=k), "damping.floor", None), "no floor"),
+    "paper damping": (lambda k: paper_damping(k, (0.001, 0.1, 1.0)[k]), "no floor"),
+    "paper damping without m": (
+        lambda k: with_attribute(paper_damping(k, 0.1), "damping.m", (0.0, -1.0, np.nan)[k]),
+        "no floor D₀, and m is",
+    ),
+    "negative rate": (negative_rate, "rate Λ has the eigenvalue"),
+    "bad omega": (lambda k: with_attribute(law(seed=k), "inertial_rate", (-1.0, np.nan, np.inf)[k]), "ω is"),
+    "bad share": (bad_share, "least share"),
+    "another arm's parts": (lambda k: with_attribute(law(seed=k), *TWO_JOINTS[k]), "joints and|is for"),
+    "another kind of part": (lambda k: with_attribute(law(seed=k), *OTHER_PARTS[k]), "of the controller is a|ω is"),
+    "another law": (another_law, "no Lyapunov function"),
+    "another torque": (
+        lambda k: by_hand(k, kind=(PUSHING_AWAY, WITHOUT_GRAVITY, SOFTER)[k]),
+        "not the law that its parts describe|is not known",
+    ),
+    "patched torque": (patched_torque, "not the law that its parts describe|'torque' of this"),
+    "another potential": (another_potential, "convex|∇²Φ dz"),
+    "another damping": (
+        lambda k: by_hand(k, damping=(Driving, Indefinite, SameDamping)[k](3, floor=np.eye(3))),
+        "D is not symmetric|SameDamping is not",
+    ),
+    "bad friction": (bad_friction, "falls with velocity"),
+    "no floor in the mass": (no_floor_in_mass, "εI must be positive"),
+    "not quadratic": (lambda k: learned_by(PaperPicnn(TURNING, widths=(8, 8), seed=k)), "not quadratic"),
+    "unstructured": (
+        lambda k: learned_by(UnconstrainedLagrangian(TURNING, widths=(8, 8), seed=k)),
+        "UnconstrainedLagrangian",
+    ),
+    "no gate": (no_gate, "not positive definite|Ungated"),
+    "another model": (
+        lambda k: believing((PaperCoriolis, Hollow, Tilted)[k](ROBOT)),
+        "Ṁ − 2C is not skew|not positive definite|reference torque",
+    ),
+    "impossible body": (impossible_body, "body behind joint"),
+    "stale code": (stale_code, "machine code|reference torque"),
+    "another arm": (another_arm, "arm"),
+    "residual without nominal": (residual_without_nominal, "share κ|not positive definite"),
+    "other closed form": (other_closed_form, "two-link model"),
 }
-MORE = {bad_activation: range(6), another_law: range(6)}
-CASES = [(kind, seed) for kind in BROKEN for seed in MORE.get(kind, SEEDS)]
+MORE = {"bad activation": range(6), "another law": range(6)}
+CASES = [(name, seed) for name in BROKEN for seed in MORE.get(name, SEEDS)]
 
 
-@pytest.mark.parametrize(("kind", "seed"), CASES, ids=[f"{kind.__name__}-{seed}" for kind, seed in CASES])
-def test_a_broken_controller_is_refused_or_labelled_down(kind, seed):
-    broken = kind(seed)
+@pytest.mark.parametrize(("name", "seed"), CASES)
+def test_a_broken_controller_is_refused_or_labelled_down(name, seed):
+    make, words = BROKEN[name]
+    broken = make(seed)
     try:
         claims = check_structure(broken).claims
     except CertificateRefused as error:
@@ -523,11 +466,7 @@ def test_a_broken_controller_is_refused_or_labelled_down(kind, seed):
         down = [claim.because for claim in claims if claim.label is Label.EMPIRICAL]
         assert down, "a broken controller is PROVED"
         said = " ".join(down)
-    assert re.search(BROKEN[kind], said), said
-
-
-def test_there_are_enough_broken_ones():
-    assert len(CASES) >= 60
+    assert re.search(words, said), said
 
 
 # Sound ones.
@@ -557,15 +496,14 @@ def test_a_trained_controller_is_proved_and_so_is_its_file(tmp_path):
 
 def learned(seed):
     """One model of every family that has a proof, with weights that nobody fitted."""
-    slides, nominal = [False] * 3, PinocchioDynamics(ROBOT)
     networks = [
-        CholeskyNetwork(slides, widths=(8, 8), seed=seed),
-        HomogenisedPicnn(slides, widths=(8, 8), seed=seed),
+        CholeskyNetwork(TURNING, widths=(8, 8), seed=seed),
+        HomogenisedPicnn(TURNING, widths=(8, 8), seed=seed),
         Chain(ROBOT.parents, ROBOT.prismatic, seed=seed),
     ]
     for network in networks[:2]:
         randomise(network, seed, gain=2.0)
-    residual = ResidualNetwork(nominal, widths=(8,), seed=seed)
+    residual = ResidualNetwork(PinocchioDynamics(ROBOT), widths=(8,), seed=seed)
     randomise(residual, seed)
     bodies = np.array([body.toDynamicParameters() for body in list(ROBOT.model.inertias)[1:]])
     identified = IdentifiedDynamics(ROBOT, (1.0 + seed) * bodies, rotor_inertia=0.1 * np.ones(3))
@@ -584,10 +522,10 @@ def test_a_sound_model_is_proved(family, seed):
 
 def test_closed_forms_and_unknown_activations():
     assert {claim.label for claim in check_model(AnalyticDynamics((2.0, 0.5), (0.7, 1.1)))} == {Label.PROVED}
-    softplus = Shape(lambda x: -(1.0 * (x < 0.0)) * 0.0 + _softplus(x), sigmoid, lambda x: sigmoid(x) * sigmoid(-x))
+    softplus = Shape(_softplus, sigmoid, lambda x: sigmoid(x) * sigmoid(-x))
     narrow = Shape(*(lambda x, i=i: SmoothedReLU(1e-5).derivatives(x - 0.7)[i] for i in range(3)))
     for activation in (softplus, narrow):
-        claims = check_structure(bad_activation(0, activation)).claims
+        claims = check_structure(activated(activation)).claims
         assert {claim.label for claim in claims} == {Label.PROVED, Label.EMPIRICAL}  # neither refused nor believed
 
 
