@@ -1,4 +1,4 @@
-# The public names and their rooms, for type checkers and editors; `__init__.py` imports each name at its first use.
+# The public names and the modules that define them; `__init__.py` imports each name at its first use.
 
 from .accuracy.compare import ModelErrors as ModelErrors, compare as compare
 from .base.exceptions import (
@@ -21,6 +21,8 @@ from .certificates.propose import Proposal as Proposal, propose as propose
 from .controllers.computed_torque import ComputedTorque as ComputedTorque
 from .controllers.controller import Controller as Controller, MemorylessController as MemorylessController
 from .controllers.damping import Damping as Damping
+from .controllers.lyapunov_law import LyapunovLaw as LyapunovLaw
+from .controllers.model_law import ModelLaw as ModelLaw
 from .controllers.neural_backstepping import (
     NeuralBackstepping as NeuralBackstepping,
     paper_controller as paper_controller,

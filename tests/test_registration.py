@@ -7,6 +7,7 @@ import pytest
 
 import nbs_pin as nbs
 from nbs_pin.base.claims import Label
+from nbs_pin.base.known_code import known_code
 from nbs_pin.base.registry import Entry, entry
 from nbs_pin.certificates.model_structure import check_model
 from nbs_pin.cli import main
@@ -36,6 +37,31 @@ def test_a_law_is_tracked_trained_saved_loaded_and_runs_as_it_is_written(law, tm
     assert main([*TRACK, "--controller", str(file), "--out", str(tmp_path / "c")]) == 0
     used = [json.loads((tmp_path / x / "summary.json").read_text())["settings"]["controller"] for x in "ac"]
     assert used == ["impedance", str(file)]
+
+
+@known_code
+class Offset(nbs.SlotineLi):
+    """A law whose author vouches for its code, and which inherits another's kernel."""
+
+    def torque(self, q, v, q_ref, v_ref, a_ref):
+        return super().torque(q, v, q_ref, v_ref, a_ref) + 100.0
+
+
+@known_code
+class Heavier(nbs.PinocchioDynamics):
+    """The same of a model."""
+
+    def gravity(self, q):
+        return super().gravity(q) + 100.0
+
+    def reference_torque(self, q, v, v_r, a_r):
+        return super().reference_torque(q, v, v_r, a_r) + 100.0
+
+
+@pytest.mark.parametrize("make", [Offset.for_robot, lambda arm: nbs.ComputedTorque.for_robot(arm, Heavier(arm))])
+def test_a_kernel_is_of_the_class_that_packs_for_it_and_of_no_subclass(make):
+    law, rows = make(nbs.load_robot("two_link")), np.random.default_rng(0).normal(size=(5, 2))
+    np.testing.assert_allclose(law.compile().torque(*rows), law.torque(*rows), rtol=1e-12)
 
 
 def test_certify_says_what_such_a_law_lacks(law, capsys):

@@ -1,7 +1,7 @@
-"""Registry of the classes whose code the proofs and the kernels rely on.
+"""Registry of the classes whose code the proofs rely on.
 
-A proof is about the code of one class, and a kernel reimplements it. Neither applies to a subclass, which may override
-a method, nor to an object with a replaced method.
+A proof is about the code of one class, and does not apply to a subclass, which may override a method, nor to an object
+with a replaced method.
 """
 
 from collections.abc import Iterable
@@ -13,14 +13,17 @@ _HOOKS = ("_forward_hooks", "_forward_pre_hooks")
 
 
 def known_code(cls: _Class) -> _Class:
-    """Class decorator: proofs and kernels may rely on the code of exactly this class."""
+    """Class decorator: proofs may rely on the code of exactly this class."""
     _KNOWN.add(cls)
     return cls
 
 
-def is_known(part: Any) -> bool:
-    """Whether the class of `part` is registered as known code."""
-    return type(part) in _KNOWN
+def defines(part: Any, method: str) -> bool:
+    """Whether exactly the class of `part` defines a method or property, as one that packs numbers for a kernel.
+
+    A subclass that inherits it may compute something else, so the kernel is not its own.
+    """
+    return method in vars(type(part))
 
 
 def foreign_code(part: Any) -> str:

@@ -1,1 +1,1 @@
-"""What laws, plants and training cost; laws compared."""
+"""Run times of laws, plants and training, and a comparison of tuned laws."""

@@ -9,7 +9,7 @@ import tyro
 
 from nbs_pin.cli.values import SAVED, choice, configuration, default, disturbance_text, integer, number
 from nbs_pin.controllers.registry import LAWS
-from nbs_pin.simulation.registry import INTEGRATORS, PLANTS
+from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Track:
     """Effort limit of every joint [N·m]."""
     no_effort_limit: bool = False
     """Do not limit the torques."""
-    integrator: Annotated[str | None, choice("--integrator", INTEGRATORS), default("the plant's usual one")] = None
+    integrator: Annotated[str | None, choice("--integrator", INTEGRATOR_NAMES), default("the plant's usual one")] = None
     """Integrator of the plant. mujoco: rk4, euler (semi-implicit), implicitfast.
     pinocchio: rk4, euler (explicit), semi_implicit_euler."""
     plant_step: Annotated[

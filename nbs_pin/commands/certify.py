@@ -65,9 +65,13 @@ def _controller(options: Certify) -> LyapunovLaw:
     name = options.controller
     law: Any = load(name) if name.endswith(SAVED) else build_law(options.law, load_robot(name), **settings)
     if not isinstance(law, LyapunovLaw):
-        what = f"{name} holds a {type(law).__name__}" if name.endswith(SAVED) else f"--law {options.law}"
+        what = (
+            f"{name} holds a controller of class {type(law).__name__}"
+            if name.endswith(SAVED)
+            else f"--law {options.law}"
+        )
         raise CertificateRefused(
-            f"{what}, of which no Lyapunov function is known; give a law that has one, such as nbs or slotine-li."
+            f"{what}, of which no Lyapunov function is known; give one that has it, such as nbs or slotine-li."
         )
     return law
 

@@ -83,10 +83,6 @@ class ComputedTorque(ModelLaw):
         tau = self.dynamics.reference_torque(q, v, v, a)
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
 
-    @property
-    def _has_kernel(self) -> bool:
-        return True
-
     def _packed(self, numpy: bool) -> Packed:
         kp, kd = self.gains.value(numpy=numpy)
         return self._pack(LawCode.COMPUTED_TORQUE, (kp, kd))

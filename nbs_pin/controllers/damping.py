@@ -14,7 +14,7 @@ from torch import nn
 from nbs_pin.base.arrays import Array, Matrices, Vectors, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import OUTWARD, Interval
-from nbs_pin.base.known_code import is_known, known_code
+from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.base.tensors import positive_definite, positive_scale
 from nbs_pin.controllers.gain import Gain
@@ -117,7 +117,7 @@ class Damping(nn.Module):
     @property
     def is_packable(self) -> bool:
         """Whether the kernels implement all parts; False for a subclass."""
-        return all(map(is_known, (self, self.diagonal, self.lower)))
+        return defines(self, "packed") and all(defines(network, "layers") for network in (self.diagonal, self.lower))
 
     def packed(self, *, numpy: bool = True) -> Packed:
         """Weights for the kernel of `force` (`kernels/damping.py`), as an array or a differentiable tensor."""

@@ -5,7 +5,7 @@ from typing import Any
 from torch import nn
 
 from nbs_pin.base.arrays import Array
-from nbs_pin.base.known_code import is_known
+from nbs_pin.base.known_code import defines
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
@@ -37,7 +37,8 @@ class ModelLaw(MemorylessController, nn.Module):
     def packable(self) -> bool:
         """Whether the kernels implement the law, its error and its friction; False for a subclass."""
         wraps = type(self.dynamics).difference is DynamicsProvider.difference
-        return wraps and is_known(self) and (self.friction is None or is_known(self.friction)) and self._has_kernel
+        friction = self.friction is None or type(self.friction) is JointFriction
+        return wraps and friction and defines(self, "_packed") and self._has_kernel
 
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """Constants and weights for the kernels (`Controller.packed_law`)."""
@@ -49,11 +50,11 @@ class ModelLaw(MemorylessController, nn.Module):
 
     @property
     def _has_kernel(self) -> bool:
-        """Whether the law and its parts have a kernel; False unless a subclass overrides it."""
-        return False
+        """Whether the parts of a law that defines `_packed` have kernels."""
+        return True
 
     def _packed(self, numpy: bool) -> Packed:
-        """`packed_law` of a law that has a kernel."""
+        """`packed_law` of exactly the class that defines it, by which a law has a kernel."""
         raise NotImplementedError
 
     def _pack(self, law: int, gains: tuple[Array, Array], **parts: Any) -> Packed:

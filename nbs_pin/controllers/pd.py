@@ -89,10 +89,6 @@ class PD(ModelLaw):
             tau = tau + self.dynamics.reference_torque(q, v, v_ref, a_ref)
         return tau if self.friction is None else tau + self.friction.torque(v_ref)
 
-    @property
-    def _has_kernel(self) -> bool:
-        return True
-
     def _packed(self, numpy: bool) -> Packed:
         kp, kd = self.gains.value(numpy=numpy)
         return self._pack(LawCode.PD_GRAVITY if self.feedforward == "gravity" else LawCode.PD_REFERENCE, (kp, kd))

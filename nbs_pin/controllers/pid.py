@@ -7,7 +7,7 @@ from torch import nn
 
 from nbs_pin.base.arrays import Array, JointArray, Vectors, array_namespace, as_vectors, constant_like, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.known_code import is_known, known_code
+from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.records import Reference
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.controller import Controller
@@ -125,7 +125,7 @@ class PID(Controller, nn.Module):
     @property
     def packable(self) -> bool:
         """Whether the kernel implements this law: True unless it is a subclass."""
-        return is_known(self)
+        return defines(self, "packed_law")
 
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """Gains, limits, T_f and wrapped joints for the kernel (`Controller.packed_law`)."""

@@ -11,7 +11,7 @@ from torch import nn
 from nbs_pin.base.arrays import Array, Scalars, Vectors, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import OUTWARD, Interval
-from nbs_pin.base.known_code import is_known, known_code
+from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.base.tensors import positive_definite, positive_scale
 from nbs_pin.controllers.activations import Activation, SmoothedReLU, Squareplus
@@ -99,7 +99,8 @@ class Potential(nn.Module):
     @property
     def is_packable(self) -> bool:
         """Whether the kernels implement all parts; False for a subclass."""
-        return all(map(is_known, (self, self.network, self.network.activation)))
+        activation = self.network.activation
+        return defines(self, "packed") and defines(self.network, "layers") and defines(activation, "kernel")
 
     def packed(self, *, numpy: bool = True) -> Packed:
         """Weights for the kernel of `terms`, as array or tensor; ArgumentError if the activation has no kernel."""

@@ -115,7 +115,3 @@ class SlidingMode(SlotineLi):
     def _switched(self, s: Array) -> Vectors:
         (size,) = self.switching.like(s)
         return size * array_namespace(s).tanh(s / constant_like(s, self.boundary))
-
-    @property
-    def _has_kernel(self) -> bool:
-        return False

@@ -132,10 +132,6 @@ class SlotineLi(LyapunovLaw):
         )
         return Lyapunov(np.diag(rate * gain), 0.5 / gain, np.diag(gain), 0.0, self.coupling, claims)
 
-    @property
-    def _has_kernel(self) -> bool:
-        return True
-
     def _packed(self, numpy: bool) -> Packed:
         rate, gain = self.gains.value(numpy=numpy)
         return self._pack(LawCode.SLOTINE_LI, (rate, gain))

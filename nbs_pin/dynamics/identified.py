@@ -10,12 +10,14 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import Array
 from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.known_code import known_code
+from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
 from nbs_pin.dynamics.structure import ModelClaims, rigid_tree_claims
+from nbs_pin.kernels.layout import Packed
 from nbs_pin.robots.robot import Robot
 
 _ROUNDING = 1e-9
@@ -61,6 +63,10 @@ class IdentifiedDynamics(PinocchioDynamics):
     def robot(self) -> Robot:
         """The arm with the inertias of its URDF."""
         return self._described
+
+    def packed_tree(self) -> Packed | None:
+        """The joints and the identified bodies; None for a subclass, which may change equations."""
+        return pack_model(self._model) if defines(self, "packed_tree") else None
 
     def structure_claims(self) -> ModelClaims | None:
         """The claims of a rigid tree."""

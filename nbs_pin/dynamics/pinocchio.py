@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, is_torch_array, over_rows
 from nbs_pin.base.claims import refuse
-from nbs_pin.base.known_code import is_known, known_code
+from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -92,8 +92,8 @@ class PinocchioDynamics(DynamicsProvider):
         return self._evaluate(Quantity(self._forward_dynamics, self._forward_dynamics_vjp), q=q, v=v, tau=tau)
 
     def packed_tree(self) -> Packed | None:
-        """The joints and bodies of the model; None for an unknown subclass, which may change equations."""
-        return pack_model(self._model) if is_known(self) else None
+        """The joints and bodies of the model; None for a subclass, which may change equations."""
+        return pack_model(self._model) if defines(self, "packed_tree") else None
 
     def structure_claims(self) -> ModelClaims | None:
         """The claims of a rigid tree; raises CertificateRefused if the model no longer matches `robot`."""

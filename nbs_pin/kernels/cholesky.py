@@ -66,7 +66,7 @@ def pack_cholesky(
 
 
 def cholesky_workspace(part: Packed) -> int:
-    """How many numbers of scratch space the kernels need."""
+    """Size of the scratch space that the kernels need."""
     n, depth, widest = (int(x) for x in part.layout[[SIZE, DEPTH, WIDEST]])
     return (6 + depth) * (widest + PADDING) + 8 * n
 

@@ -4,7 +4,7 @@ s = ḡᵀ∇f(x) + p̄ᵀ∇²f(x)ẋ is a derivative of f: with y₁ along ẋ
 
     a = W u, …, a₁₂ = W u₁₂;  y = σ(a), y₁ = σ'a₁, y₂ = σ'a₂, y₁₂ = σ'a₁₂ + σ''a₁a₂;  s = y₁₂ at the output.
 
-Backwards, with δ for what s gains per a and λ for what it gains per y,
+Backwards, with δ = ∂s/∂a and λ = ∂s/∂y,
 
     δ₁₂ = σ'λ₁₂,  δ₂ = σ'λ₂ + σ''a₁λ₁₂,  δ₁ = σ'λ₁ + σ''a₂λ₁₂,  δ = σ'λ + σ''(a₁λ₁ + a₂λ₂ + a₁₂λ₁₂) + σ'''a₁a₂λ₁₂.
 
@@ -57,7 +57,7 @@ def tape_sizes(part: Packed) -> tuple[int, int]:
 
 @kernel
 def room_for_potential(part: Packed) -> int:
-    """How many numbers of scratch space `taped` and `pull_back` need for the potential."""
+    """Size of the scratch space that `taped` and `pull_back` need for the potential."""
     phi, (units, inputs) = potential_of(part), tape_sizes(part)
     return 2 * (phi.n + phi.widest) + CHANNELS * inputs + PER_UNIT * units
 
@@ -135,7 +135,7 @@ def forward_again(part: Packed, tape: Tape) -> None:
 
 @kernel
 def reverse_again(part: Packed, tape: Tape, part_bar: Packed) -> None:
-    """What s gains per x → λ[:n] and per ẋ → λ̇[:n]; what it gains per weight of a layer is added to part_bar."""
+    """∂s/∂x → λ[:n] and ∂s/∂ẋ → λ̇[:n]; the gradient by the weights of a layer is added to part_bar."""
     phi, lam, lam1, units = potential_of(part), tape.lam.value, tape.lam.rate, tape.units
     n, end, there = phi.n, units.shape[1], tape.inputs.shape[1] - phi.widest
     lam[:], lam1[:] = 0.0, 0.0

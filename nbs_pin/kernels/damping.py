@@ -98,7 +98,7 @@ def damping_force(z: Vec, part: Packed, work: Vec, force: Vec) -> None:
 
 @kernel
 def room_for_damping(part: Packed) -> int:
-    """How many numbers of scratch space `damping_adjoint` needs for the damping."""
+    """Size of the scratch space that `damping_adjoint` needs for the damping."""
     d, tapes = damping_of(part), 0
     for k in range(2 * d.depth):
         tapes += layer(part, k)[1]

@@ -1,4 +1,4 @@
-"""Adjoints of the laws of `laws.py`: what a number that depends on their signals gains per state and per weight."""
+"""Adjoints of the laws of `laws.py`: vector–Jacobian products with respect to state and weights."""
 
 import math
 
@@ -13,7 +13,7 @@ from nbs_pin.kernels.views import damping_in, numbers, pid_of, potential_in, tak
 
 
 def adjoint_workspace(law: Packed) -> int:
-    """How many numbers of scratch space `law_adjoint` needs for this law."""
+    """Size of the scratch space that `law_adjoint` needs for this law."""
     networks = law.layout[at.LAW] == LawCode.BACKSTEPPING
     rooms = room_for_potential(potential_in(law)) + room_for_damping(damping_in(law)) if networks else 0
     return int(10 * law.layout[at.JOINTS] + rooms)

@@ -1,6 +1,4 @@
-"""Every law of one state, what it adds to the model, τ = M(q) a_r + C(q, v) v_r + G(q) + feedback; and on a rigid tree
-the torque itself.
-"""
+"""Kernels of all laws: v_r, a_r and feedback of τ = M(q)a_r + C(q, v)v_r + G(q) + feedback, and τ on a rigid tree."""
 
 import math
 
@@ -34,7 +32,7 @@ def compile_tree_law() -> None:
 
 
 def law_workspace(law: Packed, tree: Packed | None = None) -> int:
-    """How many numbers of scratch space `law_signals` needs, or `tree_law`.
+    """Size of the scratch space that `law_signals` or `tree_law` needs.
 
     Args:
         law: a law with a model of the arm, as `layout.pack_law` packs it.

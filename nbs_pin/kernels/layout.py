@@ -191,7 +191,7 @@ def pack_pid(
 
 
 def workspace(part: Packed) -> int:
-    """How many numbers of scratch space the kernels of a potential or a damping need."""
+    """Size of the scratch space that the kernels of a potential or a damping need."""
     sizes = part.layout[LAYERS::PER_LAYER]
     return int(4 * (part.layout[WIDEST] + PADDING) + 3 * part.layout[SIZE] + 2 * sizes.sum())
 

@@ -1,4 +1,4 @@
-"""What kernels pass around. Fields are contiguous float64 vectors (n,) unless said otherwise."""
+"""Records passed between kernels; fields are contiguous float64 vectors (n,) unless stated otherwise."""
 
 from collections import namedtuple
 from typing import TypeAlias

@@ -28,7 +28,7 @@ STAGES = 4
 
 
 class Scene(NamedTuple):
-    """What a motion depends on beside its start and the law's weights; what all starts share."""
+    """Constants of a motion, shared by all starts."""
 
     period: float
     step: float
@@ -78,7 +78,7 @@ factors of M, (4, n, n)."""
 
 
 def rollout_workspace(law: Packed, scene: Scene) -> int:
-    """How many numbers of scratch space `rollout` and `rollout_adjoint` need.
+    """Size of the scratch space that `rollout` and `rollout_adjoint` need.
 
     Args:
         law: the law, with weights as a numpy array.
@@ -116,7 +116,7 @@ def rollout(course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout) 
 def rollout_adjoint(
     course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout, bars: Rollout, tau_d_bar: Mat, law_bar: Packed
 ) -> None:
-    """What a number that depends on a motion gains per start, disturbance and weight of the law.
+    """Gradient with respect to start, disturbance and weights of the law.
 
     Args:
         course: what the motion followed.

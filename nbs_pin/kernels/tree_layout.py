@@ -71,7 +71,7 @@ def pack_tree(links: Sequence[Link], gravity: np.ndarray) -> Packed:
 
 
 def tree_workspace(part: Packed) -> int:
-    """How many numbers of scratch space each kernel of a tree needs."""
+    """Size of the scratch space that each kernel of a tree needs."""
     n = int(part.layout[TREE_SIZE])
     return (n + 1) * ROW + 2 * n
 

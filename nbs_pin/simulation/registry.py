@@ -13,7 +13,7 @@ PLANTS: dict[str, Entry] = {
     "pinocchio": Entry("nbs_pin.simulation.dynamics_plant:DynamicsPlant.for_robot"),
 }
 """All plants by name; each entry takes a robot, integrator and joint_friction."""
-INTEGRATORS = ("rk4", "euler", "implicitfast", "semi_implicit_euler")
+INTEGRATOR_NAMES = ("rk4", "euler", "implicitfast", "semi_implicit_euler")
 """All integrators that some plant supports."""
 
 

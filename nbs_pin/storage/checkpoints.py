@@ -50,12 +50,12 @@ def save(controller: Stored, path: str | Path, *, info: Mapping[str, Any] | None
     """Write a controller or a model to one file, from which `load` restores the same torques bit for bit.
 
     Args:
-        controller: A controller or a dynamics model, all of whose parts are from this package.
+        controller: A controller or a dynamics model, all of whose parts are `@storable`.
         path: The file, replaced atomically; missing folders are created.
         info: Notes, such as the seed, stored as JSON and returned by `about`.
 
     Raises:
-        ArgumentError: If a part is not from this package or cannot be stored, or a weight is not finite.
+        ArgumentError: If a part is not `@storable` or cannot be stored, or a weight is not finite.
 
     Example:
         >>> import tempfile

@@ -32,7 +32,7 @@ Stored: TypeAlias = Controller | DynamicsProvider
 def describe(stored: Stored) -> tuple[Settings, Tensors]:
     """JSON settings and copies of the `state_dict` tensors, from which `rebuild` makes the same controller or model.
 
-    Raises ArgumentError if a part is not from this package, or a number is not finite.
+    Raises ArgumentError if a part is not `@storable`, or a number is not finite.
     """
     settings = cast(Settings, _described(stored))
     state = stored.state_dict() if isinstance(stored, nn.Module) else {}

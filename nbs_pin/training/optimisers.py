@@ -1,19 +1,19 @@
-"""Optimisers by name, their learning rate schedules, and their state as tensors and JSON values."""
+"""Optimisers by name, their learning rate schedules, and their state as tensors and JSON values.
+
+"adam-backtracking" is Adam that returns to the best parameters with half the step whenever the cost exceeds the lowest
+by the share `RISE`; "adam" has its step halved after every fifth of the epochs, as in the paper; "lbfgs" has a strong
+Wolfe line search. The cost of a sampled loop jumps where gains become too high for the period. Adam may step across such
+a jump and then search on the wrong side; a line search stops in front of it (docs/theory.md §7).
+"""
 
 from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import torch
 
 from nbs_pin.base.checks import positive
 from nbs_pin.base.exceptions import ArgumentError
 
-OptimiserName: TypeAlias = Literal["adam-backtracking", "adam", "lbfgs"]
-"""Adam that returns to the best parameters with half the step whenever the cost exceeds the lowest by the share `RISE`;
-Adam with its step halved after every fifth of the epochs, as in the paper; or L-BFGS with a strong Wolfe line search.
-
-The cost of a sampled loop jumps where gains become too high for the period. Adam may step across such a jump and then
-search on the wrong side; a line search stops in front of it (docs/theory.md §7)."""
 LEARNING_RATES: dict[str, float] = {"adam-backtracking": 1e-2, "adam": 1e-2, "lbfgs": 1.0}
 """Default learning rates; the paper uses 1e-3 for Adam."""
 RISE = 0.02
