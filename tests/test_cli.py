@@ -1,6 +1,5 @@
 """The command line: what it writes, what it prints, what it refuses, and what it leaves behind when stopped."""
 
-import json
 import re
 import resource
 import shlex
@@ -20,7 +19,9 @@ from nbs_pin import cli
 from nbs_pin.base.versions import versions
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_number
 from nbs_pin.commands import track as tracking
+from nbs_pin.robots.catalogue import find
 from nbs_pin.simulation import metrics
+from tests.commands import check_results_are_kept_unless_forced, contents, refusal, summary
 
 NBS_PIN = (sys.executable, "-m", "nbs_pin.cli")
 TRACKS = {
@@ -29,8 +30,8 @@ TRACKS = {
 }
 
 
-def nbs_pin(*arguments, cwd=None, **options):
-    return subprocess.run([*NBS_PIN, *arguments], cwd=cwd, capture_output=True, text=True, check=False, **options)
+def nbs_pin(*arguments, **options):
+    return subprocess.run([*NBS_PIN, *arguments], capture_output=True, text=True, check=False, **options)
 
 
 @pytest.fixture(scope="module", params=TRACKS)
@@ -46,12 +47,12 @@ def tracked(request, tmp_path_factory):
 def two_link(tmp_path_factory):
     """A folder with a short run of two_link."""
     folder = tmp_path_factory.mktemp("results") / "run"
-    assert cli.main(["track", "two_link", "--duration", "0.1", "--out", str(folder)]) == 0
+    assert track(folder) == 0
     return folder
 
 
-def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+def track(folder, *options):
+    return cli.main(["track", "two_link", "--duration", "0.1", "--out", str(folder), *options])
 
 
 def motion_in(page):
@@ -67,21 +68,21 @@ def motion_in(page):
 def test_track_leaves_four_files_that_say_the_same(tracked):
     name, folder, _ = tracked
     assert sorted(path.name for path in folder.iterdir()) == ["replay.html", "run.npz", "summary.json", "tracking.png"]
-    run, summary = nbs.Run.load(folder / "run.npz"), json.loads((folder / "summary.json").read_text())
-    assert summary["figures"].items() >= metrics.summary(run).items()
+    run, said = nbs.Run.load(folder / "run.npz"), summary(folder)
+    assert said["figures"].items() >= metrics.summary(run).items()
     last = metrics.rms_error(run, after=0.7 * run.t[-1]).tolist()
-    assert summary["figures"]["rms_error_last_30_percent_rad"] == last
-    assert summary["settings"] == run.info["settings"]
-    assert summary["versions"] == run.info["versions"] == versions()
-    assert summary["robot_sha256"] == run.robot_sha256 == nbs.load_robot(name).sha256
-    assert summary["wall_time_s"] > 0.0
+    assert said["figures"]["rms_error_last_30_percent_rad"] == last
+    assert said["settings"] == run.info["settings"]
+    assert said["versions"] == run.info["versions"] == versions()
+    assert said["robot_sha256"] == run.robot_sha256 == nbs.load_robot(name).sha256
+    assert said["wall_time_s"] > 0.0
     assert (folder / "tracking.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "replay.html").read_text().startswith("<!DOCTYPE html>")
 
 
 def test_track_prints_the_figures_it_stores(tracked):
     _, folder, printed = tracked
-    figures = json.loads((folder / "summary.json").read_text())["figures"]
+    figures = summary(folder)["figures"]
     rows = {line.split()[0]: line.split()[1:] for line in printed.splitlines() if line.split()}
     for i, joint in enumerate(figures["joints"]):
         errors = [figures[f"rms_error_{which}rad"][i] for which in ("", "late_", "last_30_percent_")]
@@ -94,7 +95,7 @@ def test_track_prints_the_figures_it_stores(tracked):
 
 def test_the_options_reach_the_run(tracked):
     name, folder, _ = tracked
-    run, settings = nbs.Run.load(folder / "run.npz"), json.loads((folder / "summary.json").read_text())["settings"]
+    run, settings = nbs.Run.load(folder / "run.npz"), summary(folder)["settings"]
     offset = run.q[0] - run.q_ref[0]
     if name == "two_link":
         np.testing.assert_allclose(offset, [0.3, -0.3], atol=1e-15)
@@ -121,30 +122,20 @@ PAPERS = (
 
 def test_the_papers_row_is_one_command(tmp_path, capsys):
     for out, more in (("a", "--start=-0.5,1"), ("b", "")):
-        command = f"{PAPERS} --seed 3 --duration 0.5 --out {tmp_path / out} {more}"
-        assert cli.main(shlex.split(command)) == 0
+        assert cli.main(f"{PAPERS} --seed 3 --duration 0.5 --out {tmp_path / out} {more}".split()) == 0
     far, run = (nbs.Run.load(tmp_path / out / "run.npz") for out in "ab")
     assert far.q[0].tolist() == [-0.5, 1.0]
     dynamics = nbs.PinocchioDynamics(nbs.load_robot("two_link"))
-    same = nbs.simulate(
-        nbs.DynamicsPlant(dynamics, integrator="euler"),
-        nbs.paper_controller(dynamics, seed=3),
-        nbs.paper_reference(2),
-        duration=0.5,
-        period=0.01,
-        q0=np.zeros(2),
-        plant_step=0.01,
-        lookahead=0.0,
-        effort_limit=np.inf,
-    )
+    plant, law = nbs.DynamicsPlant(dynamics, integrator="euler"), nbs.paper_controller(dynamics, seed=3)
+    options = {"q0": np.zeros(2), "plant_step": 0.01, "lookahead": 0.0, "effort_limit": np.inf}
+    same = nbs.simulate(plant, law, nbs.paper_reference(2), duration=0.5, period=0.01, **options)
     np.testing.assert_array_equal(run.q, same.q)
     assert np.isinf(run.effort_limit).all()
 
 
 def test_an_effort_limit_reaches_the_law(tmp_path, capsys):
-    command = f"track two_link --controller pid --duration 0.1 --start-error 1 --effort-limit 40 --out {tmp_path}/run"
-    assert cli.main(shlex.split(command)) == 0
-    run, arm = nbs.Run.load(tmp_path / "run" / "run.npz"), nbs.load_robot("two_link").with_effort_limit(40.0)
+    assert track(tmp_path, "--controller", "pid", "--start-error", "1", "--effort-limit", "40") == 0
+    run, arm = nbs.Run.load(tmp_path / "run.npz"), nbs.load_robot("two_link").with_effort_limit(40.0)
     assert (run.effort_limit == 40.0).all()
     motion = nbs.Sinusoid.for_robot(arm)
     start = motion(0.0).q + np.array([1.0, -1.0])
@@ -167,8 +158,6 @@ def test_a_motion_from_a_file_is_followed_for_its_length(tmp_path, capsys):
 
 
 def test_an_arm_from_a_file_is_found_again_from_anywhere(tmp_path, monkeypatch, capsys):
-    from nbs_pin.robots.catalogue import find
-
     urdf = find("two_link").path.read_text()
     (tmp_path / "arm.urdf").write_text(urdf.replace('name="two_link"', 'name="my/arm"'))
     monkeypatch.chdir(tmp_path)
@@ -181,15 +170,10 @@ def test_an_arm_from_a_file_is_found_again_from_anywhere(tmp_path, monkeypatch, 
 
 def test_results_of_another_run_are_kept_unless_forced(two_link, capsys):
     before = contents(two_link)
-    same = ["track", "two_link", "--duration", "0.1", "--out", str(two_link)]
-    assert cli.main(same) == 0
+    assert track(two_link) == 0
     assert contents(two_link)["run.npz"] == before["run.npz"]
-    before = contents(two_link)
-    assert cli.main([*same, "--seed", "1"]) == 2
-    assert "--force" in capsys.readouterr().err
-    assert contents(two_link) == before
-    assert cli.main([*same, "--seed", "1", "--force"]) == 0
-    assert json.loads((two_link / "summary.json").read_text())["seed"] == 1
+    check_results_are_kept_unless_forced(track, two_link, ["--seed", "1"], "--force", capsys)
+    assert summary(two_link)["seed"] == 1
 
 
 # Refusals: exit code 2 and one sentence.
@@ -220,52 +204,34 @@ REFUSED = {
     "track two_link --out /proc/nowhere": "'/proc/nowhere': no such file",
     "replay none.npz": "'none.npz': no such file",
     "robots panda": "takes no argument 'panda'",
-    **{
-        f"track panda {flag} {value}": f"{flag} is '{value}'"
-        for flag, values in {
-            "--duration": ("nan", "inf", "0", "-1", "1_0", "٣", "1e-400", "ten"),
-            "--frequency": ("nan", "0", "-1"),
-            "--period": ("0", "1e-9", "10", "nan"),
-            "--bandwidth": ("-8", "inf"),
-            "--start-error": ("-0.1", "4", "nan"),
-            "--effort-limit": ("0", "inf"),
-            "--start": ("nan,0", "0,", "0;1", "0,1_0"),
-            "--plant-step": ("0", "nan", "1"),
-            "--lookahead": ("-1", "inf"),
-            "--seed": ("-1", "1.5", "1_0", "99999999999"),
-            "--disturbance": (
-                "5",
-                "constant",
-                "constant:nan",
-                "square:5",
-                "sine:5@0",
-                "noise:-1",
-                "noise:1@2",
-                "sin:5@8",
-            ),
-        }.items()
-        for value in values
-    },
 }
+WRONG = {
+    "--duration": ("nan", "inf", "0", "-1", "1_0", "٣", "1e-400", "ten"),
+    "--frequency": ("nan", "0", "-1"),
+    "--period": ("0", "1e-9", "10", "nan"),
+    "--bandwidth": ("-8", "inf"),
+    "--start-error": ("-0.1", "4", "nan"),
+    "--effort-limit": ("0", "inf"),
+    "--start": ("nan,0", "0,", "0;1", "0,1_0"),
+    "--plant-step": ("0", "nan", "1"),
+    "--lookahead": ("-1", "inf"),
+    "--seed": ("-1", "1.5", "1_0", "99999999999"),
+    "--disturbance": ("5", "constant", "constant:nan", "square:5", "sine:5@0", "noise:-1", "noise:1@2", "sin:5@8"),
+}
+REFUSED |= {f"track panda {flag} {x}": f"{flag} is '{x}'" for flag, values in WRONG.items() for x in values}
 
 
 @pytest.mark.parametrize("command", REFUSED)
 def test_bad_input_is_refused_in_one_sentence(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert cli.main(shlex.split(command)) == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.startswith("nbs-pin: error: ")
-    assert printed.err.count("\n") == 1
-    assert REFUSED[command] in printed.err
+    assert REFUSED[command] in refusal(cli.main(command.split()), capsys)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("target", ["--out {0}/run.npz", "--out {0}/run.npz/deeper"])
 def test_a_file_is_no_folder(two_link, target, capsys):
     before = contents(two_link)
-    assert cli.main(["track", "two_link", *target.format(two_link).split()]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert refusal(cli.main(["track", "two_link", *target.format(two_link).split()]), capsys)
     assert contents(two_link) == before
 
 
@@ -305,7 +271,7 @@ def test_a_stop_the_moment_the_folder_is_made_leaves_nothing(tmp_path, monkeypat
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Path, "mkdir", made_and_interrupted)
-    assert cli.main(["track", "two_link", "--duration", "0.1", "--out", str(tmp_path / "run")]) == 130
+    assert track(tmp_path / "run") == 130
     assert not list(tmp_path.iterdir())
 
 
@@ -315,7 +281,7 @@ def test_ctrl_c_while_drawing_keeps_the_old_results_whole(two_link, monkeypatch,
 
     before = contents(two_link)
     monkeypatch.setattr("nbs_pin.commands.track.replay", interrupted)
-    assert cli.main(["track", "two_link", "--duration", "0.1", "--seed", "9", "--force", "--out", str(two_link)]) == 130
+    assert track(two_link, "--seed", "9", "--force") == 130
     assert "interrupted" in capsys.readouterr().err
     assert contents(two_link) == before
 
@@ -339,20 +305,18 @@ def test_replay_draws_what_track_drew(two_link, tmp_path, monkeypatch, capsys):
     assert motion_in(page) == motion_in(two_link / "replay.html")
     assert opened == [page.as_uri()]
     assert capsys.readouterr().out == f"{page}\n"
-    assert cli.main(["replay", str(two_link), "--out", str(page)]) == 2
-    assert "--force" in capsys.readouterr().err
+    assert "--force" in refusal(cli.main(["replay", str(two_link), "--out", str(page)]), capsys)
     assert cli.main(["replay", str(two_link), "--out", str(page), "--force"]) == 0
 
 
 def test_replay_goes_beside_the_run_and_refuses_what_is_none(two_link, capsys):
     (two_link / "replay.html").unlink()
     assert cli.main(["replay", str(two_link)]) == 0
+    assert capsys.readouterr().out == f"{two_link / 'replay.html'}\n"
     assert (two_link / "replay.html").is_file()
-    assert cli.main(["replay", str(two_link / "summary.json")]) == 2
-    assert "not an intact npz file" in capsys.readouterr().err
-    assert cli.main(["replay", str(two_link), "--start", "1"]) == 2
-    assert cli.main(["replay", str(two_link), "--robot", "panda"]) == 2
-    assert cli.main(["replay", str(two_link), "--out", str(two_link)]) == 2
+    assert "not an intact npz file" in refusal(cli.main(["replay", str(two_link / "summary.json")]), capsys)
+    for options in (["--start", "1"], ["--robot", "panda"], ["--out", str(two_link)]):
+        assert refusal(cli.main(["replay", str(two_link), *options]), capsys)
 
 
 def test_robots_lists_every_arm(capsys):

@@ -1,19 +1,16 @@
 """Identification: what clean data say exactly, what noisy data say well, and what data do not say at all."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from nbs_pin.base.arrays import matvec
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.pd import PD
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import BASIS, coordinates, inertial_parameters, pseudo_inertia, symmetric
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.consistent_fit import consistent_fit
@@ -21,8 +18,9 @@ from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.identify import identify
 from nbs_pin.identification.measurement import Noise
 from nbs_pin.robots.robot import Robot, load_robot
+from tests.test_chain import errors
+from tests.test_dynamics import GANTRY
 
-GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # prismatic, revolute and continuous
 REAL = Noise(encoder=2.0**-16, torque=0.5)
 
 
@@ -37,22 +35,11 @@ def dataset(robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray, tau: np.n
     return Dataset(q, v, a, tau, 0.0 * order, order, robot.parents, robot.prismatic, robot.name)
 
 
-def clean(robot: Robot, samples: int = 300, friction: JointFriction | None = None) -> Dataset:
+def clean(robot: Robot, samples: int = 300, friction: JointFriction | None = None, noise: object = 0.0) -> Dataset:
+    """Independent states and their torque, with friction and noise of a standard deviation per joint."""
     q, v, a = states(robot.nv, samples)
-    tau = PinocchioDynamics(robot).reference_torque(q, v, v, a)
+    tau = PinocchioDynamics(robot).reference_torque(q, v, v, a) + noise * np.random.default_rng(1).normal(size=q.shape)
     return dataset(robot, q, v, a, tau if friction is None else tau + friction.torque(v))
-
-
-def errors(model: DynamicsProvider, truth: DynamicsProvider) -> np.ndarray:
-    """Relative Frobenius errors of M, C v and G over uniform states."""
-    q, v, _ = states(truth.nv, 200, seed=99)
-
-    def quantities(d: DynamicsProvider) -> tuple[np.ndarray, ...]:
-        return d.mass_matrix(q), matvec(d.coriolis_matrix(q, v), v), d.gravity(q)
-
-    return np.array(
-        [np.linalg.norm(x - y) / np.linalg.norm(y) for x, y in zip(quantities(model), quantities(truth), strict=True)]
-    )
 
 
 def unlike(robot: Robot) -> Robot:
@@ -122,14 +109,6 @@ def test_exact_data_override_what_was_expected_and_bounds_hold():
     assert fit.scalars[1] > 0.0
 
 
-def test_bodies_stay_bodies_where_plain_least_squares_leaves_them():
-    rng = np.random.default_rng(4)
-    impossible = coordinates(np.diag([1.0, -0.5, 1.0, 1.0]))
-    design = 100.0 * rng.normal(size=(12, 10))
-    fit = consistent_fit(design, design @ impossible, 1, 1.0)
-    assert np.linalg.eigvalsh(fit.factors[0] @ fit.factors[0].T).min() > 0.0
-
-
 # Clean data.
 
 
@@ -197,37 +176,28 @@ def test_a_noisy_arm_with_friction_is_identified(name, worst):
 
 
 def test_the_noise_of_a_sensor_is_estimated():
-    robot = load_robot("ur5")
-    q, v, a = states(6, 2_000)
-    noise = np.geomspace(0.1, 5.0, 6)
-    tau = PinocchioDynamics(robot).reference_torque(q, v, v, a) + noise * np.random.default_rng(1).normal(size=q.shape)
-    found = identify(dataset(robot, q, v, a, tau), robot).report.noise
+    robot, noise = load_robot("ur5"), np.geomspace(0.1, 5.0, 6)
+    found = identify(clean(robot, 2_000, noise=noise), robot).report.noise
     np.testing.assert_allclose(found, noise, rtol=4.0 / np.sqrt(2.0 * 2_000))  # four standard errors of an estimate
 
 
 def test_noise_falls_with_the_root_of_the_samples():
     robot = load_robot("xarm7")
-    q, v, a = states(robot.nv, 6_400)
-    truth = PinocchioDynamics(robot)
-    tau = truth.reference_torque(q, v, v, a) + 0.5 * np.random.default_rng(1).normal(size=q.shape)
-    few, many = (errors(identify(dataset(robot, q[:n], v[:n], a[:n], tau[:n]), robot), truth) for n in (400, 6_400))
+    few, many = (clean(robot, samples, noise=0.5) for samples in (200, 3_200))
+    few, many = (errors(identify(data, robot), PinocchioDynamics(robot)) for data in (few, many))
     assert (many < 0.5 * few).all()
 
 
 def test_a_noisy_joint_does_not_spoil_the_others():
-    robot = load_robot("ur5")
-    q, v, a = states(6, 400)
-    truth, noise = PinocchioDynamics(robot), np.array([50.0, 0.01, 0.01, 0.01, 0.01, 0.01])
-    tau = truth.reference_torque(q, v, v, a) + noise * np.random.default_rng(1).normal(size=q.shape)
-    model = identify(dataset(robot, q, v, a, tau), robot)
+    robot, noise = load_robot("ur5"), np.array([50.0, 0.01, 0.01, 0.01, 0.01, 0.01])
+    model = identify(clean(robot, 400, noise=noise), robot)
     np.testing.assert_allclose(model.report.noise, noise, rtol=0.2)
-    assert errors(model, truth).max() < 0.02
+    assert errors(model, PinocchioDynamics(robot)).max() < 0.02
 
 
 def test_the_units_of_torque_do_not_matter():
     robot = load_robot("three_link")
-    data = clean(robot, friction=JointFriction(np.ones(3), np.ones(3)))
-    data = replace(data, tau=data.tau + np.random.default_rng(0).normal(size=data.tau.shape))
+    data = clean(robot, friction=JointFriction(np.ones(3), np.ones(3)), noise=1.0)
     one, thousand = (identify(replace(data, tau=c * data.tau), robot, friction=True) for c in (1.0, 1e3))
     np.testing.assert_allclose(thousand.parameters, 1e3 * one.parameters, rtol=1e-5, atol=1e-5)
     assert one.friction is not None
@@ -237,12 +207,9 @@ def test_the_units_of_torque_do_not_matter():
 
 def test_the_order_of_the_samples_does_not_matter():
     robot = load_robot("three_link")
-    data = clean(robot, 1_500)
-    noisy = data.tau + np.random.default_rng(0).normal(size=data.tau.shape)
+    data = clean(robot, 1_500, noise=1.0)
     shuffle = np.random.default_rng(1).permutation(1_500)
-    models = [
-        identify(dataset(robot, data.q[k], data.v[k], data.a[k], noisy[k]), robot) for k in (slice(None), shuffle)
-    ]
+    models = [identify(data.take(k), robot) for k in (slice(None), shuffle)]
     np.testing.assert_allclose(models[0].parameters, models[1].parameters, rtol=1e-6, atol=1e-8)
 
 
@@ -289,25 +256,34 @@ def test_few_noisy_samples_give_bodies_that_exist():
 # Refusals.
 
 
-def test_data_of_another_arm_are_refused():
-    with pytest.raises(ArgumentError, match=r"number, kinds or order of the joints differ"):
-        identify(clean(load_robot("two_link")), load_robot("three_link"))
-    with pytest.raises(ArgumentError, match=r"number, kinds or order of the joints differ"):
-        identify(clean(load_robot("three_link")), load_robot(GANTRY))
+OTHER = "number, kinds or order of the joints differ"
+LIGHT = load_robot("two_link", gravity=0.0)
 
 
-def test_a_motion_without_torque_is_refused():
-    robot = load_robot("two_link")
+def still(robot: Robot) -> Dataset:
     data = clean(robot)
-    with pytest.raises(ArgumentError, match="inertias of every scale explain such a motion"):
-        identify(replace(data, tau=0.0 * data.tau), robot)
+    return replace(data, v=0.0 * data.v, a=0.0 * data.a)
 
 
-def test_rest_without_weight_is_refused():
-    robot = load_robot("two_link", gravity=0.0)
-    q, v, _ = states(2, 50)
-    with pytest.raises(ArgumentError, match="neither moves nor carries weight"):
-        identify(dataset(robot, q, 0.0 * v, 0.0 * v, v), robot)
+def without_torque(robot: Robot) -> Dataset:
+    data = clean(robot)
+    return replace(data, tau=0.0 * data.tau)
+
+
+@pytest.mark.parametrize(
+    ("data", "robot", "settings", "words"),
+    [
+        (clean(load_robot("two_link")), load_robot("three_link"), {}, OTHER),
+        (clean(load_robot("three_link")), load_robot(GANTRY), {}, OTHER),
+        (without_torque(LIGHT), LIGHT, {}, "inertias of every scale explain such a motion"),
+        (still(LIGHT), LIGHT, {}, "neither moves nor carries weight"),
+        (clean(LIGHT), LIGHT, {"transition": 0.0}, "transition is 0"),
+        (clean(LIGHT), LIGHT, {"regularisation": 0.0}, "regularisation is 0"),
+    ],
+)
+def test_what_identifies_nothing_is_refused(data, robot, settings, words):
+    with pytest.raises(ArgumentError, match=words):
+        identify(data, robot, **settings)
 
 
 def test_too_few_samples_are_refused():
@@ -315,13 +291,6 @@ def test_too_few_samples_are_refused():
     with pytest.raises(ArgumentError, match=r"12 samples of 7 joints are too few for 43 .* give 13 or more"):
         identify(clean(robot, 12), robot)
     assert identify(clean(robot, 13), robot).report.samples == 13
-
-
-@pytest.mark.parametrize("name", ["transition", "regularisation"])
-def test_settings_must_be_positive(name):
-    robot = load_robot("two_link")
-    with pytest.raises(ArgumentError, match=f"{name} is 0"):
-        identify(clean(robot), robot, **{name: 0.0})
 
 
 # The model.
@@ -351,9 +320,8 @@ def test_a_law_on_the_model_runs_as_machine_code():
     law = PD(model, feedforward="reference", kp=np.full(6, 10.0), kd=np.full(6, 1.0))
     arguments = (q[0], v[0], q[0] + 0.1, v[0], a[0])
     np.testing.assert_allclose(law.compile().torque(*arguments), law.torque(*arguments), rtol=1e-12)
-    np.testing.assert_allclose(
-        model.mass_matrix(q[0]) - PinocchioDynamics(robot).mass_matrix(q[0]), np.diag(rotors), atol=1e-13
-    )
+    added = model.mass_matrix(q[0]) - PinocchioDynamics(robot).mass_matrix(q[0])
+    np.testing.assert_allclose(added, np.diag(rotors), atol=1e-13)
     assert model.robot is robot
 
     class Changed(IdentifiedDynamics):
@@ -372,18 +340,18 @@ def test_the_callers_robot_and_arrays_are_left_alone():
 
 
 @pytest.mark.parametrize(
-    ("row", "words"),
+    "row",
     [
-        ([-1.0, 0, 0, 0, 1, 0, 1, 0, 0, 1], "no distribution of mass has"),
-        ([1.0, 0, 0, 0, 1, 0, 1, 0, 0, 3], "no distribution of mass has"),  # triangle inequality
-        ([np.nan, 0, 0, 0, 1, 0, 1, 0, 0, 1], "no distribution of mass has"),
+        [-1.0, 0, 0, 0, 1, 0, 1, 0, 0, 1],
+        [1.0, 0, 0, 0, 1, 0, 1, 0, 0, 3],  # triangle inequality
+        [np.nan, 0, 0, 0, 1, 0, 1, 0, 0, 1],
     ],
 )
-def test_bodies_that_cannot_exist_are_refused(row, words):
+def test_bodies_that_cannot_exist_are_refused(row):
     robot = load_robot("two_link")
     parameters = own_parameters(robot)
     parameters[1] = row
-    with pytest.raises(ArgumentError, match=words):
+    with pytest.raises(ArgumentError, match="no distribution of mass has"):
         IdentifiedDynamics(robot, parameters)
 
 

@@ -16,7 +16,6 @@ from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.damping import DAMPINGS, Damping
 from nbs_pin.kernels.convex import activation, potential
 from nbs_pin.kernels.damping import damping_adjoint, damping_force, room_for_damping
-from nbs_pin.kernels.law_adjoints import law_adjoint
 from nbs_pin.kernels.laws import law_signals
 from nbs_pin.kernels.layout import (
     CODE,
@@ -33,25 +32,17 @@ from nbs_pin.kernels.layout import (
     pack_potential,
     workspace,
 )
-from nbs_pin.kernels.records import Dual, Motion, Signals, State, Target
+from nbs_pin.kernels.records import Dual, Motion, State
 from nbs_pin.kernels.rollouts import Course, Rollout, rollout, rollout_adjoint, rollout_workspace
 from nbs_pin.kernels.tree_layout import PER_JOINT, TREE_JOINTS, Link, pack_tree, tree_workspace
 from nbs_pin.kernels.trees import tree_acceleration, tree_torque
 from nbs_pin.simulation.costs import squared_error
 from nbs_pin.simulation.integrators import INTEGRATORS
 from nbs_pin.simulation.rollout import _scene, motions, running_cost
-from tests.test_adjoints import random_damping, random_law, random_potential, states
+from tests.laws import COMPILED
+from tests.test_adjoints import adjoint_of, random_damping, random_law, random_potential, scratch, states
 from tests.test_training import arm, assert_engines_agree, law_for, problem
 
-WRITTEN = {
-    LawCode.BACKSTEPPING: "nbs",
-    LawCode.SLOTINE_LI: "slotine-li",
-    LawCode.COMPUTED_TORQUE: "computed-torque",
-    LawCode.PD_REFERENCE: "pd-plus",
-    LawCode.PD_GRAVITY: "pd-gravity",
-    LawCode.PID: "pid",
-}
-"""Every code with the law that is written in Python."""
 ACTIVATIONS = {ActivationCode.SMOOTHED_RELU: SmoothedReLU(0.5), ActivationCode.SQUAREPLUS: Squareplus(0.3)}
 UNKNOWN = 99
 
@@ -63,20 +54,8 @@ def forged(part: Packed, at: int) -> Packed:
     return Packed(layout, part.weights)
 
 
-# Every code: written law = kernel = adjoint. A code without all three fails here.
-
-
-@pytest.mark.parametrize("code", LawCode)
-def test_every_law_is_its_kernel_and_its_adjoint(code):
-    """Kernels against numpy, and along a motion, with its gradient, against torch."""
-    robot = arm("two_link", 30.0)
-    law = law_for(robot, WRITTEN[code])
-    assert law.packed_law().layout[LAW] == code
-    q, v, *reference = np.random.default_rng(code).normal(size=(5, 2))
-    given = law.initial_memory(q), q, v, nbs.Reference(*reference), 0.01
-    tau, compiled = law.step(*given)[0], law.compile().step(*given)[0]
-    assert np.abs(compiled - tau).max() <= 1e-12 * np.abs(tau).max()
-    assert_engines_agree(law, problem(robot, steps=4), squared_error)
+# Every code: what is written = kernel = adjoint. A code without all three fails here; laws run in test_compiled.py and
+# test_both_engines_are_one_loop_for_every_law.
 
 
 @pytest.mark.parametrize("code", ActivationCode)
@@ -102,33 +81,31 @@ def test_every_damping_is_its_kernel_and_its_adjoint(code):
     force, z_bar, weights_bar = np.empty(3), np.zeros(3), np.zeros_like(part.weights)
     damping_force(z, part, np.empty(workspace(part)), force)
     np.testing.assert_allclose(force, damping.force(z), rtol=1e-12)
-    tensor = torch.tensor(z, requires_grad=True)
-    weights = damping.packed(numpy=False).weights
-    (expected,) = torch.autograd.grad(damping.force(tensor) @ torch.tensor(force_bar), tensor)
     damping_adjoint(z, force_bar, part, np.empty(room_for_damping(part)), z_bar, weights_bar)
-    np.testing.assert_allclose(z_bar, expected.numpy(), rtol=1e-10, atol=1e-12)
-    parameters = list(damping.parameters())
+    tensor, parameters = torch.tensor(z, requires_grad=True), list(damping.parameters())
+    expected = torch.autograd.grad(damping.force(tensor) @ torch.tensor(force_bar), [tensor, *parameters])
+    weights = damping.packed(numpy=False).weights
     through = torch.autograd.grad(weights, parameters, torch.tensor(weights_bar), allow_unused=True)
-    direct = torch.autograd.grad(damping.force(torch.tensor(z)) @ torch.tensor(force_bar), parameters)
-    for x, y in zip(through, direct, strict=True):
+    for x, y in zip((torch.tensor(z_bar), *through), expected, strict=True):
         torch.testing.assert_close(x, y, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("code", IntegratorCode)
-def test_every_integrator_is_its_kernel_and_its_adjoint(code):
-    robot = arm("two_link")
-    batch = problem(robot, steps=3, integrator=code.name.lower(), substeps=2)
-    assert_engines_agree(law_for(robot, "slotine-li"), batch, squared_error)
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_every_integrator_is_its_kernel_and_its_adjoint(code, substeps):
+    """With friction in the plant and in the law."""
+    robot, friction = arm("two_link"), nbs.JointFriction(np.array([0.3, 0.2]), np.array([0.4, 0.0]), 0.5)
+    batch = problem(robot, steps=5, integrator=code.name.lower(), substeps=substeps, friction=friction)
+    assert_engines_agree(law_for(robot, friction=friction), batch, squared_error)
 
 
 @pytest.mark.parametrize("code", JointCode)
 def test_every_joint_has_its_kernel(code):
     """A unit mass a metre from its axis: it turns and slides against gravity, which is across the axis and along it."""
-    about = np.zeros(3) if code is JointCode.PRISMATIC else np.array([1.0, 0.0, 0.0])
-    gravity = np.array([0.0, 0.0, -9.0]) if code is JointCode.PRISMATIC else np.array([0.0, -9.0, 0.0])
-    axis, slides = np.array([0.0, 0.0, 1.0]), code is JointCode.PRISMATIC
-    link = Link(0, slides, axis, np.eye(3), np.zeros(3), 1.0, about, np.zeros((3, 3)))
-    tau, tree = np.empty(1), pack_tree([link], gravity)
+    slides = code is JointCode.PRISMATIC
+    about, gravity = (np.zeros(3), [0.0, 0.0, -9.0]) if slides else (np.array([1.0, 0.0, 0.0]), [0.0, -9.0, 0.0])
+    link = Link(0, slides, np.array([0.0, 0.0, 1.0]), np.eye(3), np.zeros(3), 1.0, about, np.zeros((3, 3)))
+    tau, tree = np.empty(1), pack_tree([link], np.array(gravity))
     tree_torque(Motion(*np.array([[0.0], [3.0], [3.0], [2.0]])), tree, np.empty(tree_workspace(tree)), tau)
     np.testing.assert_allclose(tau, [11.0])
 
@@ -136,7 +113,7 @@ def test_every_joint_has_its_kernel(code):
 def test_names_and_codes_are_the_same_lists():
     assert {code.name.lower() for code in IntegratorCode} == set(INTEGRATORS)
     assert {code.name.lower() for code in DampingCode} == set(DAMPINGS)
-    assert set(WRITTEN) == set(LawCode)
+    assert {law_for(arm("two_link"), name).packed_law().layout[LAW] for name in COMPILED} == set(LawCode)
     assert set(ACTIVATIONS) == set(ActivationCode)
 
 
@@ -173,11 +150,7 @@ def test_an_unknown_law_gives_no_number(friction):
         given, out = states(2, seed=0), np.zeros((3, 2))
         assert law_signals(*given, *law, np.zeros(1000), out)
         assert np.isnan(out).all()
-        room, found = np.zeros(1000), np.zeros((2, 2))
-        (q, v, *target), law_bar = given, Packed(law.layout, np.zeros_like(law.weights))
-        bars = Signals(*np.ones((3, 2)))
-        law_adjoint(State(q, v), Target(*target), law, room, bars, State(*found), law_bar)
-        assert np.isnan(found).all()
+        assert np.isnan(adjoint_of(law, given, np.ones((3, 2)))[:2]).all()
 
 
 def test_unknown_parts_give_no_number():
@@ -207,35 +180,32 @@ def test_an_unknown_integrator_gives_no_number():
 
 
 def run_and_adjoint(name: str, arm_name: str, integrator: str, substeps: int, code: int | None = None):
-    """A motion, its cotangents and its scratch space, with 64 guard numbers behind what is asked for."""
+    """A motion, its cotangents and the last number of the scratch space they used."""
     robot = arm(arm_name)
     steps, n, law = 2, robot.nv, law_for(robot, name)
     batch, packed = problem(robot, steps, 1, integrator=integrator, substeps=substeps), law.packed_law()
     scene = _scene(law, batch.loop)
     scene = scene if code is None else scene._replace(integrator=code)
-    size = rollout_workspace(packed, scene)
-    room = np.full(size + 64, np.nan)
     shapes = ((steps + 1, n), (steps + 1, n), (steps, n), (steps + 1, 2, n))
     motion, bars = Rollout(*(np.zeros(s) for s in shapes)), Rollout(*(np.ones(s) for s in shapes))
     motion.q[0], motion.v[0], bars.memory[:] = batch.q0[0], batch.v0[0], 0.0
     course = Course(batch.aims[0], batch.leads, batch.tau_d[0])
-    rollout(course, scene, packed, room[:size], motion)
-    forward = room.copy()
-    room[:] = np.nan
+    with scratch(rollout_workspace(packed, scene)) as room:
+        rollout(course, scene, packed, room, motion)
     law_bar = Packed(packed.layout, np.zeros_like(packed.weights))
-    rollout_adjoint(course, scene, packed, room[:size], motion, bars, np.empty((steps, n)), law_bar)
-    return motion, bars, (size, forward, room)
+    with scratch(len(room)) as room:
+        rollout_adjoint(course, scene, packed, room, motion, bars, np.empty((steps, n)), law_bar)
+    return motion, bars, room[-1]
 
 
-@pytest.mark.parametrize("name", WRITTEN.values())
+@pytest.mark.parametrize("name", COMPILED)
 @pytest.mark.parametrize(("arm_name", "integrator", "substeps"), [("two_link", "euler", 1), ("panda", "rk4", 3)])
 def test_rollouts_stay_within_their_scratch_space(name, arm_name, integrator, substeps):
-    motion, bars, (size, *rooms) = run_and_adjoint(name, arm_name, integrator, substeps)
+    motion, bars, last = run_and_adjoint(name, arm_name, integrator, substeps)
     assert np.isfinite(motion.q).all()
     assert np.isfinite(bars.q).all()
-    assert all(np.isnan(room[size:]).all() for room in rooms)
-    if name != "nbs":  # whose networks leave room for rows that are padded
-        assert np.isfinite(rooms[1][size - 1])
+    if not name.startswith("nbs"):  # whose networks leave room for rows that are padded
+        assert np.isfinite(last)
 
 
 # Kernels as Python.
@@ -245,7 +215,7 @@ def numbers() -> dict[str, np.ndarray]:
     """Torques of all laws, of a model beside a law's kernel, and of a tree; motions with their gradients."""
     robot, found = arm("two_link", 30.0), {}
     q, v, *reference = given = np.random.default_rng(0).normal(size=(5, 2))
-    for name in WRITTEN.values():
+    for name in COMPILED:
         law = law_for(robot, name).compile()
         found[name], _ = law.step(law.initial_memory(q), q, v, nbs.Reference(*reference), 0.01)
     compiled = CompiledController(law_for(robot).packed_law(), nbs.PinocchioDynamics(robot))

@@ -6,19 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
-from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.equations import bias, energy, forward_dynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.motions.references import Sinusoid
-from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.integrators import INTEGRATORS
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
-from nbs_pin.simulation.simulate import simulate
+from tests.test_simulation import Law
 
 GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # prismatic, revolute and continuous
 PUBLISHED = {  # docs/theory.md §8: row k is the state after k − 1 steps of 1 ms
@@ -28,20 +27,6 @@ PUBLISHED = {  # docs/theory.md §8: row k is the state after k − 1 steps of 1
     5000: (-3.257532, 0.5981221, 2.3077562),
     10012: (-1.9568236, -2.260467, -20.141457),
 }
-
-
-class GravityPlus(MemorylessController):
-    """τ = G(q) + a_ref, so that a reference's acceleration is a torque of time."""
-
-    def __init__(self, dynamics, gravity=1.0):
-        self.dynamics, self.gravity = dynamics, gravity
-
-    @property
-    def nv(self):
-        return self.dynamics.nv
-
-    def torque(self, q, v, q_ref, v_ref, a_ref):
-        return self.gravity * self.dynamics.gravity(q) + a_ref
 
 
 @pytest.fixture(scope="module")
@@ -54,41 +39,26 @@ def middle(robot):
     return np.where(inside, 0.5 * (np.where(inside, robot.lower, 0.0) + np.where(inside, robot.upper, 0.0)), 0.3)
 
 
-def smooth_torque(robot, dynamics, seed=0):
-    """Some newton metres on each joint, in proportion to the inertia it moves, at 2 to 5 rad/s."""
-    rng = np.random.default_rng(seed)
-    inertia = np.diagonal(dynamics.mass_matrix(middle(robot)))
-    return Sinusoid(
-        rng.uniform(1.0, 3.0, robot.nv) * inertia, rng.uniform(2.0, 5.0, robot.nv), rng.uniform(-3, 3, robot.nv)
-    )
+def run_of(plant, dynamics, duration):
+    """Gravity compensated, and some newton metres on each joint, in proportion to its inertia, at 2 to 5 rad/s."""
+    rng, q0, n = np.random.default_rng(0), middle(dynamics.robot), dynamics.nv
+    inertia = np.diagonal(dynamics.mass_matrix(q0))
+    amplitude, frequency = rng.uniform(1.0, 3.0, n) * inertia, rng.uniform(2.0, 5.0, n)
+    law = Law(lambda q, v, ref: dynamics.gravity(q), n)
+    given = {"disturbance": nbs.SinusoidalTorque(amplitude, frequency, rng.uniform(-3.0, 3.0, n)), "q0": q0}
+    return nbs.simulate(plant, law, nbs.Hold(q0), duration, 0.001, effort_limit=np.inf, **given)
 
 
-class AccelerationOnly:
-    """A reference whose a is the q of another: a torque of time for `GravityPlus`."""
-
-    def __init__(self, torque):
-        self.torque = torque
-
-    def __call__(self, t):
-        values = self.torque(t)
-        return type(values)(0.0 * values.q, 0.0 * values.q, values.q)
-
-
-@pytest.mark.parametrize("name", [*ROBOT_NAMES, GANTRY])
+@pytest.mark.parametrize("name", [*nbs.ROBOT_NAMES, GANTRY])
 def test_mujoco_and_pinocchio_move_every_arm_alike(name):
     robot = load_robot(name)
     dynamics = PinocchioDynamics(robot)
-    reference = AccelerationOnly(smooth_torque(robot, dynamics))
-    runs = [
-        simulate(plant, GravityPlus(dynamics), reference, 1.0, 0.001, q0=middle(robot), effort_limit=np.inf)
-        for plant in (MujocoPlant(robot), DynamicsPlant(dynamics))
-    ]
-    assert np.abs(runs[0].q[-1] - runs[0].q[0]).max() > 0.05
-    np.testing.assert_allclose(runs[0].q, runs[1].q, rtol=0, atol=1e-10, equal_nan=False)
-    np.testing.assert_allclose(runs[0].v, runs[1].v, rtol=0, atol=1e-10, equal_nan=False)
+    ours, theirs = (run_of(plant, dynamics, 0.5) for plant in (DynamicsPlant(dynamics), MujocoPlant(robot)))
+    assert np.abs(ours.q[-1] - ours.q[0]).max() > 0.05
+    np.testing.assert_allclose((theirs.q, theirs.v), (ours.q, ours.v), rtol=0, atol=1e-10, equal_nan=False)
 
 
-@pytest.mark.parametrize("name", [*ROBOT_NAMES, GANTRY])
+@pytest.mark.parametrize("name", [*nbs.ROBOT_NAMES, GANTRY])
 def test_mujoco_and_pinocchio_agree_on_mass_bias_and_acceleration(name):
     robot = load_robot(name)
     mujoco, dynamics = MujocoPlant(robot), PinocchioDynamics(robot)
@@ -96,22 +66,16 @@ def test_mujoco_and_pinocchio_agree_on_mass_bias_and_acceleration(name):
     tau = bias(dynamics, q, v) + np.einsum("bij,bj->bi", dynamics.mass_matrix(q), tau)
     np.testing.assert_allclose(mujoco.mass_matrix(q), dynamics.mass_matrix(q), rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(mujoco.bias(q, v), bias(dynamics, q, v), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(
-        mujoco.acceleration(q, v, tau), forward_dynamics(dynamics, q, v, tau), rtol=1e-10, atol=1e-10
-    )
+    ours = forward_dynamics(dynamics, q, v, tau)
+    np.testing.assert_allclose(mujoco.acceleration(q, v, tau), ours, rtol=1e-10, atol=1e-10)
 
 
-def test_semi_implicit_euler_is_mujocos_euler(panda):
+@pytest.mark.parametrize("integrator", ["euler", "implicitfast"])
+def test_semi_implicit_euler_is_mujocos_euler(panda, integrator):
     dynamics = PinocchioDynamics(panda)
-    reference = AccelerationOnly(smooth_torque(panda, dynamics))
-    plants = (
-        MujocoPlant(panda, "euler"),
-        MujocoPlant(panda, "implicitfast"),
-        DynamicsPlant(dynamics, "semi_implicit_euler"),
-    )
-    runs = [simulate(p, GravityPlus(dynamics), reference, 0.3, 0.001, q0=middle(panda)) for p in plants]
-    np.testing.assert_allclose(runs[0].q, runs[2].q, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(runs[1].q, runs[2].q, rtol=0, atol=1e-10)
+    plants = MujocoPlant(panda, integrator), DynamicsPlant(dynamics, "semi_implicit_euler")
+    theirs, ours = (run_of(plant, dynamics, 0.3) for plant in plants)
+    np.testing.assert_allclose(theirs.q, ours.q, rtol=0, atol=1e-10)
 
 
 def test_three_link_passes_through_the_published_rows():
@@ -212,7 +176,6 @@ def test_kept_dry_friction_holds_an_arm_that_otherwise_falls():
 
 
 def test_friction_takes_energy_and_comes_in_both_array_kinds():
-    torch = pytest.importorskip("torch")
     friction = JointFriction(np.array([0.5, 0.0]), np.array([1.0, 2.0]), 0.1)
     v = np.linspace(-2.0, 2.0, 41)[:, None] * np.ones(2)
     torque = friction.torque(v)
@@ -227,39 +190,28 @@ def test_friction_takes_energy_and_comes_in_both_array_kinds():
 def test_gravity_is_the_robots():
     robot = load_robot("panda", gravity=[1.0, -2.0, 3.0])
     q = middle(robot)
-    np.testing.assert_allclose(
-        MujocoPlant(robot).bias(q, 0.0 * q), PinocchioDynamics(robot).gravity(q), rtol=0, atol=1e-12
-    )
+    expected = PinocchioDynamics(robot).gravity(q)
+    np.testing.assert_allclose(MujocoPlant(robot).bias(q, 0.0 * q), expected, rtol=0, atol=1e-12)
 
 
-def test_effort_limits_do_not_clamp_inside_mujoco(panda):
-    q, zero = middle(panda), np.zeros(7)
-    tau = 20.0 * panda.effort_limit
-    expected = forward_dynamics(PinocchioDynamics(panda), q, zero, tau)
-    np.testing.assert_allclose(MujocoPlant(panda).acceleration(q, zero, tau), expected, rtol=1e-9)
+@pytest.mark.parametrize("joint_friction", ["drop", "keep"])
+@pytest.mark.parametrize(("beyond", "torque"), [(-0.5, 20.0), (0.5, 0.0)])
+def test_limits_of_effort_and_position_are_none_of_mujocos(panda, joint_friction, beyond, torque):
+    q, tau = panda.upper + beyond, torque * panda.effort_limit
+    expected = forward_dynamics(PinocchioDynamics(panda), q, 0 * q, tau)
+    plant = MujocoPlant(panda, joint_friction=joint_friction)
+    np.testing.assert_allclose(plant.acceleration(q, 0 * q, tau), expected, rtol=1e-9)
 
 
-def test_position_limits_do_not_stop_an_arm(panda):
-    q = panda.upper + 0.5
-    expected = forward_dynamics(PinocchioDynamics(panda), q, 0 * q, 0 * q)
-    for choice in ("drop", "keep"):
-        plant = MujocoPlant(panda, joint_friction=choice)
-        np.testing.assert_allclose(plant.acceleration(q, 0 * q, 0 * q), expected, rtol=1e-9)
+NOT_FINITE = [(k, value, "expected finite") for k in range(3) for value in (np.nan, np.inf)]
 
 
-@pytest.mark.parametrize("argument", [0, 1, 2])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_mujoco_never_sees_a_number_that_is_not_finite(panda, argument, value):
-    arguments = [np.zeros(7), np.zeros(7), np.zeros(7)]
-    arguments[argument][3] = value
-    with pytest.raises(SimulationDiverged, match="expected finite"):
-        MujocoPlant(panda).step(*arguments, 0.001)
-
-
-@pytest.mark.parametrize(("argument", "cause"), [(0, "QPOS"), (1, "QVEL"), (2, "QACC")])
-def test_mujoco_warnings_raise_with_their_cause(panda, argument, cause):
-    arguments = [np.zeros(7), np.zeros(7), np.zeros(7)]
-    arguments[argument] += 1e15
+@pytest.mark.parametrize(
+    ("argument", "value", "cause"), [*NOT_FINITE, (0, 1e15, "QPOS"), (1, 1e15, "QVEL"), (2, 1e15, "QACC")]
+)
+def test_numbers_that_mujoco_cannot_take_are_raised_with_their_cause(panda, argument, value, cause):
+    arguments = np.zeros((3, 7))
+    arguments[argument, 3] = value
     with pytest.raises(SimulationDiverged, match=cause):
         MujocoPlant(panda).step(*arguments, 0.001)
 

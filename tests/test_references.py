@@ -165,24 +165,17 @@ def test_a_disturbance_for_another_arm_is_refused(kind, size, batch):
         assert kind(torque)(0.1, q, q).shape == q.shape
 
 
-def resting(name):
-    robot = load_robot(name)
-    lower, upper = robot.sampling_range
-    return robot, resting_posture(robot), lower, upper
-
-
 @pytest.mark.parametrize("name", ROBOT_NAMES)
 def test_the_resting_posture_is_in_the_middle_half_of_the_range(name):
-    _, posture, lower, upper = resting(name)
-    assert (np.abs(posture - 0.5 * (lower + upper)) <= 0.25 * (upper - lower) + 1e-12).all()
+    robot = load_robot(name)
+    lower, upper = robot.sampling_range
+    assert (np.abs(resting_posture(robot) - 0.5 * (lower + upper)) <= 0.25 * (upper - lower) + 1e-12).all()
 
 
 def test_the_resting_posture_of_a_range_beyond_a_turn_is_its_middle(tmp_path):
-    text = find("two_link").path.read_text()
-    text = re.sub(r'lower="[^"]*" upper="[^"]*"', 'lower="3.5" upper="6"', text)
-    path = tmp_path / "far.urdf"
-    path.write_text(text)
-    robot = load_robot(path, gravity=0.0)
+    text = re.sub(r'lower="[^"]*" upper="[^"]*"', 'lower="3.5" upper="6"', find("two_link").path.read_text())
+    (tmp_path / "far.urdf").write_text(text)
+    robot = load_robot(tmp_path / "far.urdf", gravity=0.0)
     np.testing.assert_array_equal(resting_posture(robot), [4.75, 4.75])
     check_reference(Sinusoid.for_robot(robot), robot, 7.0)
 
@@ -315,10 +308,10 @@ def test_a_stated_velocity_must_be_that_of_the_motion(tmp_path):
             load_reference(tmp_path / "motion.npz", JOINTS)
 
 
-def test_a_missing_file_is_not_found(tmp_path):
-    for suffix in ("csv", "npz"):
-        with pytest.raises(FileNotFoundError):
-            load_reference(tmp_path / f"none.{suffix}", JOINTS)
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_a_missing_file_is_not_found(tmp_path, suffix):
+    with pytest.raises(FileNotFoundError):
+        load_reference(tmp_path / f"none.{suffix}", JOINTS)
 
 
 def test_a_motion_beyond_the_arms_limits_is_refused_with_joint_and_time():

@@ -1,6 +1,5 @@
 """`nbs-pin train`: what it writes and prints, what it refuses, and that Ctrl-C and --resume lose nothing."""
 
-import json
 import os
 import pty
 import signal
@@ -16,6 +15,7 @@ from nbs_pin.base.versions import versions
 from nbs_pin.commands import train as training
 from nbs_pin.reports.charts import plot_training
 from nbs_pin.training import evaluation, trainer
+from tests.commands import check_results_are_kept_unless_forced, contents, refusal, summary
 from tests.test_plotting import drawn, png_size, sinusoid_run
 
 QUICK = ("--starts", "6", "--duration", "0.3", "--frequencies", "1,2", "--epochs", "6", "--bandwidth", "4")
@@ -32,14 +32,6 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained") / "two_link"
     assert train(folder) == 0
     return folder
-
-
-def summary(folder):
-    return json.loads((folder / "summary.json").read_text())
-
-
-def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def outcome(folder):
@@ -89,8 +81,8 @@ def test_fresh_starts_are_judged_as_simulate_would(folder):
     loop = training.Loop.of(plant, 2, 0.9, 0.005, plant_step=0.005, effort_limit=None, lookahead=None)
     batch = training.fresh_batch(loop, references, 0.3, seed=0)
     run = training.compared(law, batch)
-    times = nbs.metrics.convergence_time(run)
-    assert summary(folder)["figures"]["after"]["convergence_time_worst_s"] == times.max()
+    worst = nbs.metrics.convergence_time(run).max()
+    assert summary(folder)["figures"]["after"]["convergence_time_worst_s"] == worst
     for k, reference in ((3, references[0]), (31, references[1])):
         again = nbs.simulate(plant, law, reference, 0.9, 0.005, q0=batch.q0[k], plant_step=0.005)
         np.testing.assert_allclose(run.q[:, k], again.q, atol=1e-9)
@@ -99,16 +91,12 @@ def test_fresh_starts_are_judged_as_simulate_would(folder):
 
 def test_a_trained_controller_can_be_tracked_and_trained_on(folder, tmp_path, capsys):
     saved = str(folder / "controller.nbs")
-    assert (
-        cli.main(["track", "two_link", "--controller", saved, "--duration", "0.1", "--out", str(tmp_path / "a")]) == 0
-    )
+    track = ["track", "two_link", "--controller", saved, "--duration", "0.1", "--out", str(tmp_path / "a")]
+    assert cli.main(track) == 0
     assert len(summary(tmp_path / "a")["settings"]["controller_sha256"]) == 64
-    run = nbs.Run.load(tmp_path / "a" / "run.npz")
-    state = (run.q[5], run.v[5], run.q_ref[5], run.v_ref[5], run.a_ref[5])
-    plain = nbs.simulate(nbs.MujocoPlant(nbs.load_robot("two_link")), nbs.load(saved), nbs.Sinusoid.for_robot(
-        nbs.load_robot("two_link")), 0.1, 0.001)  # fmt: skip
-    np.testing.assert_array_equal(run.tau, plain.tau)
-    assert np.isfinite(state).all()
+    robot = nbs.load_robot("two_link")
+    plain = nbs.simulate(nbs.MujocoPlant(robot), nbs.load(saved), nbs.Sinusoid.for_robot(robot), 0.1, 0.001)
+    np.testing.assert_array_equal(nbs.Run.load(tmp_path / "a" / "run.npz").tau, plain.tau)
     assert train(tmp_path / "b", "--controller", saved, "--epochs", "1") == 0
     assert summary(tmp_path / "b")["history"][0] == summary(folder)["history"][summary(folder)["figures"]["best_epoch"]]
 
@@ -150,18 +138,17 @@ def test_ctrl_c_at_any_moment_and_resume_are_one_training(folder, tmp_path, caps
             raise KeyboardInterrupt
         return value
 
-    options = ("--optimiser", optimiser)
-    whole = folder
+    options, whole = ("--optimiser", optimiser), folder
     if optimiser == "lbfgs":
         whole = tmp_path / "whole"
         assert train(whole, *options) == 0
     monkeypatch.setattr(trainer, "running_cost", counted)
     assert train(tmp_path / "parts", *options) == 130
     assert "interrupted" in capsys.readouterr().err
-    assert summary(tmp_path / "parts")["interrupted"]
-    assert len(summary(tmp_path / "parts")["history"]) in range(1, 7)
-    assert train(tmp_path / "parts", *options) == 2  # neither --resume nor --force
-    assert "--resume to continue it" in capsys.readouterr().err
+    said = summary(tmp_path / "parts")
+    assert said["interrupted"]
+    assert len(said["history"]) in range(1, 7)
+    assert "--resume to continue it" in refusal(train(tmp_path / "parts", *options), capsys)
     assert train(tmp_path / "parts", *options, "--resume") == 0
     assert outcome(tmp_path / "parts") == outcome(whole)
 
@@ -206,30 +193,22 @@ def test_a_real_ctrl_c_at_a_terminal(tmp_path):
 
 
 def test_results_of_another_training_are_kept_unless_forced(tmp_path, capsys):
-    assert train(tmp_path, "--epochs", "1") == 0
-    before = contents(tmp_path)
-    assert train(tmp_path, "--epochs", "1", "--seed", "2") == 2
-    assert "training.ckpt of another or an unfinished training" in capsys.readouterr().err
-    assert contents(tmp_path) == before
-    assert train(tmp_path, "--epochs", "1") == 0  # the very same
-    assert train(tmp_path, "--epochs", "1", "--seed", "2", "--force") == 0
+    words = "training.ckpt of another or an unfinished training"
+    check_results_are_kept_unless_forced(train, tmp_path, ["--seed", "2"], words, capsys)
     assert summary(tmp_path)["settings"]["seed"] == 2
 
 
 @pytest.mark.parametrize("change", ["--seed=1", "--bandwidth=7", "--starts=8", "--effort-limit=50", "--epochs=7"])
 def test_a_resume_of_another_training_is_refused(folder, capsys, change):
     before = contents(folder)
-    assert train(folder, "--resume", change) == 2
-    assert "not a checkpoint of this training" in " ".join(capsys.readouterr().err.split())
+    assert "not a checkpoint of this training" in refusal(train(folder, "--resume", change), capsys)
     assert contents(folder) == before
 
 
 @pytest.mark.parametrize("command", ["track", "train"])
 def test_a_controller_of_another_arm_is_refused_in_a_sentence(folder, tmp_path, capsys, command):
-    saved = str(folder / "controller.nbs")
-    assert cli.main([command, "panda", "--controller", saved, "--out", str(tmp_path / "run")]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "is for the arm 'two_link'" in line
+    words = [command, "panda", "--controller", str(folder / "controller.nbs"), "--out", str(tmp_path / "run")]
+    assert "is for the arm 'two_link'" in refusal(cli.main(words), capsys)
     assert not (tmp_path / "run").exists()
 
 
@@ -254,16 +233,8 @@ def test_a_controller_of_another_arm_is_refused_in_a_sentence(folder, tmp_path, 
     ],
 )
 def test_what_cannot_be_trained_is_refused_in_a_sentence(tmp_path, capsys, options, words):
-    assert train(tmp_path / "run", *options.split()) == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if "warning" not in line]
-    assert line.startswith("nbs-pin: error: ")
-    assert words in line
+    assert words in refusal(train(tmp_path / "run", *options.split()), capsys)
     assert not (tmp_path / "run").exists()
-
-
-def test_help_shows_an_example(capsys):
-    assert cli.main(["train", "--help"]) == 0
-    assert "Example: nbs-pin train panda" in capsys.readouterr().out
 
 
 # The picture.
@@ -303,10 +274,8 @@ def test_fresh_motions_that_diverge_are_told_and_not_counted(tmp_path, capsys):
 @pytest.mark.parametrize("without_kernels", [False, True])
 def test_one_motion_that_diverges_leaves_the_others_their_figures(monkeypatch, without_kernels):
     robot = nbs.load_robot("two_link").with_effort_limit(np.inf)
-    plant, law = (
-        nbs.DynamicsPlant(nbs.PinocchioDynamics(robot)),
-        nbs.ComputedTorque(nbs.PinocchioDynamics(robot), kp=25.0, kd=10.0),
-    )
+    dynamics = nbs.PinocchioDynamics(robot)
+    plant, law = nbs.DynamicsPlant(dynamics), nbs.ComputedTorque(dynamics, kp=25.0, kd=10.0)
     loop = training.Loop.of(plant, 2, 0.8, 0.05, plant_step=0.05, effort_limit=None, lookahead=None)
     batch = training.fresh_batch(loop, [nbs.Sinusoid.for_robot(robot, 1.0)], 0.1, seed=0, starts=5)
     batch.v0[2] = 1e3

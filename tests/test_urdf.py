@@ -28,6 +28,7 @@ ARM = """<?xml version="1.0"?>
   <joint name="flange" type="fixed"><parent link="l2"/><child link="tool"/></joint>
 </robot>
 """
+TOOL = '<link name="tool"/>'
 LIMIT1 = '<limit lower="-1" upper="2" effort="10" velocity="3"/>'
 INERTIA2 = 'ixx="0.3" ixy="0" ixz="0" iyy="0.3" iyz="0" izz="0.3"'
 BODY2 = re.search(r'<link name="l2">.*?</link>', ARM, re.S).group()
@@ -58,13 +59,7 @@ REFUSED = {
     "U4 nan": ('"1.5"', '"nan"', 4, ["link 'l1'", "mass", "'nan'", "fix <mass value=…>"]),
     "U4 inf": ('"1.5"', '"inf"', 4, ["link 'l1'", "'inf'"]),
     "U4 negative": ('"1.5"', '"-1"', 4, ["link 'l1'", "'-1.0'", ">= 0"]),
-    "U4 text": ('"1.5"', '"heavy"', 4, ["'heavy'"]),
-    "U4 comma": ('"1.5"', '"1,5"', 4, ["'1,5'"]),
-    "U4 unit": ('"1.5"', '"1kg"', 4, ["'1kg'"]),
-    "U4 python": ('"1.5"', '"1_0"', 4, ["'1_0'"]),
-    "U4 other digits": ('"1.5"', '"٣"', 4, ["'٣'"]),
-    "U4 overflow": ('"1.5"', '"1e999"', 4, ["'1e999'"]),
-    "U4 empty": ('"1.5"', '""', 4, ["''"]),
+    **{f"U4 '{x}'": ('"1.5"', f'"{x}"', 4, [f"'{x}'"]) for x in ("heavy", "1,5", "1kg", "1_0", "٣", "1e999", "")},
     "U4 no value": ('<mass value="1.5"/>', "<mass/>", 4, ["<mass> states no value"]),
     "U4 no mass": ('<mass value="1.5"/>', "", 4, ["<inertial> has no <mass>"]),
     "U4 no inertia": (f"<inertia {INERTIA2}/>", "", 6, ["link 'l2'", "<inertial> has no <inertia>"]),
@@ -72,13 +67,7 @@ REFUSED = {
     "U4 inertia text": ('ixx="0.1"', 'ixx="0.1m"', 5, ["inertia ixx '0.1m'"]),
     "U4 inertia missing": ('ixy="0" ', "", 5, ["<inertia> states no ixy"]),
     "U5 no inertial": (BODY2, '<link name="l2"/>', 10, ["joint 'j2'", "link 'l2'", "no mass"]),
-    "U5 mass 0": (
-        BODY2,
-        '<link name="l2"><inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'
-        "</inertial></link>",
-        10,
-        ["joint 'j2'", "no mass"],
-    ),
+    "U5 mass 0": (BODY2, re.sub(r'"[\d.]+"', '"0"', BODY2), 11, ["joint 'j2'", "no mass"]),
     "U5 mass 0, inertia": ('"2.5"', '"0"', 6, ["link 'l2'", "mass value '0'"]),
     "U6 negative": (INERTIA2, INERTIA2.replace('ixx="0.3"', 'ixx="-0.3"'), 7, ["not positive definite", "-0.3"]),
     "U6 indefinite": (INERTIA2, INERTIA2.replace('ixy="0"', 'ixy="0.4"'), 7, ["not positive definite", "-0.1"]),
@@ -106,12 +95,7 @@ REFUSED = {
     "U13 parent": ('parent link="l1"', 'parent link="nope"', 11, ["joint 'j2'", "parent link 'nope' is not defined"]),
     "U13 child": ('child link="tool"', 'child link="nope"', 13, ["child link 'nope' is not defined"]),
     "U13 no parent": ('<parent link="base"/>', "", 9, ["<joint> has no <parent>"]),
-    "U14 orphan": (
-        '<link name="tool"/>',
-        '<link name="tool"/><link name="lost"/>',
-        8,
-        ["not a tree", "'base', 'lost'"],
-    ),
+    "U14 orphan": (TOOL, TOOL + '<link name="lost"/>', 8, ["not a tree", "'base', 'lost'"]),
     "U14 cycle": ('parent link="base"', 'parent link="tool"', 9, ["not a tree", "'j1', 'j2', 'flange'", "cycle"]),
     "U14 self": ('parent link="l2"', 'parent link="tool"', 13, ["not a tree", "'flange'", "cycle"]),
     "U14 two parents": ('child link="tool"', 'child link="l1"', 13, ["not a tree", "also the child of joint 'j1'"]),
@@ -128,16 +112,11 @@ REFUSED = {
         ["joint 'j3'", "lock=['j3', 'j4']"],
     ),
     "U17": (LIMIT1, LIMIT1 + '<mimic joint="j2"/>', 10, ["mimic", "lock=['j1']"]),
-    "U18 xacro": (
-        '<link name="tool"/>',
-        '<xacro:macro name="m"/>',
-        8,
-        ["<xacro:macro> is not expanded", "xacro first"],
-    ),
+    "U18 xacro": (TOOL, '<xacro:macro name="m"/>', 8, ["<xacro:macro> is not expanded", "xacro first"]),
     "U18 property": ('"1.5"', '"${m}"', 4, ["'${m}'", "xacro"]),
-    "U18 undeclared": ('<link name="tool"/>', "<nope:macro/>", 8, ["not well-formed XML"]),
+    "U18 undeclared": (TOOL, "<nope:macro/>", 8, ["not well-formed XML"]),
     "U20 XInclude": (
-        '<link name="tool"/>',
+        TOOL,
         '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>',
         8,
         ["<xinclude:include>"],
@@ -305,7 +284,7 @@ def test_what_engines_read_is_what_was_checked(tmp_path):
 def test_links_without_inertia_are_part_of_the_body_they_are_fixed_to(tmp_path):
     """A massless flange that a joint moves is fine when a massive tool is fixed to it."""
     body = BODY2.replace('name="l2"', 'name="tool"')
-    text = ARM.replace(BODY2, '<link name="l2"/>').replace('<link name="tool"/>', body)
+    text = ARM.replace(BODY2, '<link name="l2"/>').replace(TOOL, body)
     assert load_robot(write(tmp_path, text)).model.inertias[2].mass == 2.5
 
 
@@ -329,7 +308,7 @@ def test_two_joints_on_one_axis_leave_a_singular_arm(tmp_path):
 
 
 def test_without_geometry_is_the_dynamics_alone(tmp_path):
-    drawn = mutated('<link name="tool"/>', '<link name="tool"><visual><nonsense/></visual><collision/></link>')
+    drawn = mutated(TOOL, '<link name="tool"><visual><nonsense/></visual><collision/></link>')
     drawn = drawn.replace("<link", '<material name="m"/>\n<!-- a comment --><link', 1)
     urdf, plain = read_urdf(write(tmp_path, drawn)), read_urdf(write(tmp_path, ARM))
     assert b"nonsense" in urdf.xml
