@@ -4,8 +4,8 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of torch wait for each other beside those of other workers
 
-import pytest  # noqa: E402
-from jaxtyping import config, install_import_hook  # noqa: E402
+import pytest
+from jaxtyping import config, install_import_hook
 
 CONTRACTS = {"test_dynamics", "test_controllers", "test_compiled", "test_plants", "test_networks", "test_lyapunov_laws"}
 """Test files that execute the annotations; elsewhere the checks would take more time than the tests."""
