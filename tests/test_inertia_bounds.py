@@ -1,6 +1,7 @@
 """Bounds on M(q) over all configurations: never left by sampled or adversarial poses, and not far from them."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pinocchio as pin
@@ -10,7 +11,7 @@ from scipy.optimize import minimize
 from nbs_pin import load_robot
 from nbs_pin.base.claims import Label
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.rounding import down, largest_eigenvalue, least_eigenvalue, up
+from nbs_pin.base.rounding import down, exceeds_every_perturbation, largest_eigenvalue, least_eigenvalue, up
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
 from nbs_pin.dynamics.structure import rigid_tree_claims
@@ -24,7 +25,7 @@ from nbs_pin.inertia.bounds import (
     trigonometric_bound,
 )
 from nbs_pin.inertia.lever_arms import lever_arms
-from nbs_pin.inertia.multipliers import Motions, least_by_multipliers, maximise
+from nbs_pin.inertia.multipliers import Motions, largest_by_multipliers, least_by_multipliers, maximise
 from nbs_pin.inertia.pose_grid import Plan
 
 FEW = 20_000
@@ -91,6 +92,20 @@ def poses_of(tree, rng, count):
     travel = np.where(tree.prismatic, tree.upper, 1.0)
     slides = np.where(rng.random(q.shape) < 0.5, np.sign(q), q / np.pi) * travel
     return np.where(tree.prismatic, slides, q)
+
+
+def test_two_branches_on_one_torso_are_bounded_by_multipliers():
+    """The solver's default merging of cliques panics on this tree, with an exception that is no `Exception`."""
+    model = pin.Model()
+    for axis, parent in zip(np.eye(3)[[2, 1, 1, 1, 2]], [0, 1, 1, 3, 4], strict=True):
+        place = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.3]))
+        joint = model.addJoint(parent, pin.JointModelRevoluteUnaligned(axis), place, f"joint{model.njoints}")
+        model.appendBodyToJoint(
+            joint, pin.Inertia.FromBox(1.0, 0.1, 0.1, 0.1), pin.SE3(np.eye(3), np.array([0, 0, 0.1]))
+        )
+    highest, lowest = extremes(model, np.eye(5), np.random.default_rng(0).uniform(-np.pi, np.pi, (2000, 5)), 1)
+    assert highest <= largest_by_multipliers(tree_of(model), np.eye(5)) <= 1.1 * highest
+    assert lowest / 1.1 <= least_by_multipliers(tree_of(model)) <= lowest
 
 
 @pytest.mark.parametrize("name", ["two_link", "panda", "ur5", "so100", "double_pendulum"])
@@ -313,6 +328,42 @@ def test_polynomials_that_are_nowhere_negative_between_samples(angles):
     if angles % 2 == 0:
         peak = 1.0 + np.cos(2.0 * (coarse - np.pi / angles))
         assert factor * peak.max() == pytest.approx(2.0)
+
+
+def pivots(matrix, shift):
+    """Those of A − shift·I in rational numbers, up to the first that is not positive."""
+    lower = np.tril(matrix) + np.tril(matrix, -1).T
+    a = [[Fraction(x) - (Fraction(shift) if i == j else 0) for j, x in enumerate(row)] for i, row in enumerate(lower)]
+    found = []
+    for k in range(len(a)):
+        found.append(a[k][k])
+        if a[k][k] <= 0:
+            break
+        for i in range(k + 1, len(a)):
+            factor = a[i][k] / a[k][k]
+            a[i] = [x - factor * y for x, y in zip(a[i], a[k], strict=True)]
+    return found
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_verified_matrix_is_positive_definite_in_exact_arithmetic(seed):
+    """Matrices at the edge: an eigenvalue within some ε of the radius, on either side, and entries of all sizes."""
+    rng = np.random.default_rng(seed)
+    n, radius = int(rng.integers(2, 7)), float(rng.choice([0.0, 1e-14, 1e-9, 1e-3]))
+    vectors = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    values = 10.0 ** rng.uniform(-6.0, 2.0, n)
+    values[0] = radius + float(rng.choice([-1.0, 1.0])) * 10.0 ** rng.uniform(-17.0, -11.0)
+    matrix = (vectors * values) @ vectors.T
+    if exceeds_every_perturbation(matrix, radius):
+        assert all(pivot > 0 for pivot in pivots(matrix, radius))
+    lacking = max(0.0, radius - values.min()) + 1e-12 * values.max() * n
+    assert exceeds_every_perturbation(matrix + lacking * np.eye(n), radius)
+
+
+@pytest.mark.parametrize("matrix", [np.diag([1.0, -1e-300]), np.diag([1.0, np.nan]), np.zeros((2, 2))])
+def test_what_is_not_positive_definite_is_not_verified(matrix):
+    assert not exceeds_every_perturbation(matrix, 0.0)
+    assert not exceeds_every_perturbation(np.eye(2), np.nan)
 
 
 def test_rounding_goes_the_safe_way():
