@@ -14,7 +14,8 @@ from .base.exceptions import (
 from .base.records import Reference as Reference, Run as Run
 from .certificates.admissible import Admissible as Admissible
 from .certificates.attack import Attack as Attack, attack as attack
-from .certificates.certify import Certificate as Certificate, certify as certify
+from .certificates.certificate import Certificate as Certificate
+from .certificates.certify import certify as certify
 from .certificates.monitor import Monitored as Monitored, monitor as monitor
 from .certificates.online_monitor import Watch as Watch
 from .certificates.propose import Proposal as Proposal, propose as propose

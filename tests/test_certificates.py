@@ -207,7 +207,8 @@ def test_one_joint_with_networks_stays_inside_its_bound(one_joint_arm, seed):
 def test_inertia_shaped_bounds_rest_on_chosen_constants_alone(name):
     robot = nbs.load_robot(name)
     law = nbs.NeuralBackstepping.for_robot(robot, bandwidth=8.0)
-    certificate = nbs.certify(law, np.full(robot.nv, 5.0))
+    none = nbs.JointFriction(np.zeros(robot.nv), np.zeros(robot.nv))
+    certificate = nbs.certify(law, np.full(robot.nv, 5.0), friction=none)
     gains = gains_for_robot(robot, law.dynamics, bandwidth=8.0, period=0.001)
     storage = (25.0 / gains.damping).sum() / (8.0 * 8.0)
     assert certificate.label is Label.PROVED

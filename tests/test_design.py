@@ -102,7 +102,7 @@ def test_errors_can_be_wished_for_each_joint_and_disturbances_be_balls():
         (5.0, 0.01, {"periods": 0.001}, "periods is '0.001', expected a list"),
         (5.0, 0.01, {"periods": "fast"}, "periods is fast, expected numbers"),
         (5.0, 0.01, {"reference": 3}, "the reference is '3', expected a motion"),
-        (5.0, 0.01, {"reference": nbs.Hold(np.zeros(3))}, "is not a finite motion of the 2 joints"),
+        (5.0, 0.01, {"reference": nbs.Hold(np.zeros(3))}, "is not a finite motion of the arm's 2 joints"),
         (5.0, 0.01, {"duration": -1.0}, "duration is -1"),
         (5.0, 0.01, {"dynamics": 3}, "dynamics is '3', expected a model of the 2 joints"),
         (0.0, 0.01, {}, "does not determine the gains"),

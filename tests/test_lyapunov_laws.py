@@ -64,7 +64,7 @@ def test_the_constants_bound_what_they_are_constants_of(name):
 @pytest.mark.parametrize("friction", [None, FRICTION])
 def test_slotine_and_lis_law_is_certified_and_keeps_its_word(friction):
     law = build_law("slotine-li", ROBOT, friction=friction)
-    bound = nbs.certify(law, np.full(3, 5.0))
+    bound = nbs.certify(law, np.full(3, 5.0), friction=friction)
     assert bound.label is Label.PROVED
     worst = nbs.attack(law, np.full(3, 5.0), rounds=3, starts=2)
     assert 0.0 < worst.error <= bound.error <= 4.0 * worst.error
@@ -77,7 +77,7 @@ def test_one_joint_under_slotine_and_lis_law_has_the_exact_worst_case():
     """The loop is (s + λ)(Ms + K)/M: a constant torque is the worst, and errs by τ/(λK)."""
     robot = nbs.load_robot("double_pendulum", lock=["joint2"])
     law = nbs.SlotineLi.for_robot(robot)
-    bound = nbs.certify(law, np.full(1, 0.1))
+    bound = nbs.certify(law, np.full(1, 0.1), friction=nbs.JointFriction(np.zeros(1), np.zeros(1)))
     assert bound.error == pytest.approx(0.1 / float(law.rate[0] * law.gain[0]), rel=1e-6)
 
 

@@ -593,7 +593,8 @@ def fitted(trajectories, seed=0, doubt=1e-6, **changes) -> Mismatch:
     q, v = np.random.default_rng(seed).uniform(0.1, 1.0, (2, 20, trajectories))
     size = 0.5 * q + 0.2 * v
     chance = violation_chance(trajectories, doubt)
-    whole = Mismatch(0.5, 0.2, 0.1, chance, doubt, trajectories, np.ones(3), np.arange(20.0), q, v, size)
+    drawn = (1.0, np.ones(3), np.ones(3), np.zeros((20, 3)), np.ones(3))
+    whole = Mismatch(0.5, 0.2, 0.1, chance, doubt, trajectories, np.ones(3), np.arange(20.0), q, v, size, *drawn)
     return whole._replace(**changes)
 
 

@@ -16,6 +16,7 @@ from nbs_pin.benchmarks.serial_chains import serial_chain
 from nbs_pin.certificates import one_joint as one_joint_bounds
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.margins import check_box, effort_margin, position_margin, sampled_control
+from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.gains import check_sampling, pd_gains, warn_if_too_fast
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -102,9 +103,9 @@ def test_the_longest_period_and_delay_are_the_rules_of_the_theory(seed):
     speed = omega + damping / mass
     assert hold == pytest.approx(2.0 / (speed + rate * stiffness), rel=1e-9)
     assert delay == pytest.approx(0.5 * np.pi / speed, rel=1e-9)
-    for period, holds in ((0.999 * hold, True), (1.001 * hold, False)):
-        (condition,) = sampled_control(law, period)[1]
-        assert (condition.holds, condition.left, condition.right) == (holds, hold, period)
+    for period, holds in ((0.4999 * hold, True), (0.5001 * hold, False)):
+        condition, _ = sampled_control(law, period)[1]
+        assert (condition.holds, condition.left, condition.right) == (holds, 0.5 * hold, period)
 
 
 @pytest.mark.parametrize(("share", "grows"), [(0.9, False), (1.1, True)])
@@ -141,7 +142,7 @@ def test_room_to_a_stop_is_measured_at_both_ends(side, joint):
     q = middle.copy()
     q[joint] = robot.lower[joint] + gap if side == "lower" else robot.upper[joint] - gap
     for error, holds in ((0.99 * gap, True), (1.01 * gap, False)):
-        (condition,) = position_margin(robot, np.full(7, error), nbs.Hold(q), 1.0)
+        (condition,) = position_margin(robot, np.full(7, error), SampledMotion.of(nbs.Hold(q), 7, 1.0))
         assert condition.name.startswith(f"room of {robot.joint_names[joint]} ")
         assert condition.left == pytest.approx(gap)
         assert (condition.right, condition.holds) == (error, holds)
@@ -185,7 +186,7 @@ def test_the_torque_told_is_what_the_effort_limit_must_exceed(norm):
     needed = np.abs(nbs.inverse_dynamics(dynamics, *motion(t))).max(axis=0) + (3.0 if norm else np.array([3.0, 2.0]))
     for share, holds in ((1.001, True), (0.999, False)):
         arm = robot.with_effort_limit(share * needed)
-        (condition,) = effort_margin(arm, dynamics, admissible, motion, 10.0)
+        (condition,) = effort_margin(arm, dynamics, admissible, SampledMotion.of(motion, 2, 10.0))
         assert condition.holds is holds
         assert condition.right in needed
 

@@ -54,6 +54,16 @@ class Mismatch(NamedTuple):
     """‖v‖ [rad/s]."""
     size: Float[np.ndarray, "rows starts"]
     """‖δ‖ [N·m]."""
+    duration: float
+    """Length of the trajectories [s]."""
+    start_errors: JointArray
+    """Largest |q(0) ⊖ q_d(0)| among the starts, per joint [rad]."""
+    start_speeds: JointArray
+    """Largest |v(0) − v_d(0)| among the starts, per joint [rad/s]."""
+    q_ref: Float[np.ndarray, "rows n"]
+    """q_d of the first trajectory [rad]."""
+    disturbance: JointArray
+    """Largest |τ_d| in the trajectories, per joint [N·m]."""
 
     def bound(self, q_norm: Float[np.ndarray, "*x"], v_norm: Float[np.ndarray, "*x"]) -> Float[np.ndarray, "*x"]:
         """a‖q‖ + b‖v‖ + c [N·m]."""
@@ -92,7 +102,22 @@ def mismatch(
     first = np.concatenate([x[0].reshape(-1, run.nv) for x in (q, v)], axis=1)
     count = len(np.unique(first, axis=0))
     rms = np.sqrt(np.mean(delta.reshape(-1, run.nv) ** 2, axis=0))
-    return Mismatch(*constants, violation_chance(count, doubt), doubt, count, rms, run.t[:-1], *norms)
+    return Mismatch(
+        *constants,
+        violation=violation_chance(count, doubt),
+        doubt=doubt,
+        trajectories=count,
+        rms=rms,
+        t=run.t[:-1],
+        q_norm=norms[0],
+        v_norm=norms[1],
+        size=norms[2],
+        duration=float(run.t[-1] - run.t[0]),
+        start_errors=np.abs(model.difference(run.q[0], run.q_ref[0])).reshape(-1, run.nv).max(axis=0),
+        start_speeds=np.abs(run.v[0] - run.v_ref[0]).reshape(-1, run.nv).max(axis=0),
+        q_ref=run.q_ref[:-1].reshape(len(q), -1, run.nv)[:, 0],
+        disturbance=np.abs(run.disturbance).reshape(-1, run.nv).max(axis=0),
+    )
 
 
 def accelerations(

@@ -31,6 +31,7 @@ class Group(StrEnum):
     CONSTANTS = "constants"
     SAMPLED = "sampled control"
     LOADS = "disturbance"
+    FRICTION = "friction"
 
 
 def weakest(*labels: Label) -> Label:

@@ -95,7 +95,7 @@ def bench(
 
 
 def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step", against_torch: bool = False) -> Row:
-    """Percentiles of a control step [µs], compiled if the law has kernels; its ratio to two RNEA, and eager torch's to it."""
+    """Percentiles of a control step [µs], compiled if it can be, its ratio to two RNEA, and eager torch's to it."""
     eager: Any = build_law(law, robot, period=PERIOD)
     controller = eager.compile()
     states = _states(robot)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray, Vectors
 from nbs_pin.base.checks import PerJoint, floats
+from nbs_pin.base.claims import Claim, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError
 
 _LEAST, _GREATEST = 1e-100, 1e100
@@ -30,6 +31,8 @@ class Admissible:
     """Largest |τ_d,i| [N·m]."""
     radius: float | None = None
     """Largest ‖τ_d‖ [N·m]."""
+    claims: tuple[Claim, ...] = ()
+    """How the bound is known where it was computed, as from a payload; none for bounds that are given."""
 
     def __post_init__(self) -> None:
         given = np.asarray(self.radius if self.box is None else self.box, dtype=float)
@@ -59,6 +62,15 @@ class Admissible:
                 f"disturbance is {disturbance}, expected one bound on ‖τ_d‖ or {nv}, one on each |τ_d,i| [N·m]."
             )
         return cls(radius=float(given)) if given.ndim == 0 else cls(box=given)
+
+    @property
+    def label(self) -> Label:
+        """The weakest label of its claims; PROVED for bounds that are given, as these are an assumption."""
+        return weakest(*(claim.label for claim in self.claims))
+
+    def largest(self, nv: int) -> JointArray:
+        """Largest |τ_d| of each of the joints [N·m]."""
+        return np.full(nv, self.radius) if self.box is None else self.box
 
     def energy(self, metric: Float[np.ndarray, "n n"]) -> float:
         """Upper bound of τ_dᵀAτ_d over the set for A ≻ 0, rounded up; the supremum for a ball or a diagonal A."""

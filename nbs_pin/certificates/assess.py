@@ -1,5 +1,6 @@
 """Certification of a law for one task, with a search for its worst disturbance and the check of a recorded run."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,13 +13,15 @@ from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.attack import Attack, attack, random_disturbances
-from nbs_pin.certificates.certify import Certificate, certify
+from nbs_pin.certificates.certificate import Certificate
+from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.ensemble import motions_of
-from nbs_pin.certificates.loads import MARGIN, Load, friction, gravity_error, payload, total
+from nbs_pin.certificates.loads import MARGIN, gravity_error, payload, total
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.certificates.monitor import Monitored, monitor
 from nbs_pin.certificates.propose import PERIODS, Proposal, propose
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.robots.robot import Robot
@@ -34,8 +37,6 @@ class Certified:
     """A certificate with the attack, the monitored run and the design that belong to it."""
 
     certificate: Certificate
-    loads: tuple[Load, ...]
-    """Parts of the disturbance that were computed from loads."""
     attack: Attack | None
     """The worst motion found; None without a disturbance, or if a motion diverged."""
     thorough: bool
@@ -64,8 +65,8 @@ class Task:
     """Payload that the model does not include [kg]."""
     link: str | None = None
     """The link that carries the payload; None takes `loads.tool_frame`."""
-    friction: tuple[PerJoint, PerJoint] | str | None = None
-    """Viscous and Coulomb coefficients of joint friction that is not fed forward, or "urdf"."""
+    friction: JointFriction | None = None
+    """Joint friction of the arm; None as in `certify`."""
     gravity_error: float | None = None
     """Largest ‖Δg‖ [m/s²]."""
     margin: float = MARGIN
@@ -78,15 +79,12 @@ class Task:
     """Closed-loop trajectories from which the error of an inexact model is bounded."""
     seed: int = 0
 
-    def loads(self, robot: Robot) -> tuple[Load, ...]:
+    def loads(self, robot: Robot) -> tuple[Admissible, ...]:
         """The loads computed for the arm; raises ArgumentError if they do not fit it."""
         along: dict[str, Any] = {"duration": self.duration, "margin": self.margin}
         found = []
         if self.payload is not None:
             found.append(payload(robot, self.payload, self.reference, frame=self.link, **along))
-        if self.friction is not None:
-            viscous, coulomb = (None, None) if isinstance(self.friction, str) else self.friction
-            found.append(friction(robot, self.reference, viscous=viscous, coulomb=coulomb, **along))
         if self.gravity_error is not None:
             found.append(gravity_error(robot, self.gravity_error, self.reference, **along))
         return tuple(found)
@@ -108,7 +106,7 @@ def assess(
         ArgumentError: If task, run and controller do not fit each other.
     """
     robot = arm_of(controller, task)
-    loads, admissible = disturbance_of(robot, task)
+    admissible = disturbance_of(robot, task)
     error, start = None, None
     if not is_exact(controller.dynamics, robot):
         error = model_error(controller, robot, task, admissible, progress)
@@ -124,23 +122,24 @@ def assess(
             mismatch=error,
             period=task.period,
             robot=robot,
+            friction=task.friction,
         )
     watched = None if run is None else monitor(run, certificate)
     found, diverged = _attacked(certificate, task, thorough, progress)
     exceeding = None
     if found is not None and exceeds(found, certificate):
         exceeding = monitor(found.run, certificate)
-    return Certified(certificate, loads, found, thorough, diverged, exceeding, watched, proposal)
+    return Certified(certificate, found, thorough, diverged, exceeding, watched, proposal)
 
 
 def exceeds(found: Attack, certificate: Certificate) -> bool:
     """Whether the largest errors found exceed a bound, of ‖z1‖ or of a joint."""
-    return found.error > certificate.error or bool((found.joint_errors > certificate.joint_errors).any())
+    return not (found.error <= certificate.error and bool((found.joint_errors <= certificate.joint_errors).all()))
 
 
 def design(robot: Robot, task: Task, error: PerJoint, *, period: float | None = None) -> Proposal:
     """`propose` for the disturbance of the task; `period` fixes the control period [s], None takes the longest one."""
-    _, admissible = disturbance_of(robot, task)
+    admissible = disturbance_of(robot, task)
     periods = PERIODS if period is None else (period,)
     return propose(
         robot, admissible, error, reference=task.reference, duration=task.duration, periods=periods, seed=task.seed
@@ -157,13 +156,13 @@ def arm_of(controller: LyapunovLaw, task: Task) -> Robot:
     return robot
 
 
-def disturbance_of(robot: Robot, task: Task) -> tuple[tuple[Load, ...], Admissible]:
-    """The loads of the task and its total disturbance; raises ArgumentError if it has none."""
+def disturbance_of(robot: Robot, task: Task) -> Admissible:
+    """The total disturbance of the task; raises ArgumentError if it has none."""
     loads = task.loads(robot)
     given = [] if task.disturbance is None else [task.disturbance]
     if not (given or loads):
-        raise ArgumentError("no disturbance was given; give --disturbance, --payload, --friction or --gravity-error.")
-    return loads, total(*given, *loads)
+        raise ArgumentError("no disturbance was given; give --disturbance, --payload or --gravity-error.")
+    return total(*given, *loads)
 
 
 def model_error(
@@ -171,16 +170,18 @@ def model_error(
 ) -> Mismatch:
     """δ of the controller's model along closed loops on the true arm, with independent starts and disturbances.
 
-    The starts are at rest within ±0.1 rad of the reference; random admissible disturbances act for 2 s.
+    The loops last as long as the task. They start at rest within ±0.1 rad of the reference, or the start error of the
+    task if it is larger, under random admissible disturbances.
     """
     truth, period, rng = PinocchioDynamics(robot), max(task.period, 0.002), np.random.default_rng((task.seed, 3))
-    steps = round(2.0 / period)
+    steps = math.ceil(task.duration / period - 1e-6)
     torques = random_disturbances(admissible, steps, period, task.trajectories, rng, nv=robot.nv)
 
     def disturbance(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         return torques[:, min(int(t / period + 1e-6), steps - 1)]
 
-    away = rng.uniform(-0.1, 0.1, (task.trajectories, robot.nv))
+    largest = max(0.1, 1.05 * task.start_error)
+    away = rng.uniform(-largest, largest, (task.trajectories, robot.nv))
     run = simulate(
         DynamicsPlant(truth, friction=controller.friction),
         controller,
@@ -202,7 +203,7 @@ def _attacked(certificate: Certificate, task: Task, thorough: bool, progress: bo
         return None, ""
     controller, robot = certificate.controller, certificate.robot
     exact = is_exact(controller.dynamics, robot)
-    free = thorough and exact and task.payload is None and task.friction is None and task.gravity_error is None
+    free = thorough and exact and task.payload is None and task.gravity_error is None
     others = motions_of(controller.dynamics, None, task.seed)[1:] if free else []
     waves: dict[str, Any] = {} if thorough else {"rounds": 0, "starts": 1}
     try:

@@ -4,6 +4,7 @@ Admissible torques give V̇ ≤ −c(V − V∞). Hence only inadmissible torque
 bound, and by no more than the energy that they have supplied, less what has decayed since.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,19 +13,19 @@ from jaxtyping import Bool, Float
 
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Balance, LoopSamples, beyond
+from nbs_pin.certificates.sampled_motion import unexplained_steps
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 
 WRONG = "the certificate is wrong"
 """The verdict if no violated assumption accounts for an exceeded bound."""
 ROUNDING, DIFFERENCES = 1e-9, 1e-3
 """Relative tolerances of a bound: for V itself, and for energies summed over periods."""
-NOTICEABLE = 0.01
-"""Share of the bound of V that holding the torque may supply before it is reported."""
+_NOTICEABLE = 0.01
+_MOST = 0.4  # above this h(ω + ν) a period is no longer sound
 _EPS = float(np.finfo(float).eps)
-_OF_RATE = 0.1
 _OF_BOUND, _OF_TORQUE = 1e-2, 1e-3  # smaller torques are within the error of finite differences
 
 
@@ -46,7 +47,7 @@ def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption,
     if is_kept:
         return "promise kept" + (f", though assumptions failed: {named}" if named else "")
     if not is_wrong:
-        return f"promise broken{at}; assumptions that failed: {named}"
+        return f"promise broken{at}" + (f"; assumptions that failed: {named}" if named else "")
     why = f"for which the failed assumptions do not account ({named})" if named else "though no assumption failed"
     return f"promise broken{at}, {why}: {WRONG}"
 
@@ -81,8 +82,8 @@ class Promise(NamedTuple):
     def exceeded(
         self, values: Float[np.ndarray, "rows quantities"], bounds: Float[np.ndarray, "rows quantities"]
     ) -> Bool[np.ndarray, "rows quantities"]:
-        """Where a bound is exceeded by more than rounding errors."""
-        return np.asarray(values > bounds * (1.0 + ROUNDING) + _EPS * (1.0 + self.initial))
+        """Where a bound is exceeded by more than rounding errors, or a value is no number."""
+        return np.asarray(~(values <= bounds * (1.0 + ROUNDING) + _EPS * (1.0 + self.initial)))
 
     def accounted(
         self,
@@ -115,6 +116,31 @@ def quantities(
     return np.column_stack([storage, np.linalg.norm(z1, axis=-1), np.abs(z1)])
 
 
+def not_finite(
+    at: LoopSamples, joint_names: Sequence[str], recorded: Float[np.ndarray, "rows n"] | None = None
+) -> tuple[Bool[np.ndarray, " rows"], str]:
+    """Which rows hold a number that is not finite, and a name for the first of these, empty if there is none."""
+    named = [("q", at.q), ("v", at.v), ("q_d", at.q_ref), ("v_d", at.v_ref), ("a_d", at.a_ref)]
+    named += [("the torque", at.tau), ("the command", at.tau_command)]
+    named += [] if recorded is None else [("the recorded disturbance", recorded)]
+    bad = ~np.isfinite(np.stack([x for _, x in named]))
+    rows = bad.any(axis=(0, 2))
+    if not rows.any():
+        return rows, ""
+    which, joint = np.argwhere(bad[:, int(rows.argmax())])[0]
+    return rows, f"{named[which][0]} of {joint_names[joint]}, which is not finite"
+
+
+def noticeable(certificate: Certificate, step: Float[np.ndarray, "*periods"]) -> Float[np.ndarray, "*periods"]:
+    """Share of the bound of V that holding the torque may supply over periods [s] before it is reported.
+
+    A held torque lags by a share h(ω + ν) of the fastest decay of z2, which at a sound period is no fault of the loop.
+    """
+    k = certificate.comparison
+    expected = step * (k.omega + k.nu) if math.isfinite(k.nu) else 0.0 * step
+    return np.asarray(np.where(expected <= _MOST, np.maximum(expected, _NOTICEABLE), _NOTICEABLE))
+
+
 class Setting(NamedTuple):
     """The limits that torques are compared with."""
 
@@ -133,7 +159,8 @@ class Setting(NamedTuple):
         speed = np.linalg.norm(at.v, axis=-1)
         torque = np.linalg.norm(at.tau[:-1], axis=-1) + np.linalg.norm(flow.unexplained, axis=-1)
         fastest = np.maximum(speed[1:], speed[:-1])
-        granted = np.zeros_like(q) if mismatch is None else mismatch.bound(q, v)
+        granted = np.linalg.norm(certificate.friction.gap.torque(0.5 * (at.v[1:] + at.v[:-1])), axis=-1)
+        granted = granted if mismatch is None else granted + mismatch.bound(q, v)
         return cls(admissible, granted, _OF_BOUND * size + (_OF_TORQUE + (step * fastest) ** 2) * torque)
 
     def beyond(self, torque: Float[np.ndarray, "periods n"]) -> Float[np.ndarray, " periods"]:
@@ -225,20 +252,12 @@ JUMPS = (Assumption.WRAP, Assumption.REFERENCE)
 
 
 def jumps(controller: LyapunovLaw, at: LoopSamples) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
-    """When the error of a continuous joint wrapped around, and when the reference contradicts its own derivatives.
-
-    Between two instants a smooth reference moves by the mean of its velocities, up to a share of these and of their
-    change, and its velocity by the mean of its accelerations, which may jump.
-    """
+    """When the error of a continuous joint wrapped around, and when the reference contradicts its own derivatives."""
     z1, robot = controller.dynamics.difference(at.q, at.q_ref), controller.dynamics.robot
     wrapped = np.zeros(len(z1) - 1, dtype=bool)
     if robot is not None:
         wrapped = (np.abs(np.diff(z1, axis=0)) > np.pi)[:, robot.continuous].any(axis=-1)
     broken = wrapped & False
-    for x, rate in ((at.q_ref, at.v_ref), (at.v_ref, at.a_ref)):
-        step = np.diff(at.t)[:, None]
-        rest = np.abs(np.diff(x, axis=0) - 0.5 * step * (rate[1:] + rate[:-1]))
-        change, size = np.abs(np.diff(rate, axis=0)), np.abs(rate[1:]) + np.abs(rate[:-1])
-        allowed = step * (change + _OF_RATE * size) + ROUNDING * (1.0 + np.abs(x[1:]))
+    for rest, allowed in unexplained_steps(at.t, at.q_ref, at.v_ref, at.a_ref):
         broken = broken | (rest > allowed).any(axis=-1)
     return {Assumption.WRAP: np.asarray(wrapped), Assumption.REFERENCE: np.asarray(broken)}

@@ -3,7 +3,7 @@
 Along every motion (docs/certificates.md §2), with y² = z2ᵀD₀z2 and some x, s, σ
 
     Φ̇ = −x² + s,     x² ≥ 2ρΦ,   |s| ≤ xy/√δ,
-    Ẇ ≤ −ζs − (1 − β)y² + αxy − 2ωW + σ,     2κW ≤ y² ≤ 2νW,   σ ≤ t y.
+    Ẇ ≤ −ζs − (1 − β)y² + αxy − 2ωW + σ,     2κW ≤ y² ≤ 2νW,   σ ≤ t y + P.
 
 A set that no choice of x, y, s, σ can leave is invariant: the set below a level of V, and a polygon inside it.
 """
@@ -47,6 +47,9 @@ class ComparisonSystem:
     coupling: float = 1.0
     """ζ: the share of s, the power that z2 supplies to Φ, that the law takes from W."""
 
+    power: float = 0.0
+    """P [W], from Coulomb friction that is fed forward smoothly."""
+
     @property
     def cross(self) -> float:
         """α + (1 − ζ)/√δ: the coefficient of xy in V̇."""
@@ -84,14 +87,15 @@ def decay(comparison: ComparisonSystem, share: float = 0.0) -> float:
 
 
 def level(comparison: ComparisonSystem) -> Level:
-    """The least V∞ over the shares θ of y² that compensate the disturbance: ty ≤ θy² + t²/4θ, V∞ = t²/(4θ c(θ))."""
+    """The least V∞ over the shares θ of y² that compensate the disturbance: ty ≤ θy² + t²/4θ, cV∞ = t²/4θ + P."""
+    power = comparison.power * _OUTWARD
     if comparison.t == 0.0:
         c = decay(comparison) / _OUTWARD
-        return Level(c, 0.0 if c > 0.0 else np.inf)
+        return Level(c, power / c if c > 0.0 else np.inf)
     found = Level(0.0, np.inf)
     for share in (*_SHARES.tolist(), 1.0):
         c = decay(comparison, share) / _OUTWARD
-        storage = comparison.t**2 / (4.0 * share * c) * _OUTWARD if c > 0.0 else np.inf
+        storage = (comparison.t**2 / (4.0 * share) * _OUTWARD + power) / c if c > 0.0 else np.inf
         if storage < found.storage:
             found = Level(c, storage)
     return found
@@ -105,7 +109,7 @@ def reach(comparison: ComparisonSystem, storage: float) -> float:
     """
     if not 0.0 < storage < np.inf:
         return storage
-    k = replace(comparison, t=comparison.t * _OUTWARD)
+    k = replace(comparison, t=comparison.t * _OUTWARD, power=comparison.power * _OUTWARD)
     low, high = 0.0, storage
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -150,6 +154,6 @@ def _growth(k: ComparisonSystem, end: np.ndarray, low: float, high: float) -> np
     x = np.maximum(x0, a * candidates / (2.0 * m))
     values = a * x * candidates - m * x * x - g * candidates**2 + k.t * candidates
     sizes = a * x * candidates + m * x * x + g * candidates**2 + k.t * candidates
-    worst = values.max(axis=0) - 2.0 * k.omega * low
+    worst = values.max(axis=0) - 2.0 * k.omega * low + k.power
     rounding = 1e-14 * (sizes.max(axis=0) + 2.0 * k.omega * low) + 1e-12 * k.t**2
     return np.where((bend > 0.0) | np.isfinite(y1), worst + rounding, np.inf)

@@ -2,15 +2,14 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.rounding import least_eigenvalue
 from nbs_pin.certificates.structure import check_structure
-from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -36,28 +35,37 @@ class Constants:
     """ω [1/s]."""
     coupling: float
     """ζ: 1 for a law that feeds back −∇Φ, 0 for one that does not."""
-    largest_rate: float
-    """λ_max(Λ) [rad/s per N·m]."""
+    rate: JointArray
+    """Diagonal of Λ [rad/s per N·m]."""
     least_floor: float
     """λ_min(D₀) [N·m·s/rad]."""
     stiffness: Float[np.ndarray, "n n"]
     """S [J/rad²]."""
     floor: Float[np.ndarray, "n n"]
-    """D₀ [N·m·s/rad]."""
+    """D₀ with the viscous friction that is not compensated [N·m·s/rad]."""
     metric: Float[np.ndarray, "n n"]
     """D₀⁻¹, for Δ = sup τ_dᵀD₀⁻¹τ_d."""
     label: Label
-    """The weakest label of all that the bounds rest on."""
+    """The weakest label of all that they rest on."""
     lines: tuple[Claim, ...]
 
+    @property
+    def largest_rate(self) -> float:
+        """λ_max(Λ) [rad/s per N·m]."""
+        return float(self.rate.max())
 
-def constants_of(law: Controller) -> Constants:
-    """The constants of a controller; raises CertificateRefused if it or its model does not admit a proof."""
+
+def constants_of(law: LyapunovLaw, viscous: JointArray | None = None) -> Constants:
+    """The constants of a controller; raises CertificateRefused if it or its model does not admit a proof.
+
+    viscous: friction of the joints that the law does not compensate [N·m·s/rad], ≥ 0, which adds to D₀.
+    """
     v = check_structure(law)
-    controller = cast(LyapunovLaw, law)  # any other law was refused
+    if viscous is not None and viscous.any():
+        v = v._replace(floor=v.floor + np.diag(viscous))
     root = np.sqrt(v.rate)
     delta = least_eigenvalue(root[:, None] * v.floor * root)
-    largest, least, *plain = _inertia(controller.dynamics, v.floor)
+    largest, least, *plain = _inertia(law.dynamics, v.floor)
     # With ωM in the damping no bound of M is needed, so an unproved one is not used.
     used = v.inertial_rate == 0.0 or largest.label is Label.PROVED
     claim = Claim("δ = λ_min(Λ^½D₀Λ^½)", delta, "", Label.PROVED, "eigenvalue of the gains", Group.CONSTANTS)
@@ -68,7 +76,7 @@ def constants_of(law: Controller) -> Constants:
         nu=1.0 / least.value if used and least.value > 0.0 else math.inf,
         omega=v.inertial_rate,
         coupling=v.coupling,
-        largest_rate=float(v.rate.max()),
+        rate=v.rate,
         least_floor=least_eigenvalue(v.floor),
         stiffness=v.stiffness,
         floor=v.floor,

@@ -10,7 +10,6 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.assumptions import (
     JUMPS,
-    NOTICEABLE,
     Promise,
     Setting,
     check_certificate,
@@ -20,11 +19,13 @@ from nbs_pin.certificates.assumptions import (
     is_cut,
     jumps,
     listed,
+    not_finite,
+    noticeable,
     quantities,
     sentence,
     summed,
 )
-from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, storage_of
 
@@ -89,8 +90,8 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
 
     The torque that the model does not explain is found from differences of v, so noise in a log counts as disturbance.
     The certificate is called wrong (`is_wrong`) if V or an error exceeds its bound by more than the energy supplied by
-    inadmissible torques, whatever their cause, accounts for. A certified model error is allowed for. The hold of the
-    torque is reported if it has supplied more than 1 % of the bound of V, or if a bound is exceeded.
+    inadmissible torques, whatever their cause, accounts for. The hold of the torque is reported if it has supplied more
+    than 1 % of the bound of V, or if a bound is exceeded. A number that is not finite breaks the promise.
 
     Args:
         run: A run of the certified controller.
@@ -111,21 +112,22 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
     """
     check_certificate(certificate)
     _check_run(run, certificate, start)
-    controller, starts = certificate.controller, int(np.prod(run.q.shape[1:-1], dtype=int))
-    at, recorded = LoopSamples.of(run).rows(start), run.disturbance.reshape(len(run.t), starts, run.nv)[:, start]
+    controller = certificate.controller
+    at, recorded, lost, what = _without_gaps(run, start, certificate.joint_names)
     storage, z1 = storage_of(controller, at), controller.dynamics.difference(at.q, at.q_ref)
     flow = balance(controller, at.rows(slice(-1)), at.rows(slice(1, None)), np.diff(storage))
     promise, values = Promise(certificate, float(storage[0])), quantities(storage, z1)
     bounds = promise.bounds(at.t - at.t[0])
-    over = promise.exceeded(values, bounds)
+    over = promise.exceeded(values, bounds) & ~lost[:, None]
     setting, steps, decay = Setting.of(certificate, flow, at), np.diff(at.t), certificate.level.c
-    held = (summed(flow.held, steps, decay) > NOTICEABLE * bounds[:, 0])[1:]
-    failed = failures(flow, setting, jumps(controller, at), held, bool(over.any()), recorded)
+    held = summed(flow.held, steps, decay)[1:] > noticeable(certificate, steps) * bounds[1:, 0]
+    failed = _outside(failures(flow, setting, jumps(controller, at), held, bool(over.any()), recorded), lost)
     power, ratio = excess_of(flow, setting)
     so_far = np.maximum.accumulate(np.concatenate([[1.0], ratio]))
     accounted = promise.accounted(bounds, summed(power, steps, decay), so_far)
-    is_wrong = not any(name in failed for name in JUMPS) and bool((over & (values > accounted)).any())
-    if over.any() and not failed and not is_wrong:
+    known = ~np.maximum.accumulate(lost)[:, None]  # a gap hides torques
+    is_wrong = not any(name in failed for name in JUMPS) and bool((over & known & (values > accounted)).any())
+    if over.any() and not failed and not is_wrong and not lost.any():
         failed = dict.fromkeys(greatest(flow, certificate.admissible, recorded), power > 0.0)
     return Monitored(
         t=at.t,
@@ -138,11 +140,42 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
         joint_names=certificate.joint_names,
         balance=flow,
         saturated=is_cut(flow),
-        excesses={name: over[:, k] for k, name in enumerate(promise.names) if over[:, k].any()},
+        excesses=_excesses(promise, over) | ({what: lost} if what else {}),
         failures=failed,
         is_recorded=bool(recorded.any()),
         is_wrong=is_wrong,
     )
+
+
+def _outside(
+    failed: dict[Assumption, Bool[np.ndarray, " periods"]], lost: Bool[np.ndarray, " rows"]
+) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
+    """The failures in periods whose rows are both finite."""
+    whole = ~(lost[1:] | lost[:-1])
+    return {name: when & whole for name, when in failed.items() if (when & whole).any()}
+
+
+def _excesses(promise: Promise, over: Bool[np.ndarray, "rows quantities"]) -> dict[str, Bool[np.ndarray, " rows"]]:
+    return {name: over[:, k] for k, name in enumerate(promise.names) if over[:, k].any()}
+
+
+def _without_gaps(
+    run: Run, start: int, joint_names: tuple[str, ...]
+) -> tuple[LoopSamples, Float[np.ndarray, "rows n"], Bool[np.ndarray, " rows"], str]:
+    """The samples with rows that are not finite replaced by the last finite one, the disturbance, these rows, and why.
+
+    Raises ArgumentError if no row is finite, or a time is not.
+    """
+    at, recorded = LoopSamples.of(run).rows(start), run.disturbance.reshape(len(run.t), -1, run.nv)[:, start]
+    if not np.isfinite(at.t).all():
+        raise ArgumentError("a time of the run is not finite; correct the times.")
+    lost, what = not_finite(at, joint_names, recorded)
+    if lost.all():
+        raise ArgumentError("no row of the run is finite; give a run that did not diverge at once.")
+    rows = np.arange(len(lost))
+    last = np.maximum.accumulate(np.where(lost, -1, rows))
+    last[last < 0] = int(np.argmin(lost))
+    return at.rows(last)._replace(t=at.t), recorded[last], lost, what
 
 
 def _check_run(run: Run, certificate: Certificate, start: int) -> None:

@@ -1,5 +1,6 @@
 """Check of a closed loop against a certificate while it runs."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, cast
@@ -12,7 +13,6 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.assumptions import (
     JUMPS,
-    NOTICEABLE,
     Promise,
     Setting,
     check_certificate,
@@ -22,10 +22,12 @@ from nbs_pin.certificates.assumptions import (
     greatest,
     jumps,
     listed,
+    not_finite,
+    noticeable,
     quantities,
     sentence,
 )
-from nbs_pin.certificates.certify import Certificate
+from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, storage_of
 from nbs_pin.controllers.controller import MemorylessController
@@ -50,6 +52,8 @@ class WatchMemory(NamedTuple):
     """Largest ratio of torque to bound so far, at least 1."""
     broken: tuple[Assumption, ...]
     """Assumptions that have failed so far."""
+    has_gap: bool = False
+    """Whether an instant was not finite, so that what torques did since the last one is not known."""
 
 
 class Watched(NamedTuple):
@@ -128,12 +132,18 @@ class Watch:
         reference: Reference,
         tau: JointArray,
         tau_command: JointArray,
-    ) -> tuple[Watched, WatchMemory]:
+    ) -> tuple[Watched, WatchMemory | None]:
         """The result at time t [s], and the memory for the next step; `memory` is None at first.
 
-        The torque `tau` acts from t on [N·m]. Raises ArgumentError unless t is after the previous instant.
+        The torque `tau` acts from t on [N·m]. A number that is not finite breaks the promise at this instant and is
+        left out of the memory. Raises ArgumentError unless t is finite and after the previous instant.
         """
         now = LoopSamples(np.array(t), q, v, reference.q, reference.v, reference.a, tau, tau_command)
+        if not math.isfinite(t):
+            raise ArgumentError(f"the instant is t = {t} s, expected a finite time; give the time of the sample.")
+        _, what = not_finite(LoopSamples(*(x[None] for x in now)), self.certificate.joint_names)
+        if what:
+            return self._lost(memory, what), None if memory is None else memory._replace(has_gap=True)
         storage = float(storage_of(self.certificate.controller, now))
         if memory is None:
             memory = WatchMemory(t, storage, now, storage, 0.0, 0.0, 1.0, ())
@@ -159,6 +169,23 @@ class Watch:
         memory = memory._replace(broken=self._broken(memory, flow, setting, both, seen))
         return self._said(memory, flow, seen), memory
 
+    def _lost(self, memory: WatchMemory | None, what: str) -> Watched:
+        """The result at an instant with a number that is not finite."""
+        nothing, n = math.nan, self.certificate.controller.nv
+        broken = () if memory is None else memory.broken
+        return Watched(
+            storage=nothing,
+            promise=nothing,
+            error=nothing,
+            error_bound=nothing,
+            joint_errors=np.full(n, nothing),
+            joint_bounds=np.full(n, nothing),
+            excesses=(what,),
+            broken=broken,
+            balance=None,
+            verdict=sentence(f" by {what}", False, False, dict.fromkeys(broken, ""), is_recorded=False),
+        )
+
     def _seen(self, memory: WatchMemory) -> _Seen:
         """The last instant of the memory, with its bounds."""
         dynamics, now, promise = self.certificate.controller.dynamics, memory.last, self._promise(memory)
@@ -166,25 +193,26 @@ class Watch:
         bounds = promise.bounds(np.array([float(now.t) - memory.began]))
         over = promise.exceeded(values, bounds)
         accounted = promise.accounted(bounds, np.array([memory.excess]), np.array([memory.ratio]))
-        return _Seen(values[0], bounds[0], over[0], bool((over & (values > accounted)).any()))
+        is_unaccounted = not memory.has_gap and bool((over & (values > accounted)).any())
+        return _Seen(values[0], bounds[0], over[0], is_unaccounted)
 
     def _broken(
         self, memory: WatchMemory, flow: Balance, setting: Setting, both: LoopSamples, seen: _Seen
     ) -> tuple[Assumption, ...]:
         """The assumptions that have failed, including the last period."""
         controller = self.certificate.controller
-        held = np.array([memory.held > NOTICEABLE * seen.bounds[0]])
+        held = memory.held > noticeable(self.certificate, np.diff(both.t)) * seen.bounds[0]
         failed = failures(flow, setting, jumps(controller, both), held, bool(seen.over.any()), None)
-        broken = tuple(name for name in Assumption if name in failed or name in memory.broken)
-        if seen.over.any() and not broken and not seen.is_unaccounted:
-            return greatest(flow, setting.admissible, None)
-        return broken
+        return tuple(name for name in Assumption if name in failed or name in memory.broken)
 
     def _said(self, memory: WatchMemory, flow: Balance | None, seen: _Seen) -> Watched:
         names = zip(self._promise(memory).names, seen.over.tolist(), strict=True)
         excesses = tuple(name for name, is_over in names if is_over)
         is_wrong = seen.is_unaccounted and not any(name in memory.broken for name in JUMPS)
-        at, failed = f" by {listed(excesses)}", dict.fromkeys(memory.broken, "")
+        broken = memory.broken
+        if excesses and flow is not None and not broken and not is_wrong:
+            broken = greatest(flow, self.certificate.admissible, None)
+        at, failed = f" by {listed(excesses)}", dict.fromkeys(broken, "")
         return Watched(
             storage=memory.storage,
             promise=float(seen.bounds[0]),
@@ -193,7 +221,7 @@ class Watch:
             joint_errors=seen.values[2:],
             joint_bounds=seen.bounds[2:],
             excesses=excesses,
-            broken=memory.broken,
+            broken=broken,
             balance=flow,
             verdict=sentence(at, not excesses, is_wrong, failed, is_recorded=False),
         )

@@ -2,9 +2,10 @@
 
 For the inertia-shaped law with K = s²K̂, D₀ = sD̂₀ and ω = sω̂, every constant of the proof scales with the speed s: V∞
 and Φ∞ scale with s⁻², hence the errors √(2Φ∞/K_i) with s⁻². So one bound per shape (K̂, D̂₀, ω̂) gives the slowest loop
-of that shape that certifies the wanted error (docs/certificates.md §8).
+of that shape that certifies the wanted error (docs/certificates.md §10).
 """
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -14,12 +15,15 @@ import numpy as np
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, positive
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.comparison_system import ComparisonSystem, level, reach
-from nbs_pin.certificates.loads import sampled
+from nbs_pin.certificates.margins import STIFF, sampled_control
+from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.controllers.gains import Gains, effective_inertia, largest_inertia
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.motions.references import DesiredMotion, Sinusoid
@@ -27,8 +31,8 @@ from nbs_pin.robots.robot import Robot
 
 PERIODS = (0.01, 0.005, 0.002, 0.001, 0.0005, 0.00025)
 """Default control periods to choose from, the longest first [s]."""
-STIFF, FAST = 0.4, 0.25
-"""Largest √(K_i/M_e,i)·h and ωh at which sampled loops without delay stay calm (measured, docs/theory.md §2)."""
+FAST = 0.25
+"""Largest ωh at which sampled loops without delay stay calm (measured, docs/theory.md §2)."""
 _ALIKE = (0.0, 0.5, 1.0)
 """Exponents of M_e in K̂: 0 shapes the stiffness by the wanted errors, 1 gives all joints the same frequency."""
 _SLOWNESS = (1.0, 1.6, 2.5, 4.0)
@@ -103,16 +107,30 @@ def propose(
     admissible = Admissible.of(disturbance, robot.nv)
     wanted = _wanted(error, robot.nv)
     choice = _periods(periods)
-    arm = _Arm.of(robot, dynamics, admissible, reference, duration)
+    motion = Sinusoid.for_robot(robot) if reference is None else reference
+    arm = _Arm.of(robot, dynamics, admissible, motion, duration)
     _check_limits(robot, arm)
     candidates = [c for shape in _shapes(arm, wanted) if (c := _scaled(shape, admissible, wanted))]
+    light = [c for c in candidates if c.share(arm, robot) <= 1.0]
+    if not light:
+        raise ArgumentError(_too_weak(robot, arm, candidates, admissible))
+    longest = [(_longest_period(c, arm, robot, dynamics, seed), c) for c in light]
+    why = ""
     for period in choice:
-        calm = [c for c in candidates if c.fits(arm, period)]
-        light = [c for c in calm if c.share(arm, robot) <= 1.0]
-        if light:
-            best = min(light, key=lambda c: c.answer(arm, robot))
-            return _proposal(robot, arm, best, period, dynamics, seed)
-    raise ArgumentError(_forbidden(robot, arm, candidates, choice[-1], admissible))
+        calm = [c for allowed, c in longest if allowed > period]
+        for best in sorted(calm, key=lambda c: c.answer(arm, robot)):
+            found = _proposal(robot, arm, best, period, dynamics, seed)
+            why = _fault(found, admissible, wanted, motion, duration)
+            if not why:
+                return found
+    if why:
+        raise ArgumentError(
+            f"no design passes its own certificate: {why}; give a gentler motion, or want a larger error."
+        )
+    raise ArgumentError(
+        f"a control period of {1e3 * choice[-1]:g} ms forbids it: the sampled loop might not stay calm; take a period"
+        f" of at most {0.9995e3 * max(allowed for allowed, _ in longest):.3g} ms, or want a larger error."
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,12 +152,11 @@ class _Arm:
         robot: Robot,
         dynamics: DynamicsProvider | None,
         admissible: Admissible,
-        reference: DesiredMotion | None,
+        reference: DesiredMotion,
         duration: float,
     ) -> "_Arm":
         model = PinocchioDynamics(robot) if dynamics is None else dynamics
-        motion = Sinusoid.for_robot(robot) if reference is None else reference
-        desired = sampled(robot, motion, duration)
+        desired = SampledMotion.of(reference, robot.nv, duration)
         tau = model.reference_torque(desired.q, desired.v, desired.v, desired.a)
         peak = np.full(robot.nv, admissible.radius) if admissible.box is None else admissible.box
         return cls(
@@ -152,6 +169,8 @@ class _Candidate:
     """Gains that certify the error at the least speed of their shape."""
 
     gains: Gains
+    storage: float
+    """V∞ [J]."""
     potential: float
     """Φ∞ [J]."""
 
@@ -159,8 +178,13 @@ class _Candidate:
     def joint_errors(self) -> np.ndarray:
         return np.sqrt(2.0 * self.potential / self.gains.stiffness)
 
-    def fits(self, arm: _Arm, period: float) -> bool:
-        return self.stiff(arm, period) <= STIFF and self.gains.bandwidth * period <= FAST
+    def controller(
+        self, robot: Robot, dynamics: DynamicsProvider | None, period: float, seed: int
+    ) -> NeuralBackstepping:
+        friction = JointFriction.of(robot) if robot.damping.any() or robot.friction.any() else None
+        return NeuralBackstepping.for_robot(
+            robot, dynamics, period=period, gains=self.gains, friction=friction, seed=seed
+        )
 
     def stiff(self, arm: _Arm, period: float) -> float:
         return float(np.sqrt(self.gains.stiffness / arm.effective).max()) * period
@@ -189,31 +213,43 @@ def _shapes(arm: _Arm, wanted: np.ndarray) -> Iterator[Gains]:
 
 def _scaled(shape: Gains, admissible: Admissible, wanted: np.ndarray) -> "_Candidate | None":
     """The shape at the least speed that certifies the error; None without a disturbance."""
-    unit = _potential(shape, admissible)
+    storage, unit = _levels(shape, admissible)
     errors = np.sqrt(2.0 * unit / shape.stiffness)
     missing = float((errors / wanted).max())
     s = np.sqrt(missing / _SPARE)
     gains = Gains(float(s), s**2 * shape.stiffness, s * shape.damping)
-    return _Candidate(gains, unit / s**2) if s > 0.0 else None
+    return _Candidate(gains, storage / s**2, unit / s**2) if s > 0.0 else None
 
 
-def _potential(gains: Gains, admissible: Admissible) -> float:
-    """Φ∞ [J] of the inertia-shaped law, whatever M is: ρ = ω because ΛK = ωI."""
+def _longest_period(
+    candidate: _Candidate, arm: _Arm, robot: Robot, dynamics: DynamicsProvider | None, seed: int
+) -> float:
+    """The longest control period [s] at which √(K/M)h, ωh and the rule of `certify` stay within their limits."""
+    longest = min(STIFF / candidate.stiff(arm, 1.0), FAST / candidate.gains.bandwidth)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a candidate that may not be chosen
+        controller = candidate.controller(robot, dynamics, longest, seed)
+    hold, stiff = sampled_control(controller, longest, candidate.storage, candidate.potential)[1]
+    return min(longest, hold.left, longest * STIFF / stiff.right)
+
+
+def _levels(gains: Gains, admissible: Admissible) -> tuple[float, float]:
+    """V∞ and Φ∞ [J] of the inertia-shaped law, whatever M is: ρ = ω because ΛK = ωI."""
     omega = gains.bandwidth
     delta = float((omega * gains.damping / gains.stiffness).min())
     t = float(np.sqrt(admissible.energy(np.diag(1.0 / gains.damping))))
     comparison = ComparisonSystem(rho=omega, delta=delta, kappa=0.0, nu=np.inf, omega=omega, t=t)
-    return reach(comparison, level(comparison).storage)
+    storage = level(comparison).storage
+    return storage, reach(comparison, storage)
 
 
 def _proposal(
     robot: Robot, arm: _Arm, best: _Candidate, period: float, dynamics: DynamicsProvider | None, seed: int
 ) -> Proposal:
-    controller = NeuralBackstepping.for_robot(robot, dynamics, period=period, gains=best.gains, seed=seed)
     return Proposal(
         gains=best.gains,
         period=period,
-        controller=controller,
+        controller=best.controller(robot, dynamics, period, seed),
         error=float(np.sqrt(2.0 * best.potential / best.gains.stiffness.min())),
         joint_errors=best.joint_errors,
         torque=best.torque(arm),
@@ -275,23 +311,27 @@ def _check_limits(robot: Robot, arm: _Arm) -> None:
         )
 
 
-def _forbidden(robot: Robot, arm: _Arm, candidates: "list[_Candidate]", period: float, admissible: Admissible) -> str:
-    """Why no candidate is feasible, in one sentence."""
+def _fault(
+    proposal: Proposal, admissible: Admissible, wanted: np.ndarray, reference: DesiredMotion, duration: float
+) -> str:
+    """Why the certificate of a proposal does not show the wanted errors, empty if it does."""
+    try:
+        found = certify(proposal.controller, admissible, reference=reference, duration=duration, period=proposal.period)
+    except CertificateRefused as error:
+        return str(error).rstrip(".")
+    if found.void:
+        return "; ".join(found.void)
+    return "" if (found.joint_errors <= wanted * (1.0 + 1e-6)).all() else "friction enlarges its errors"
+
+
+def _too_weak(robot: Robot, arm: _Arm, candidates: "list[_Candidate]", admissible: Admissible) -> str:
+    """Why no candidate stays within the effort limits, in one sentence."""
     if not candidates:
         return f"{admissible} does not determine the gains; give a disturbance above 0."
-    light = [c for c in candidates if c.share(arm, robot) <= 1.0]
-    if not light:
-        best = min(candidates, key=lambda c: c.share(arm, robot))
-        i = int(np.argmax(best.torque(arm) / robot.effort_limit))
-        return (
-            f"the torque limit of joint '{robot.joint_names[i]}' of {robot.name} forbids it: reference, disturbance and"
-            f" the stiffness at its error bound take {best.torque(arm)[i]:.3g} N·m, whatever the wanted error, and it"
-            f" gives {robot.effort_limit[i]:g}; take a gentler motion, less load or a stronger drive."
-        )
-    best = min(light, key=lambda c: max(c.stiff(arm, 1.0) / STIFF, c.gains.bandwidth / FAST))
-    need = min(STIFF / best.stiff(arm, 1.0), FAST / best.gains.bandwidth)
+    best = min(candidates, key=lambda c: c.share(arm, robot))
+    i = int(np.argmax(best.torque(arm) / robot.effort_limit))
     return (
-        f"a control period of {1e3 * period:g} ms forbids it: √(K/M)·h would be {best.stiff(arm, period):.2g} and ωh"
-        f" {best.gains.bandwidth * period:.2g}, while sampled loops stay calm up to {STIFF:g} and {FAST:g}; take a"
-        f" period of at most {1e3 * need:.2g} ms, or want a larger error."
+        f"the torque limit of joint '{robot.joint_names[i]}' of {robot.name} forbids it: reference, disturbance and"
+        f" the stiffness at its error bound take {best.torque(arm)[i]:.3g} N·m, whatever the wanted error, and it"
+        f" gives {robot.effort_limit[i]:g}; take a gentler motion, less load or a stronger drive."
     )

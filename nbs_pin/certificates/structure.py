@@ -29,17 +29,23 @@ def check_structure(controller: Any, robot: Robot | None = None) -> Lyapunov:
     Raises:
         CertificateRefused: If the proof of docs/theory.md §5 does not apply.
     """
+    law = lyapunov_law(controller)
+    check_finite("the controller", law)
+    model = check_model(law.dynamics, robot)
+    if not np.isfinite(model.skew.value):
+        refuse(f"no bound follows from this model: {model.skew.because}", "take a 'homogenised' or 'cholesky' one")
+    lyapunov = law.lyapunov()
+    return lyapunov._replace(claims=(*lyapunov.claims, _law_claim(law, model), *model))
+
+
+def lyapunov_law(controller: Any) -> LyapunovLaw:
+    """The controller, if it has a Lyapunov function; raises CertificateRefused if not."""
     if not isinstance(controller, LyapunovLaw):
         refuse(
             f"a {type(controller).__name__} has no Lyapunov function here",
             "give a NeuralBackstepping or SlotineLi, and for a compiled one the controller it was compiled from",
         )
-    check_finite("the controller", controller)
-    model = check_model(controller.dynamics, robot)
-    if not np.isfinite(model.skew.value):
-        refuse(f"no bound follows from this model: {model.skew.because}", "take a 'homogenised' or 'cholesky' one")
-    lyapunov = controller.lyapunov()
-    return lyapunov._replace(claims=(*lyapunov.claims, _law_claim(controller, model), *model))
+    return controller
 
 
 def _law_claim(controller: LyapunovLaw, model: ModelClaims) -> Claim:

@@ -17,7 +17,7 @@ import tyro
 from rich.console import Console
 
 from nbs_pin import __version__
-from nbs_pin.base.exceptions import NbsPinError
+from nbs_pin.base.exceptions import CertificateRefused, NbsPinError
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.collect import Collect
@@ -43,10 +43,11 @@ COMMANDS: dict[str, type] = {
     "robots": Robots,
 }
 """The options class of every command. The module of the same name in `nbs_pin.commands` does the work in `run`."""
-BAD_INPUT, INTERRUPTED = 2, 130
+BAD_INPUT, NO_PROMISE, INTERRUPTED = 2, 3, 130
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` lists the options of a command, "
-    "`nbs-pin --version` prints the version. Exit codes: 0 success, 2 bad input, 130 interrupted."
+    "`nbs-pin --version` prints the version. Exit codes: 0 success, 2 bad input, 3 no promise from certify, "
+    "130 interrupted."
 )
 
 
@@ -61,7 +62,8 @@ class Output(Console):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `nbs-pin` with these arguments, or the shell's, and return the exit code.
 
-    It is 0 for success, 2 for bad input (one sentence on stderr), 130 after Ctrl-C, 143 after SIGTERM.
+    It is 0 for success, 2 for bad input (one sentence on stderr), 3 if `certify` gives no promise (refused, or a
+    condition fails), 130 after Ctrl-C, 143 after SIGTERM.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -92,7 +94,7 @@ def _failed(error: BaseException, notes: Console) -> int:
         notes.print(f"nbs-pin: error: {where}{reason}; check the path, its permissions and the free space.")
     else:
         raise error
-    return BAD_INPUT
+    return NO_PROMISE if isinstance(error, CertificateRefused) else BAD_INPUT
 
 
 def _run(arguments: list[str], notes: Console, stops: list[int]) -> int:
@@ -106,7 +108,7 @@ def _run(arguments: list[str], notes: Console, stops: list[int]) -> int:
             body = import_module(f"nbs_pin.commands.{arguments[0]}")
         if stops:  # a library that is being imported may swallow the interrupt
             raise KeyboardInterrupt
-        body.run(command, console, notes)
+        return body.run(command, console, notes) or 0
     return 0
 
 

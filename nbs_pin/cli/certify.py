@@ -28,19 +28,19 @@ def torque_bounds() -> PrimitiveConstructorSpec[str]:
 
 
 def friction_text() -> PrimitiveConstructorSpec[str]:
-    """A tyro parser of the text urdf or VISCOUS,COULOMB; raises OptionError for any other."""
+    """A tyro parser of the text VISCOUS,COULOMB; raises OptionError for any other."""
 
     def parse(words: list[str]) -> str:
         values = plain_numbers(words[0])
         usable = values is not None and len(values) == 2 and all(0.0 <= value <= 1e6 for value in values)
-        if words[0] != "urdf" and not usable:
+        if not usable:
             raise OptionError(
-                f"--friction is '{words[0]}'; give urdf, or the viscous and the Coulomb coefficient of all joints, "
-                "N·m·s/rad and N·m: --friction 0.5,1."
+                f"--friction is '{words[0]}'; give the viscous and the Coulomb coefficient of all joints, N·m·s/rad "
+                "and N·m: --friction 0.5,1."
             )
         return words[0]
 
-    return text("urdf|B,C", parse)
+    return text("B,C", parse)
 
 
 @dataclass(frozen=True)
@@ -66,14 +66,16 @@ class Certify:
     """Mass that the model does not include [kg], as a disturbance along the reference."""
     link: Annotated[str | None, tyro.conf.arg(metavar="LINK"), default("the arm's end")] = None
     """Link that carries the payload."""
-    friction: Annotated[str | None, friction_text(), default("none")] = None
-    """Joint friction that is not fed forward, as a disturbance: urdf, or coefficients [N·m·s/rad, N·m]."""
+    friction: Annotated[str | None, friction_text(), default("the URDF's")] = None
+    """Joint friction of the arm, viscous and Coulomb [N·m·s/rad, N·m]; what the law does not feed forward counts."""
+    feed_friction: bool = False
+    """Feed that friction forward in a law built for an arm."""
     gravity_error: Annotated[
         float | None, number("--gravity-error", above=0.0, most=100.0, unit="m/s²"), default("none")
     ] = None
     """Largest error of the gravity vector [m/s²]; a base tilted by α has 2·9.81·sin(α/2)."""
     margin: Annotated[float | None, number("--margin", least=1.0, most=100.0, unit=""), default("1.5")] = None
-    """Factor on the torques of payload, friction and gravity error along the reference."""
+    """Factor on the torques of payload and gravity error along the reference."""
     reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
     """Motion for loads and limits: sinusoid (fitted to the arm), paper, or a .csv or .npz file."""
     frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0

@@ -9,7 +9,7 @@ from rich.text import Text
 
 _ERRORS = ("rad", "m", "rad, m")
 """Units of the error bounds, which have a table of their own."""
-_ORDER = ("bounds", "sampled control", "model error", "inertia", "constants", "structure")
+_ORDER = ("disturbance", "friction", "bounds", "sampled control", "model error", "inertia", "constants", "structure")
 """Groups of claims, in the order in which they are printed."""
 
 _GAINS = (
@@ -31,9 +31,8 @@ def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> 
     reasons = [line["because"] for line in bounds]
     bounds.sort(key=lambda line: reasons.index(line["because"]))
     console.print(_errors(bounds, figures))
+    console.print(_assumptions(certificate["assumptions"]))
     console.print(_conditions(certificate["conditions"]))
-    if figures["loads"]:
-        console.print(_claims("disturbance", figures["loads"]))
     for name in _ORDER:
         lines = [line for line in certificate["lines"] if line["group"] == name and line not in bounds]
         if lines:
@@ -65,6 +64,15 @@ def _conditions(conditions: list[dict[str, Any]]) -> Table:
         holds = "yes" if line["holds"] else Text("NO", style="bold red")
         name = Text.assemble(line["name"], ("\n" + line["because"], "dim"))
         table.add_row(name, _number(line["left"]), _with_unit(line["right"], line["unit"]), holds, line["label"])
+    return table
+
+
+def _assumptions(assumptions: list[dict[str, Any]]) -> Table:
+    """What the bounds assume, and how far it was checked."""
+    table = _table("assumptions", "", "by the conditions below")
+    for line in assumptions:
+        failed = line["checked"] == "FAILS"
+        table.add_row(Text(line["assumption"]), Text(line["checked"], style="bold red" if failed else ""))
     return table
 
 
@@ -126,9 +134,7 @@ def _closing(figures: dict[str, Any]) -> list[str]:
         lines.append(f"no worst motion to compare with the bounds: {figures['attack_diverged']}")
     if watched is not None:
         lines.append(f"the run: {watched['verdict']}")
-    if figures["loads"]:
-        lines.append(f"the bound on the disturbance itself is {figures['disturbance_label']}")
-    return [*lines, standing(certificate)]
+    return [*lines, *(f"of no use: {text}" for text in figures["useless"]), standing(certificate)]
 
 
 def standing(certificate: dict[str, Any]) -> str:
@@ -136,7 +142,7 @@ def standing(certificate: dict[str, Any]) -> str:
     if certificate["void"]:
         failed = "; ".join(certificate["void"])
         return f"{certificate['label']}: the bounds are void, as these conditions fail: {failed}"
-    return f"{certificate['label']}, assuming: {'; '.join(certificate['assumptions'])}"
+    return f"{certificate['label']}, under the assumptions that are not checked"
 
 
 def _with_unit(value: float | None, unit: str) -> str:

@@ -12,17 +12,19 @@ from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design
-from nbs_pin.certificates.loads import MARGIN, label_of
+from nbs_pin.certificates.loads import MARGIN
 from nbs_pin.certificates.model_structure import is_exact
+from nbs_pin.cli import NO_PROMISE
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import print_certificate
 from nbs_pin.commands.results import SUMMARY, Results
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.registry import build_law
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.motions.by_name import motion_of
 from nbs_pin.reports.certificate_charts import plot_certificate, plot_monitor
-from nbs_pin.robots.robot import load_robot
+from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.checkpoints import load, save
 
 FILES = ("certificate.png", "run.npz", SUMMARY)
@@ -31,8 +33,8 @@ MONITOR, DESIGNED = "monitor.png", "controller.nbs"
 """Further files, for a monitored run and for a design."""
 
 
-def run(options: Certify, console: Console, notes: Console) -> None:
-    """Certify, write and print; raises NbsPinError or OSError."""
+def run(options: Certify, console: Console, notes: Console) -> int:
+    """Certify, write and print, and return the exit code; raises NbsPinError or OSError."""
     if options.wanted is not None and options.controller.endswith(SAVED):
         raise OptionError(f"--wanted designs a controller, and '{options.controller}' is one; give an arm.")
     with notes.status(f"loading {options.controller}"):
@@ -54,6 +56,7 @@ def run(options: Certify, console: Console, notes: Console) -> None:
     law = Path(options.controller).name if options.controller.endswith(SAVED) else "a law built for it"
     print_certificate(console, f"{robot.name}, {law}", found)
     results.show(console, written)
+    return NO_PROMISE if result.certificate.void else 0
 
 
 def _controller(options: Certify) -> LyapunovLaw:
@@ -63,7 +66,14 @@ def _controller(options: Certify) -> LyapunovLaw:
     """
     settings = {"bandwidth": options.bandwidth, "period": options.period or 0.001, "seed": options.seed}
     name = options.controller
-    law: Any = load(name) if name.endswith(SAVED) else build_law(options.law, load_robot(name), **settings)
+    if name.endswith(SAVED) and options.feed_friction:
+        raise OptionError(f"--feed-friction is for a law built here, and '{name}' holds one; omit it.")
+    if name.endswith(SAVED):
+        law: Any = load(name)
+    else:
+        robot = load_robot(name)
+        stated = _friction(options.friction, robot) or JointFriction.of(robot)
+        law = build_law(options.law, robot, friction=stated if options.feed_friction else None, **settings)
     if not isinstance(law, LyapunovLaw):
         what = (
             f"{name} holds a controller of class {type(law).__name__}"
@@ -89,7 +99,6 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
             "omit it, or give the true arm with --against."
         )
     motion, duration = motion_of(options.reference, robot, frequency=options.frequency, period=period)
-    coefficients = None if options.friction in (None, "urdf") else plain_numbers(str(options.friction)) or []
     numbers = None if options.disturbance is None else plain_numbers(options.disturbance) or []
     return dataclasses.replace(
         blank,
@@ -99,7 +108,7 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
         disturbance=None if numbers is None else box_or_ball(numbers, robot.nv, norm=options.norm),
         payload=options.payload,
         link=options.link,
-        friction=options.friction if coefficients is None else (coefficients[0], coefficients[1]),
+        friction=_friction(options.friction, robot),
         gravity_error=options.gravity_error,
         margin=MARGIN if options.margin is None else options.margin,
         start_error=options.start_error,
@@ -110,7 +119,7 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
 
 def _check_options(options: Certify) -> None:
     """Raises OptionError for options that need others which were not given."""
-    loads = {"--payload": options.payload, "--friction": options.friction, "--gravity-error": options.gravity_error}
+    loads = {"--payload": options.payload, "--gravity-error": options.gravity_error}
     if options.norm and options.disturbance is None:
         raise OptionError("--norm needs --disturbance; give both.")
     if options.link is not None and options.payload is None:
@@ -119,14 +128,22 @@ def _check_options(options: Certify) -> None:
         raise OptionError(f"--margin needs one of {', '.join(loads)}; give one too.")
 
 
+def _friction(text: str | None, robot: Robot) -> JointFriction | None:
+    """The joint friction that --friction states, None for the URDF's."""
+    if text is None:
+        return None
+    viscous, coulomb = plain_numbers(text) or [0.0, 0.0]
+    return JointFriction(np.full(robot.nv, viscous), np.full(robot.nv, coulomb))
+
+
 def figures(result: Certified) -> dict[str, Any]:
     """All results as JSON can store them, with units in the keys; None for numbers that are not finite."""
     certificate, found, proposal = result.certificate, result.attack, result.proposal
     numbers: dict[str, Any] = {
         "arm": None if certificate.robot is None else certificate.robot.name,
         "certificate": certificate.summary(),
-        "loads": [load.claim.plain() | {"box_Nm": load.admissible.box} for load in result.loads],
-        "disturbance_label": str(label_of(*result.loads)),
+        "disturbance_label": str(certificate.admissible.label),
+        "useless": list(certificate.useless),
         "attack": None,
         "attack_diverged": result.diverged or None,
         "monitor": None,

@@ -131,6 +131,12 @@ class Robot:
         """SHA-256 of links, joints, stated limits and gravity, independent of visual and collision geometry."""
         return hashlib.sha256(self.urdf.without_geometry() + self.gravity_vector.tobytes()).hexdigest()
 
+    def as_described(self) -> "Robot":
+        """The arm with `model` built from the URDF again: an edit of `model` does not show in `sha256`."""
+        model = _build_model(self.urdf)
+        model.gravity.linear = self.gravity_vector
+        return replace(self, model=model)
+
     def difference(self, q: Vectors, q_ref: Vectors) -> Vectors:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
         return configuration_difference(q, q_ref, self.continuous)

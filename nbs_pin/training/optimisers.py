@@ -2,8 +2,8 @@
 
 "adam-backtracking" is Adam that returns to the best parameters with half the step whenever the cost exceeds the lowest
 by the share `RISE`; "adam" has its step halved after every fifth of the epochs, as in the paper; "lbfgs" has a strong
-Wolfe line search. The cost of a sampled loop jumps where gains become too high for the period. Adam may step across such
-a jump and then search on the wrong side; a line search stops in front of it (docs/theory.md §7).
+Wolfe line search. The cost of a sampled loop jumps where gains become too high for the period. Adam may step across
+such a jump and then search on the wrong side; a line search stops in front of it (docs/theory.md §7).
 """
 
 from collections.abc import Sequence

@@ -1,0 +1,242 @@
+"""A certificate: bounds of the tracking error, what they rest on, and how each is known."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.accuracy.mismatch import Mismatch
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.claims import Claim, Group, Label, weakest
+from nbs_pin.base.records import Reference
+from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.claims import Assumed, Assumption, Condition, Role, assumed
+from nbs_pin.certificates.comparison_system import ComparisonSystem, Level
+from nbs_pin.certificates.constants import Constants
+from nbs_pin.certificates.error_bounds import radians
+from nbs_pin.certificates.friction_error import FrictionError
+from nbs_pin.certificates.margins import units
+from nbs_pin.certificates.model_error import ModelError
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.robots.robot import Robot
+
+_PRINTED = "printed ‖z1‖"
+_FALSE = "as printed in Theorem 3 of the paper: true for constant torques, false for others (docs/theory.md §5)"
+_TRUE = "as printed in Theorem 3 of the paper: here no tighter than the proved bound"
+
+
+class Start(NamedTuple):
+    """A start beside the reference, and what follows from it."""
+
+    q: JointArray
+    """q(0) [rad]."""
+    v: JointArray
+    """v(0) [rad/s]."""
+    begin: Reference
+    """The reference at t = 0."""
+    storage: float
+    """V(0) [J]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """Bounds of the closed loop of a `LyapunovLaw`, each labelled by how it is known (docs/certificates.md).
+
+    They hold for every admissible disturbance and every reference, under `assumptions`; with a `mismatch`, for loops
+    like those that it was measured on, over the length of these.
+    """
+
+    controller: LyapunovLaw
+    admissible: Admissible
+    constants: Constants
+    model_error: ModelError
+    """Terms of the error of a learned model."""
+    friction: FrictionError
+    """Terms of the joint friction that is not fed forward."""
+    comparison: ComparisonSystem
+    """The inequalities that the bounds follow from."""
+    rate: float
+    """Without disturbance, errors decay at least like e^{−rate·t}, and V like e^{−2 rate·t} [1/s]."""
+    level: Level
+    """c and V∞ of V(t) ≤ e^{−ct}V(0) + V∞ under disturbances."""
+    potential: float
+    """Φ∞ [J]: Φ(z1) ≤ max(V(0), Φ∞) at all times, and ≤ Φ∞ in the limit."""
+    error: float
+    """Bound of ‖z1‖ [rad], at all times from z1 = z2 = 0, and in the limit from any other start."""
+    joint_errors: JointArray
+    """The same for each |z1_i| [rad]."""
+    source: str
+    """The proof of the bounds of z1."""
+    conditions: tuple[Condition, ...] = ()
+    """The conditions of the theorems and of the assumptions, with the numbers of both sides."""
+    margins: tuple[Claim, ...] = ()
+    """The longest control period and delay by the rules of sampled control."""
+    robot: Robot | None = None
+    """The true arm; None if none is known."""
+    mismatch: Mismatch | None = None
+    """The model error that the bounds include."""
+    start: Start | None = None
+    """The start from which the overshoot is bounded."""
+
+    @property
+    def label(self) -> Label:
+        """How the bounds are known: the weakest label of all that they rest on, EMPIRICAL if a condition fails."""
+        if self.void:
+            return Label.EMPIRICAL
+        sufficient = (condition.label for condition in self.conditions if condition.role is Role.SUFFICIENT)
+        lines = (line.label for line in (*self.model_error.lines, *self.friction.lines))
+        return weakest(self.constants.label, self.admissible.label, *lines, *sufficient)
+
+    @property
+    def void(self) -> tuple[str, ...]:
+        """Conditions that the bounds rest on and that do not hold; `label` is then EMPIRICAL."""
+        return tuple(condition.name for condition in self.conditions if condition.voids)
+
+    @property
+    def assumptions(self) -> tuple[Assumed, ...]:
+        """What the bounds assume, and how far each assumption is checked by `conditions`."""
+        texts = _texts(self)
+        return tuple(assumed(name, self.conditions, text) for name, text in texts.items())
+
+    @property
+    def lines(self) -> tuple[Claim, ...]:
+        """Every bound and every constant, with its label and reason."""
+        return (
+            *_bounds(self),
+            *self.admissible.claims,
+            *self.constants.lines,
+            *self.model_error.lines,
+            *self.friction.lines,
+            *self.margins,
+        )
+
+    @property
+    def printed_error(self) -> float:
+        """Bound of ‖z1‖ by the paper's Theorem 3 as printed [rad]; false for torques that vary (docs/theory.md §5)."""
+        return math.sqrt(self.constants.largest_rate) * self.comparison.t / (2.0 * self.constants.rho)
+
+    @property
+    def overshoot(self) -> tuple[float, JointArray] | None:
+        """Bounds of ‖z1‖ and each |z1_i| at all times from the given start [rad]."""
+        return None if self.start is None else self.from_start(self.start.storage)
+
+    @property
+    def stiffness(self) -> Float[np.ndarray, "n n"]:
+        """S at the time of certification [J/rad²]; training the controller changes its own."""
+        return self.constants.stiffness
+
+    @property
+    def useless(self) -> tuple[str, ...]:
+        """Why the bounds are of no use to anyone, with the numbers that would help; empty if they are."""
+        robot, box, found = self.robot, self.admissible.largest(self.controller.nv), []
+        if robot is not None and (box >= robot.effort_limit).any():
+            i = int(np.argmax(box / robot.effort_limit))
+            unit = "N" if robot.joints[i].prismatic else "N·m"
+            found.append(
+                f"the disturbance of {self.joint_names[i]}, {box[i]:.3g} {unit}, is no less than the "
+                f"{robot.effort_limit[i]:.3g} {unit} of its motor, so no law can hold it; give a smaller one"
+            )
+        turning = self.joint_errors[np.array([unit == "rad" for unit in self.joint_units])]
+        if turning.size and turning.max() > np.pi:
+            share = 0.5 / float(turning.max())
+            found.append(
+                f"a bound of {turning.max() / (2.0 * np.pi):.2g} turns says nothing: a disturbance of {share:.2g} "
+                f"times this one is certified to 0.5 rad, or a bandwidth of about {share**-0.5:.2g} times this one, "
+                "with a control period as much shorter; rotor inertia that the URDF leaves out would allow more"
+            )
+        return tuple(found)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        n = self.controller.nv
+        return tuple(f"joint {i + 1}" for i in range(n)) if self.robot is None else self.robot.joint_names
+
+    @property
+    def joint_units(self) -> tuple[str, ...]:
+        """Unit of the error of each joint: rad, or m for a prismatic joint."""
+        return units(self.robot, self.controller.nv)
+
+    @property
+    def storage(self) -> float:
+        """V∞ [J]."""
+        return self.level.storage
+
+    def storage_bound(self, t: Float[np.ndarray, "*rows"], initial: float) -> Float[np.ndarray, "*rows"]:
+        """Bound of V(t) from V(0) = `initial` [J]: the lesser of e^{−ct}V(0) + V∞ and max(V(0), V∞), t in [s]."""
+        return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
+
+    def from_start(self, initial: float) -> tuple[float, JointArray]:
+        """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞)."""
+        if initial <= 0.0:
+            return self.error, self.joint_errors
+        return radians(self.stiffness, max(initial, self.potential))
+
+    def summary(self) -> dict[str, Any]:
+        """The certificate as JSON can store it."""
+        return {
+            "disturbance": str(self.admissible),
+            "rate_per_s": self.rate,
+            "error_rad": self.error,
+            "joint_errors_rad": self.joint_errors.tolist(),
+            "printed_error_rad": self.printed_error,
+            "overshoot_rad": None if self.overshoot is None else self.overshoot[0],
+            "joint_overshoots_rad": None if self.overshoot is None else self.overshoot[1].tolist(),
+            "joints": list(self.joint_names),
+            "units": list(self.joint_units),
+            "label": str(self.label),
+            "void": list(self.void),
+            "lines": [line.plain() for line in self.lines],
+            "conditions": [condition.plain() for condition in self.conditions],
+            "assumptions": [{"assumption": text, "checked": checked} for text, checked in self.assumptions],
+        }
+
+
+def _bounds(certificate: Certificate) -> tuple[Claim, ...]:
+    """A claim for each bound."""
+    label, here = certificate.label, "docs/certificates.md §2"
+    harmless = certificate.printed_error >= certificate.error * (1.0 - 1e-6)
+    nothing, source = "disturbance", certificate.source
+    if certificate.mismatch is not None:
+        nothing = "disturbance and constant model error"
+        source = f"{source}, for loops drawn alike and up to t = {certificate.mismatch.duration:.4g} s"
+    joints = zip(certificate.joint_names, certificate.joint_errors.tolist(), certificate.joint_units, strict=True)
+    whole = "rad" if set(certificate.joint_units) == {"rad"} else "rad, m"
+    lines = [
+        Claim("‖z1‖", certificate.error, whole, label, source, Group.BOUNDS),
+        *(Claim(f"|z1| of {name}", x, unit, label, source, Group.BOUNDS) for name, x, unit in joints),
+        Claim(_PRINTED, certificate.printed_error, whole, Label.EMPIRICAL, _TRUE if harmless else _FALSE, Group.BOUNDS),
+        Claim(f"rate of decay without {nothing}", certificate.rate, "1/s", label, here, Group.BOUNDS),
+        Claim("c of V(t) ≤ e^{−ct}V(0) + V∞", certificate.level.c, "1/s", label, here, Group.BOUNDS),
+        Claim("V∞", certificate.storage, "J", label, here, Group.BOUNDS),
+        Claim("Φ∞", certificate.potential, "J", label, "docs/certificates.md §3", Group.BOUNDS),
+    ]
+    if certificate.overshoot is not None and certificate.start is not None:
+        because = "Φ never exceeds max(V(0), Φ∞), docs/certificates.md §3"
+        lines.insert(1, Claim("‖z1‖ from the start", certificate.overshoot[0], whole, label, because, Group.BOUNDS))
+        storage, because = certificate.start.storage, "storage function at the start"
+        lines.append(Claim("V(0) of the start", storage, "J", label, because, Group.BOUNDS))
+    return tuple(lines)
+
+
+def _texts(certificate: Certificate) -> dict[Assumption, str]:
+    """The assumptions of a certificate, and the words for those that its model, friction and disturbance change."""
+    m, friction, robot = certificate.mismatch, certificate.friction, certificate.robot
+    texts = dict.fromkeys(Assumption, "")
+    if m is not None:
+        texts[Assumption.MODEL] = (
+            f"the model error is bounded as on {m.trajectories} closed loops of {m.duration:.3g} s, which a further "
+            f"one, drawn alike, exceeds with a chance of at most {m.violation:.2g} at a confidence of 1 − {m.doubt:g}"
+        )
+        texts[Assumption.DISTURBANCE] = "the disturbance is drawn like those of these loops, within its bound"
+    if friction.lines:
+        texts[Assumption.FRICTION] = "joint friction is b v + c sign(v), with the coefficients stated"
+    elif certificate.controller.friction is not None:
+        texts[Assumption.FRICTION] = "joint friction is exactly what is fed forward"
+    else:
+        texts[Assumption.FRICTION] = "joints have no friction beyond the disturbance"
+    if robot is None or not robot.continuous.any():
+        del texts[Assumption.WRAP]
+    return texts

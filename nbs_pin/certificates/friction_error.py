@@ -1,0 +1,92 @@
+"""Friction of the arm that the law does not feed forward, in the inequalities (docs/certificates.md §8).
+
+With b and c the viscous and Coulomb coefficients of the arm, b̂ and ĉ those fed forward by a monotone f̂(φ), Δb = b − b̂,
+Δc = c − ĉ, and v = v_d − Λ∇Φ + z2,
+
+    z2ᵀ(f̂(φ) − f(v)) ≤ |z2|ᵀ(|Δb||v_d| + |Δc|) + z2ᵀΔbΛ∇Φ − z2ᵀΔb z2 + P.
+
+The term of z2 alone adds to D₀ where Δb ≥ 0, and is a β where it is not. P is for the sign of f, which f̂ smooths.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.claims import Claim, Group, Label
+from nbs_pin.base.rounding import largest_eigenvalue, up
+from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.claims import Assumption, Condition
+from nbs_pin.certificates.constants import Constants
+from nbs_pin.dynamics.friction import JointFriction
+
+_WORST = 0.2785
+"""Above max_x x(1 − tanh x) = 0.27846."""
+
+
+class FrictionGap(NamedTuple):
+    """Friction of the arm less that which is fed forward."""
+
+    viscous: JointArray
+    """Δb [N·m·s/rad], (n,)."""
+    coulomb: JointArray
+    """Δc [N·m], (n,)."""
+    arm: JointFriction | None
+    """Friction of the arm."""
+    power: float
+    """P = max_x x(1 − tanh x) Σ ĉ_i ε [W], with the larger ε of f̂ and f."""
+
+    @classmethod
+    def of(cls, nv: int, friction: JointFriction | None, fed: JointFriction | None) -> "FrictionGap":
+        """The gap between the arm's friction and that fed forward, None for none."""
+        none = JointFriction(np.zeros(nv), np.zeros(nv))
+        arm, law = friction or none, fed or none
+        widest = max(arm.transition, law.transition)
+        return cls(
+            arm.viscous - law.viscous, arm.coulomb - law.coulomb, friction, _WORST * widest * float(law.coulomb.sum())
+        )
+
+    def torque(self, v: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows n"]:
+        """Bound of each torque that is not fed forward [N·m]."""
+        return np.asarray(np.abs(self.viscous) * np.abs(v) + np.abs(self.coulomb))
+
+
+class FrictionError(NamedTuple):
+    """z2ᵀ(f̂(φ) − f(v)) + z2ᵀ max(Δb, 0)z2 ≤ t y + αxy + βy² + P."""
+
+    gap: FrictionGap
+    t: float
+    alpha: float
+    beta: float
+    lines: tuple[Claim, ...]
+    conditions: tuple[Condition, ...]
+
+
+def friction_error(gap: FrictionGap, constants: Constants, speed: JointArray, source: str) -> FrictionError:
+    """The terms of a gap for |v_d| ≤ `speed` [rad/s], inf for no bound; `source` says where that comes from.
+
+    The viscous part of `constants` must be max(Δb, 0).
+    """
+    viscous = np.abs(gap.viscous)
+    if not (viscous.any() or gap.coulomb.any() or gap.power):
+        return FrictionError(gap, 0.0, 0.0, 0.0, (), ())
+    bounded = np.isfinite(speed)
+    box = gap.torque(np.where(bounded, speed, 0.0))
+    t = math.sqrt(Admissible.of(box, len(box)).energy(constants.metric))
+    scaled, lacking = viscous * np.sqrt(constants.rate), np.sqrt(np.maximum(-gap.viscous, 0.0))
+    alpha = math.sqrt(up(largest_eigenvalue(scaled[:, None] * constants.metric * scaled))) if viscous.any() else 0.0
+    beta = up(largest_eigenvalue(lacking[:, None] * constants.metric * lacking)) if lacking.any() else 0.0
+    here = "docs/certificates.md §8"
+    because = f"|Δb||v_d| + |Δc| of what is not fed forward, |v_d| {source}; {here}"
+    lines = (
+        Claim("friction, largest joint", float(box.max()), "N·m", Label.PROVED, because, Group.FRICTION),
+        Claim("α of viscous friction", alpha, "", Label.PROVED, here, Group.FRICTION),
+        Claim("P of Coulomb friction fed forward smoothly", gap.power, "W", Label.PROVED, here, Group.FRICTION),
+    )
+    if not viscous.any():
+        return FrictionError(gap, t, alpha, beta, lines, ())
+    name, fastest = "∞ > speed of the reference, for viscous friction", float(speed[viscous > 0.0].max())
+    known = Condition(name, math.inf, fastest, "rad/s", Label.PROVED, f"|v_d| {source}", checks=Assumption.FRICTION)
+    return FrictionError(gap, t, alpha, beta, lines, (known,))
