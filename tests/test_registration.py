@@ -65,7 +65,7 @@ def test_a_kernel_is_of_the_class_that_packs_for_it_and_of_no_subclass(make):
 
 
 def test_certify_says_what_such_a_law_lacks(law, capsys):
-    assert main(["certify", "two_link", "--law", "impedance", "--disturbance", "1"]) == 2
+    assert main(["certify", "two_link", "--law", "impedance", "--disturbance", "1"]) == 3
     assert "--law impedance, of which no Lyapunov function is known" in " ".join(capsys.readouterr().err.split())
 
 

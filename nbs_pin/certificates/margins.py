@@ -44,7 +44,7 @@ def sampled_control(
     if period is None:
         return lines, ()
     name, left = "control period: 1/(λ_max(M⁻¹D) + λ_max(Λ∇²Φ)) > h", _SHARE * hold
-    because = f"half of {_RULE}"
+    because = f"half the period of {_RULE}"
     found = Condition(name, left, period, "s", Label.EMPIRICAL, because, Role.NECESSARY, Assumption.TIME)
     name, right = f"{STIFF:g} > √λ_max(M⁻¹K) h, with the stiffness K = (ζ + DΛ)∇²Φ", math.sqrt(stiffness) * period
     stiff = Condition(name, STIFF, right, "", Label.EMPIRICAL, _RULE, Role.NECESSARY, Assumption.TIME)
