@@ -314,7 +314,7 @@ def test_an_arm_with_friction_stays_within_a_bound_that_counts_it(fed):
 def test_friction_that_the_urdf_states_is_counted_or_refused():
     """The law of xarm7 feeds none forward: its wrist has 2 N·m·s/rad and 1 N·m."""
     robot = nbs.load_robot("xarm7")
-    with pytest.raises(CertificateRefused, match=r"friction that is not fed forward .* feed the friction forward"):
+    with pytest.raises(CertificateRefused, match=r"friction that is not fed forward, .* feed the friction forward"):
         certify(nbs.NeuralBackstepping.for_robot(robot), np.full(7, 0.05))
     own = nbs.JointFriction.of(robot)
     found = certify(nbs.NeuralBackstepping.for_robot(robot, friction=own), np.full(7, 0.05))

@@ -219,7 +219,7 @@ def _why_not(k: ComparisonSystem, has_mismatch: bool, has_friction: bool) -> str
         causes = ["the model's error"] * has_mismatch + ["joint friction that is not fed forward"] * has_friction
         remedies = ["learn a better model"] * has_mismatch + ["feed the friction forward"] * has_friction
         return (
-            f"Theorem 4 requires 1 − β > α²/4, and {' and '.join(causes)} give 1 − β = {1.0 - k.beta:.3g} and α²/4 = "
+            f"Theorem 4 requires 1 − β > α²/4; with {' and '.join(causes)}, 1 − β = {1.0 - k.beta:.3g} and α²/4 = "
             f"{0.25 * k.cross**2:.3g}; {', '.join(remedies)} or take a larger D₀."
         )
     return (
