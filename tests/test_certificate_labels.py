@@ -174,9 +174,12 @@ def test_a_long_reference_is_looked_at_closely(robot, law):
 
 def test_a_reference_with_a_length_of_its_own_is_looked_at_whole(robot, law):
     t = np.linspace(0.0, 12.0, 121)
-    late = nbs.Sampled(t, 2.0 * np.clip(t - 11.0, 0.0, None)[:, None] ** 3 * np.ones(6))
-    assert certify(law, np.full(6, 0.5), reference=late).void
-    assert not certify(law, np.full(6, 0.5), reference=late, duration=10.0).void
+    for late in (
+        nbs.Sampled(t, 2.0 * np.clip(t - 11.0, 0.0, None)[:, None] ** 3 * np.ones(6)),
+        nbs.MinimumJerk(np.array([[0.0], [0.0], [2.0]]) * np.ones(6), [0.0, 11.5, 12.0]),
+    ):
+        assert certify(law, np.full(6, 0.5), reference=late).void
+        assert not certify(law, np.full(6, 0.5), reference=late, duration=10.0).void
 
 
 def test_stiffness_far_beyond_the_period_gives_no_promise(robot, law):
@@ -270,14 +273,14 @@ def test_a_bound_on_an_estimated_load_is_no_better_than_the_estimate(robot, law)
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=60, deadline=None)
 def test_the_power_of_friction_is_within_its_terms(seed):
-    """z2ᵀ(f̂(φ) − f(v)) + z2ᵀmax(Δb, 0)z2 ≤ t y + αxy + βy² + P for a dry f, stiction and a smooth one."""
+    """z2ᵀ(f̂(φ) − f(v)) + z2ᵀb z2 ≤ t y + αxy + P for a dry f, stiction and a smooth one."""
     rng = np.random.default_rng(seed)
     robot = nbs.load_robot("two_link")
     law = nbs.NeuralBackstepping.for_robot(robot)
     b, c, b_fed, c_fed = rng.uniform(0.0, 3.0, (4, 2)) * rng.integers(0, 2, (4, 1))
     arm, fed = nbs.JointFriction(b, c), nbs.JointFriction(b_fed, c_fed)
     gap = FrictionGap.of(2, arm, fed)
-    constants = constants_of(law, np.maximum(gap.viscous, 0.0))
+    constants = constants_of(law, b)
     speed = rng.uniform(0.1, 2.0, 2)
     terms = friction_error(gap, constants, speed, "")
     for size in (1.0, 0.01):
@@ -286,10 +289,10 @@ def test_the_power_of_friction_is_within_its_terms(seed):
         z2 = np.where(rng.random(2) < 0.3, -phi, rng.normal(size=2) * size)
         v = phi + z2
         x, y = np.sqrt(force @ (constants.rate * force)), np.sqrt(z2 @ constants.floor @ z2)
-        most = terms.t * y + terms.alpha * x * y + terms.beta * y**2 + gap.power
+        most = terms.t * y + terms.alpha * x * y + gap.power
         sign = np.where(np.abs(v) < 1e-12, rng.uniform(-1.0, 1.0, 2), np.sign(v))
         for torque in (b * v + c * sign, arm.torque(v)):
-            power = z2 @ (fed.torque(phi) - torque) + z2 @ (np.maximum(gap.viscous, 0.0) * z2)
+            power = z2 @ (fed.torque(phi) - torque) + z2 @ (b * z2)
             assert power <= most * (1.0 + 1e-9) + 1e-12
 
 
@@ -318,10 +321,13 @@ def test_friction_that_the_urdf_states_is_counted_or_refused():
         certify(nbs.NeuralBackstepping.for_robot(robot), np.full(7, 0.05))
     own = nbs.JointFriction.of(robot)
     found = certify(nbs.NeuralBackstepping.for_robot(robot, friction=own), np.full(7, 0.05))
-    assert (found.friction.t, found.friction.alpha, found.friction.beta) == (0.0, 0.0, 0.0)
+    assert (found.friction.t, found.friction.alpha) == (0.0, 0.0)
     assert found.friction.gap.power > 0.0
-    none = nbs.JointFriction(np.zeros(7), np.zeros(7))
-    assert found.error > certify(nbs.NeuralBackstepping.for_robot(robot), np.full(7, 0.05), friction=none).error
+    none, dry = (nbs.JointFriction(np.zeros(7), c) for c in (np.zeros(7), own.coulomb))
+    without = certify(nbs.NeuralBackstepping.for_robot(robot), np.full(7, 0.05), friction=none)
+    rough = certify(nbs.NeuralBackstepping.for_robot(robot, friction=dry), np.full(7, 0.05), friction=dry)
+    assert rough.error > without.error  # by P, of a sign that is smoothed
+    assert found.error < rough.error  # by b, which damps
 
 
 def test_viscous_friction_without_a_bound_of_speed_gives_no_promise():

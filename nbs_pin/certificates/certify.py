@@ -9,7 +9,7 @@ import numpy as np
 from nbs_pin.accuracy.mismatch import Mismatch
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, positive
-from nbs_pin.base.claims import Claim, Group, Label
+from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
@@ -91,7 +91,7 @@ def certify(
     arm = law.dynamics.robot if robot is None else robot
     start = _check_arguments(law, arm, reference, duration, q0, v0, mismatch, period)
     gap = _friction(law, arm, friction)
-    constants, admissible = constants_of(law, np.maximum(gap.viscous, 0.0)), Admissible.of(disturbance, law.nv)
+    constants, admissible = constants_of(law, gap.arm.viscous), Admissible.of(disturbance, law.nv)
     motion = _sampled(law.nv, reference, duration)
     error = _model_error(law, arm, constants, mismatch, motion)
     rest = _friction_error(gap, constants, arm, motion)
@@ -208,7 +208,7 @@ def _comparison(
         omega=constants.omega,
         t=math.sqrt(admissible.energy(constants.metric)) + error.t + friction.t,
         alpha=error.alpha + friction.alpha,
-        beta=error.beta + friction.beta,
+        beta=error.beta,
         power=friction.gap.power,
         coupling=constants.coupling,
     )
@@ -242,6 +242,7 @@ def _with_conditions(
     conditions = [
         Condition("Theorem 1: min(ρ, ω + κ) > 0", certificate.rate, 0.0, "1/s", known, "docs/certificates.md §2"),
         *certificate.model_error.conditions,
+        *_dissipation(certificate),
         *certificate.friction.conditions,
         *_exactness(law, robot, certificate.mismatch),
         *found,
@@ -265,6 +266,16 @@ def _with_conditions(
     if start is not None and robot is not None:
         conditions += start_margin(robot, law, (start.q, start.v), start.begin)
     return replace(certificate, margins=margins, conditions=tuple(conditions))
+
+
+def _dissipation(certificate: Certificate) -> tuple[Condition, ...]:
+    """The condition of Theorem 4, with what model error and friction add, if there are any."""
+    lines = (*certificate.model_error.lines, *certificate.friction.lines)
+    if not lines:
+        return ()
+    k, label = certificate.comparison, weakest(*(line.label for line in lines))
+    sides = 1.0 - k.beta, 0.25 * k.cross**2
+    return (Condition("Theorem 4: 1 − β > α²/4", *sides, "", label, "docs/certificates.md §5, §8"),)
 
 
 def _no_wrap(robot: Robot | None, joints: JointArray) -> tuple[Condition, ...]:

@@ -42,7 +42,7 @@ class Constants:
     stiffness: Float[np.ndarray, "n n"]
     """S [J/rad²]."""
     floor: Float[np.ndarray, "n n"]
-    """D₀ with the viscous friction that is not compensated [N·m·s/rad]."""
+    """D₀ with the viscous friction of the joints [N·m·s/rad]."""
     metric: Float[np.ndarray, "n n"]
     """D₀⁻¹, for Δ = sup τ_dᵀD₀⁻¹τ_d."""
     label: Label
@@ -58,7 +58,7 @@ class Constants:
 def constants_of(law: LyapunovLaw, viscous: JointArray | None = None) -> Constants:
     """The constants of a controller; raises CertificateRefused if it or its model does not admit a proof.
 
-    viscous: friction of the joints that the law does not compensate [N·m·s/rad], ≥ 0, which adds to D₀.
+    viscous: friction of the joints [N·m·s/rad], ≥ 0, which adds to D₀ (docs/certificates.md §8).
     """
     v = check_structure(law)
     if viscous is not None and viscous.any():

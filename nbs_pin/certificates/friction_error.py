@@ -1,11 +1,11 @@
 """Friction of the arm that the law does not feed forward, in the inequalities (docs/certificates.md §8).
 
-With b and c the viscous and Coulomb coefficients of the arm, b̂ and ĉ those fed forward by a monotone f̂(φ), Δb = b − b̂,
+With b and c the viscous and Coulomb coefficients of the arm, b̂ and ĉ those fed forward by f̂(φ), Δb = b − b̂,
 Δc = c − ĉ, and v = v_d − Λ∇Φ + z2,
 
-    z2ᵀ(f̂(φ) − f(v)) ≤ |z2|ᵀ(|Δb||v_d| + |Δc|) + z2ᵀΔbΛ∇Φ − z2ᵀΔb z2 + P.
+    z2ᵀ(f̂(φ) − f(v)) ≤ −z2ᵀb z2 + |z2|ᵀ(|Δb||v_d| + |Δc|) + z2ᵀΔbΛ∇Φ + P.
 
-The term of z2 alone adds to D₀ where Δb ≥ 0, and is a β where it is not. P is for the sign of f, which f̂ smooths.
+The first term adds b to D₀. P is for the sign of f, which f̂ smooths.
 """
 
 import math
@@ -27,13 +27,13 @@ _WORST = 0.2785
 
 
 class FrictionGap(NamedTuple):
-    """Friction of the arm less that which is fed forward."""
+    """Friction of the arm, and of it that which is not fed forward."""
 
     viscous: JointArray
     """Δb [N·m·s/rad], (n,)."""
     coulomb: JointArray
     """Δc [N·m], (n,)."""
-    arm: JointFriction | None
+    arm: JointFriction
     """Friction of the arm."""
     power: float
     """P = max_x x(1 − tanh x) Σ ĉ_i ε [W], with the larger ε of f̂ and f."""
@@ -44,9 +44,7 @@ class FrictionGap(NamedTuple):
         none = JointFriction(np.zeros(nv), np.zeros(nv))
         arm, law = friction or none, fed or none
         widest = max(arm.transition, law.transition)
-        return cls(
-            arm.viscous - law.viscous, arm.coulomb - law.coulomb, friction, _WORST * widest * float(law.coulomb.sum())
-        )
+        return cls(arm.viscous - law.viscous, arm.coulomb - law.coulomb, arm, _WORST * widest * law.coulomb.sum())
 
     def torque(self, v: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows n"]:
         """Bound of each torque that is not fed forward [N·m]."""
@@ -54,12 +52,11 @@ class FrictionGap(NamedTuple):
 
 
 class FrictionError(NamedTuple):
-    """z2ᵀ(f̂(φ) − f(v)) + z2ᵀ max(Δb, 0)z2 ≤ t y + αxy + βy² + P."""
+    """z2ᵀ(f̂(φ) − f(v)) + z2ᵀb z2 ≤ t y + αxy + P."""
 
     gap: FrictionGap
     t: float
     alpha: float
-    beta: float
     lines: tuple[Claim, ...]
     conditions: tuple[Condition, ...]
 
@@ -67,17 +64,16 @@ class FrictionError(NamedTuple):
 def friction_error(gap: FrictionGap, constants: Constants, speed: JointArray, source: str) -> FrictionError:
     """The terms of a gap for |v_d| ≤ `speed` [rad/s], inf for no bound; `source` says where that comes from.
 
-    The viscous part of `constants` must be max(Δb, 0).
+    The D₀ of `constants` must include b.
     """
     viscous = np.abs(gap.viscous)
     if not (viscous.any() or gap.coulomb.any() or gap.power):
-        return FrictionError(gap, 0.0, 0.0, 0.0, (), ())
+        return FrictionError(gap, 0.0, 0.0, (), ())
     bounded = np.isfinite(speed)
     box = gap.torque(np.where(bounded, speed, 0.0))
     t = math.sqrt(Admissible.of(box, len(box)).energy(constants.metric))
-    scaled, lacking = viscous * np.sqrt(constants.rate), np.sqrt(np.maximum(-gap.viscous, 0.0))
+    scaled = viscous * np.sqrt(constants.rate)
     alpha = math.sqrt(up(largest_eigenvalue(scaled[:, None] * constants.metric * scaled))) if viscous.any() else 0.0
-    beta = up(largest_eigenvalue(lacking[:, None] * constants.metric * lacking)) if lacking.any() else 0.0
     here = "docs/certificates.md §8"
     because = f"|Δb||v_d| + |Δc| of what is not fed forward, |v_d| {source}; {here}"
     lines = (
@@ -86,7 +82,7 @@ def friction_error(gap: FrictionGap, constants: Constants, speed: JointArray, so
         Claim("P of Coulomb friction fed forward smoothly", gap.power, "W", Label.PROVED, here, Group.FRICTION),
     )
     if not viscous.any():
-        return FrictionError(gap, t, alpha, beta, lines, ())
+        return FrictionError(gap, t, alpha, lines, ())
     name, fastest = "∞ > speed of the reference, for viscous friction", float(speed[viscous > 0.0].max())
     known = Condition(name, math.inf, fastest, "rad/s", Label.PROVED, f"|v_d| {source}", checks=Assumption.FRICTION)
-    return FrictionError(gap, t, alpha, beta, lines, (known,))
+    return FrictionError(gap, t, alpha, lines, (known,))

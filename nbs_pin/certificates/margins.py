@@ -30,7 +30,9 @@ _SHARE = 0.5
 def sampled_control(
     controller: LyapunovLaw, period: float | None, storage: float = 0.0, potential: float = 0.0
 ) -> tuple[tuple[Claim, ...], tuple[Condition, ...]]:
-    """The longest hold and delay by the two rules of sampled control [s], and a period compared with half the first.
+    """The longest hold and delay by the two rules of sampled control [s], and conditions for a period.
+
+    The period must stay below half of the first, and below STIFF/√λ_max(M⁻¹K) for the stiffness K of the law.
 
     h < 2/(λ_max(M⁻¹D) + λ_max(Λ∇²Φ)) and delay < (π/2)/λ_max(M⁻¹D), with D including its inertial part ωM, at the
     largest values on sampled states with W ≤ `storage` and Φ ≤ `potential` [J].

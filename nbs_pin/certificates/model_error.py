@@ -46,7 +46,6 @@ def model_error(constants: Constants, mismatch: Mismatch, motion: SampledMotion)
     printed = "the paper's sufficient condition, for comparison; the bounds do not rest on it"
     needed = b + 0.5 * b * b + 0.5 * a + 1.0
     conditions = (
-        Condition("Theorem 4: 1 − β > α²/4", 1.0 - beta, 0.25 * alpha**2, "", fit.label, "docs/certificates.md §5"),
         Condition("printed: D > b + b²/2 + a/2 + 1", d, needed, "", fit.label, printed, Role.COMPARISON),
         Condition("printed: α > √a", mu, math.sqrt(a), "", fit.label, printed, Role.COMPARISON),
     )

@@ -139,6 +139,11 @@ class MinimumJerk:
         object.__setattr__(self, "waypoints", waypoints)
         object.__setattr__(self, "times", times)
 
+    @property
+    def duration(self) -> float:
+        """Time of the last waypoint [s]."""
+        return float(self.times[-1])
+
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
         t = np.asarray(t, dtype=float)
