@@ -79,6 +79,8 @@ class Certificate:
     """The model error that the bounds include."""
     start: Start | None = None
     """The start from which the overshoot is bounded."""
+    held: "HeldTorque | None" = None
+    """What is proved of the loop with held torques; None without a period."""
 
     @property
     def label(self) -> Label:
@@ -105,6 +107,7 @@ class Certificate:
         """Every bound and every constant, with its label and reason."""
         return (
             *_bounds(self),
+            *(() if self.held is None else (self.held.line,)),
             *self.admissible.claims,
             *self.constants.lines,
             *self.model_error.lines,
@@ -172,7 +175,9 @@ class Certificate:
         """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞)."""
         if initial <= 0.0:
             return self.error, self.joint_errors
-        return radians(self.stiffness, max(initial, self.potential))
+        within = self.held is not None and self.start is not None and initial <= self.start.storage
+        reached = self.held.potential_from_start if self.held is not None and within and self.held.is_proved else initial
+        return radians(self.stiffness, max(reached, self.potential))
 
     def summary(self) -> dict[str, Any]:
         """The certificate as JSON can store it."""

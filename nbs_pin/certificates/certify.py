@@ -17,8 +17,9 @@ from nbs_pin.certificates.certificate import Certificate, Start
 from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.comparison_system import ComparisonSystem, decay, level, reach
 from nbs_pin.certificates.constants import Constants, constants_of
-from nbs_pin.certificates.error_bounds import errors
+from nbs_pin.certificates.error_bounds import errors, radians
 from nbs_pin.certificates.friction_error import FrictionError, FrictionGap, friction_error
+from nbs_pin.certificates.held_torque import held_torque
 from nbs_pin.certificates.margins import (
     effort_margin,
     hold_margin,
@@ -56,6 +57,7 @@ def certify(
     v0: Any = None,
     mismatch: Mismatch | None = None,
     period: float | None = None,
+    lookahead: float | None = None,
     robot: Robot | None = None,
     friction: JointFriction | None = None,
 ) -> Certificate:
@@ -72,7 +74,9 @@ def certify(
         q0: Start from which the overshoot is bounded [rad]. Needs the reference.
         v0: Velocity at the start [rad/s]. None starts at rest.
         mismatch: Error δ of a learned model along closed loops (`compare(…).mismatch`). Needs the reference.
-        period: Control period to compare with the rule of sampled control [s].
+        period: Control period, over which every torque is held [s]. With the reference, the bounds are those of the
+            loop as it runs wherever that can be proved; else the period is compared with the rules of sampled control.
+        lookahead: How far ahead the law is evaluated [s], as in `simulate`; None takes half a period.
         robot: The true arm. None takes the model's.
         friction: Joint friction of the arm. None takes the URDF's, or none where it states none; without an arm, that
             which is fed forward.
@@ -118,7 +122,26 @@ def certify(
         mismatch=mismatch,
         start=start,
     )
+    if period is not None:
+        certificate = _held(certificate, motion, period, lookahead)
     return _with_conditions(certificate, reference, motion, period)
+
+
+def _held(
+    certificate: Certificate, motion: SampledMotion | None, period: float, lookahead: float | None
+) -> Certificate:
+    """The certificate with the bounds of the held torque in place of those in continuous time, if they are proved."""
+    law, constants = certificate.controller, certificate.constants
+    inexact = certificate.mismatch is not None or bool(certificate.model_error.lines)
+    other = "an inexact model is not part of the proof" if inexact else ""
+    viscous = certificate.friction.gap.arm.viscous
+    loop = law, certificate.robot, constants, certificate.comparison, viscous
+    held = held_torque(*loop, motion, certificate.storage, certificate.start, period, lookahead, other)
+    if not held.is_proved:
+        return replace(certificate, held=held)
+    size, joints = radians(constants.stiffness, held.potential)
+    source = f"Φ ≥ z1ᵀSz1, with every torque held for {1e3 * period:g} ms, docs/certificates.md §12"
+    return replace(certificate, held=held, potential=held.potential, error=size, joint_errors=joints, source=source)
 
 
 def _check_arguments(
@@ -238,6 +261,9 @@ def _with_conditions(
         joints = np.maximum(joints, certificate.overshoot[1])
         reached, potential = max(reached, start.storage), max(potential, start.storage)
     margins, found = sampled_control(law, period, reached, potential)
+    is_held = certificate.held is not None and certificate.held.is_proved
+    if certificate.held is not None and is_held:
+        found = (certificate.held.condition,)
     known = certificate.constants.label
     conditions = [
         Condition("Theorem 1: min(ρ, ω + κ) > 0", certificate.rate, 0.0, "1/s", known, "docs/certificates.md §2"),
@@ -250,7 +276,7 @@ def _with_conditions(
     ]
     if motion is not None:
         conditions += smoothness(motion)
-    if motion is not None and period is not None:
+    if motion is not None and period is not None and not is_held:
         metric = certificate.constants.metric
         conditions += hold_margin(law, metric, motion, period, certificate.admissible.energy(metric))
     if motion is not None and reference is not None and certificate.mismatch is not None:

@@ -33,6 +33,10 @@ class Activation(ABC):
         """Bounds of σ'' over the intervals; [0, ∞) unless a subclass knows more."""
         return Interval(0.0 * a.low, np.inf + 0.0 * a.high)
 
+    def largest_third_derivative(self, a: Interval) -> Float[np.ndarray, " units"]:
+        """Bound of |σ'''| over the intervals; ∞ unless a subclass knows one."""
+        return np.full(np.shape(a.low), np.inf)
+
 
 @known_code
 @storable(("d",))
@@ -94,3 +98,9 @@ class Squareplus(Activation):
         low, high = (self.derivatives(end)[2] for end in (a.low, a.high))
         top = self.derivatives(np.zeros_like(low))[2]
         return Interval(np.minimum(low, high), np.where((a.low <= 0.0) & (a.high >= 0.0), top, np.maximum(low, high)))
+
+    def largest_third_derivative(self, a: Interval) -> Float[np.ndarray, " units"]:
+        """|σ'''| = 3b|x|/2(x² + b)^{5/2} grows up to |x| = ½√b and falls beyond."""
+        nearest = np.where(a.low * a.high <= 0.0, 0.0, np.minimum(np.abs(a.low), np.abs(a.high)))
+        x = np.clip(0.5 * np.sqrt(self.b), nearest, np.maximum(np.abs(a.low), np.abs(a.high)))
+        return np.asarray(1.5 * self.b * x / (x * x + self.b) ** 2.5)

@@ -1,12 +1,13 @@
 """The neural backstepping (NBS) law: tracking that is stable for every value of its network weights."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, Matrices, Vectors, as_vectors
+from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, as_vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import known_code
@@ -172,6 +173,20 @@ class NeuralBackstepping(LyapunovLaw):
     def extra_stiffness(self, radius: float) -> Interval:
         """Bounds of ψ'' for one joint [N·m/rad]."""
         return self.potential.curvature(radius)
+
+    def stiffness_range(self, radii: JointArray) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+        """2S and bounds of ∇²ψ."""
+        low, high = self.potential.curvature_range(radii)
+        hessian = 2.0 * self.potential.stiffness.numpy()
+        return hessian + low, hessian + high
+
+    def damping_slope(self) -> float:
+        """From the Lipschitz constants of the networks of T, which are zero at 0 if they have no biases."""
+        return math.inf if self.damping.floor is None else self.damping.slope()
+
+    def stiffness_rate(self, radii: JointArray, weights: JointArray) -> float:
+        """That of ∇²ψ."""
+        return self.potential.curvature_rate(radii, weights)
 
     def extra_damping(self, radius: float) -> Interval:
         """Bounds of T² for one joint [N·m·s/rad]."""

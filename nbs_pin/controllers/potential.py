@@ -1,14 +1,14 @@
 """The error potential Φ: strongly convex for every parameter value, with its minimum at zero."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, Scalars, Vectors, array_namespace, is_torch_array, matvec
+from nbs_pin.base.arrays import Array, JointArray, Scalars, Vectors, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import OUTWARD, Interval
 from nbs_pin.base.known_code import defines, known_code
@@ -27,6 +27,19 @@ _CELLS = 400  # subintervals of [−radius, radius]
 def _stored(t: Tensors) -> Mapping[str, Any]:
     gain = {"stiffness": t["stiffness.nominal"], "least_share": float(t["stiffness.least_share"])}
     return gain | {"scale": t["scale"], "widths": t.widths("network.wx")}
+
+
+class _Units(NamedTuple):
+    """Ranges of the units y = σ(a) of a layer, and their weights Wy."""
+
+    wy: np.ndarray
+    a: Interval
+    da: Interval
+    """∇a."""
+    slope: Interval
+    """σ'."""
+    curvature: Interval
+    """σ''."""
 
 
 @known_code
@@ -131,6 +144,67 @@ class Potential(nn.Module):
             y, slope = Interval(ends[0][0], ends[1][0]), Interval(ends[0][1], ends[1][1])
             dy, ddy = slope * da, activation.curvature_range(a) * da.squared() + slope * dda
         return ddy.hull().times(scale * scale).widened(OUTWARD)
+
+    def curvature_range(self, radii: JointArray) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+        """A and B with A ⪯ ∇²ψ(z) ⪯ B while Σ (z_i/radii_i)² ≤ 1 [N·m/rad], by interval arithmetic.
+
+        ∇²f = Σ_u λ_u σ''(a_u) g_ug_uᵀ over all units u, with g_u = ∇a_u and λ_u = ∂f/∂y_u ≥ 0 by the reverse pass. With
+        g = c + d, |d| ≤ r, ggᵀ lies between (1 ∓ η)ccᵀ ± (1 ∓ 1/η)ddᵀ, and xᵀddᵀx ≤ (|x|ᵀr)². Pre-activations differ
+        from those at 0 by at most the largest |g_u| of the ellipsoid, in its norm.
+        """
+        scale = np.abs(self.scale.numpy(force=True))
+        tape = self._tape(scale * radii)
+        shape = (len(scale), len(scale))
+        known, unknown, lam = [np.zeros(shape), np.zeros(shape)], np.zeros(shape), Interval.of(np.ones(1))
+        for unit in reversed(tape):
+            weight = lam * unit.curvature
+            for k, w in enumerate((weight.low, weight.high)):
+                known[k] += unit.da.middle.T @ (w[:, None] * unit.da.middle)
+            unknown += unit.da.half_width.T @ (weight.high[:, None] * unit.da.half_width)
+            lam = (lam * unit.slope).through(unit.wy.T)
+        return self._widened(scale, known, unknown.sum(axis=1))  # |x|ᵀU|x| ≤ Σ (U1)_i x_i² for U ≥ 0
+
+    def curvature_rate(self, radii: JointArray, weights: JointArray) -> float:
+        """L with |xᵀ(∇²ψ(z) − ∇²ψ(z'))y| ≤ L‖x‖‖y‖‖z − z'‖ in the ellipsoid of `curvature_range`, ‖x‖² = Σ weights_i x_i².
+
+        From norms of the first three derivatives of every unit y = σ(a), Dy = σ'Da, D²y = σ''(Da)² + σ'D²a and
+        D³y = σ'''(Da)³ + 3σ''Da D²a + σ'D³a, where weights ≥ 0 pass norms on.
+        """
+        scale, activation = np.abs(self.scale.numpy(force=True)), self.network.activation
+        second, third = np.zeros((2, 0))
+        for unit in self._tape(scale * radii):
+            first = np.linalg.norm(np.maximum(-unit.da.low, unit.da.high) * scale / np.sqrt(weights), axis=1)
+            second, third = unit.wy @ second, unit.wy @ third
+            curvature, jerk = unit.curvature.high, activation.largest_third_derivative(unit.a)
+            third = jerk * first**3 + 3.0 * curvature * first * second + unit.slope.high * third
+            second = curvature * first**2 + unit.slope.high * second
+        return float(third[0]) * OUTWARD
+
+    def _tape(self, reach: JointArray) -> "list[_Units]":
+        """The ranges of all units while Σ (x_i/reach_i)² ≤ 1, x = Rz, layer by layer."""
+        y, dy, tape = np.zeros(0), Interval.of(np.zeros((0, len(reach)))), []
+        activation = self.network.activation
+        for wy, wx, bias in self.network.layers(numpy=True):
+            wy = np.zeros((len(wx), 0)) if wy is None else wy
+            middle = wy @ y + (0.0 if bias is None else bias)
+            da = (dy.through(wy) + wx).widened(OUTWARD)
+            off = np.linalg.norm(np.maximum(-da.low, da.high) * reach, axis=1)
+            a = Interval(middle - off, middle + off).widened(OUTWARD)
+            y = activation.derivatives(middle)[0]
+            slope = Interval(*(activation.derivatives(end)[1] for end in (a.low, a.high)))
+            dy = Interval(slope.low[:, None], slope.high[:, None]) * da
+            tape.append(_Units(wy, a, da, slope, activation.curvature_range(a)))
+        return tape
+
+    @staticmethod
+    def _widened(
+        scale: JointArray, known: list[np.ndarray], rest: JointArray
+    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+        eta = float(np.clip(np.sqrt(rest.max() / max(np.linalg.norm(known[1], 2), 1e-300)), 1e-9, 1.0))
+        low = (1.0 - eta) * known[0] - (1.0 / eta - 1.0) * np.diag(rest)
+        high = (1.0 + eta) * known[1] + (1.0 + 1.0 / eta) * np.diag(rest)
+        allowance = (OUTWARD - 1.0) * float(np.linalg.norm(high)) * np.eye(len(scale))
+        return scale[:, None] * (low - allowance) * scale, scale[:, None] * (high + allowance) * scale
 
     def _psi(self, x: Vectors, dx: Vectors) -> tuple[Scalars, Vectors, Vectors]:
         if self.form == "paper":

@@ -128,7 +128,7 @@ def determinant_bound(arm: Arm) -> float:
     """
     tree = RigidTree.of(arm)
     n = tree.nv
-    greatest = np.array([np.sum(_body_traces(tree, row)) for row in np.eye(n)])
+    greatest = largest_diagonal(tree)
     trace = min(float(np.sum(_body_traces(tree, np.ones(n)))), float(greatest.sum()))
     if not np.isfinite(trace):
         return 0.0
@@ -139,6 +139,12 @@ def determinant_bound(arm: Arm) -> float:
     plain = np.log(own).sum() + (n - 1) * np.log(max(n - 1, 1) / trace)
     scaled = np.log(own / greatest).sum() + (n - 1) * np.log(max(n - 1, 1) / n) + np.log(greatest.min())
     return down(float(np.exp(max(plain, scaled))))
+
+
+def largest_diagonal(arm: Arm) -> JointArray:
+    """Upper bounds of max_q M_ii(q) [kg·m², kg] for each joint, by lever arms; inf as in `largest_inertia_bound`."""
+    tree = RigidTree.of(arm)
+    return np.array([up(float(np.sum(_body_traces(tree, row)))) for row in np.eye(tree.nv)])
 
 
 def _body_traces(tree: RigidTree, weights: JointArray) -> JointArray:

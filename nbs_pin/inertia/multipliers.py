@@ -47,6 +47,8 @@ class Motions:
     moving: list[int]
     """Indices of q̇ in x."""
     conditions: list[Form]
+    twists: Float[np.ndarray, "2 n 6 m"]
+    """Twist (v, ω) of each body in its frame as rows in x, and the sums of absolute values behind them."""
 
     @classmethod
     def of(cls, tree: RigidTree) -> "Motions":
@@ -57,7 +59,7 @@ class Motions:
         own, sums, conditions = np.zeros((2, tree.nv, 6, starts[-1])), np.zeros((starts[-1],) * 2), []
         energy = np.zeros_like(sums)
         for i, p in enumerate(tree.parents.tolist()):
-            placed = _placed(tree, i)
+            placed = placed_twist(tree, i)
             # own[0] holds the twists and own[1] the sums of absolute values behind them.
             seen = np.stack([placed @ own[0, p], np.abs(placed) @ own[1, p]])
             own[:, i] = seen
@@ -71,7 +73,7 @@ class Motions:
             for matrix in (energy, sums):
                 matrix[moving[i], moving[i]] += tree.armature[i]
             conditions += _conditions(tree, i, own[:, i], seen)
-        return cls(Form(energy, sums), moving, conditions)
+        return cls(Form(energy, sums), moving, conditions, own)
 
 
 def least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"] | None = None) -> float:
@@ -88,28 +90,37 @@ def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) ->
 def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> float:
     """The largest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf if none is found."""
     motions = Motions.of(tree)
-    m = len(motions.energy.matrix)
-    diagonal = np.abs(np.diag(motions.energy.matrix))
+    rates = np.zeros_like(motions.energy.matrix)
+    rates[np.ix_(motions.moving, motions.moving)] = weight
+    energy = Form(sign * motions.energy.matrix, motions.energy.size)
+    return largest_multiple(energy, Form(rates, np.abs(rates)), motions.conditions, tree.nv)
+
+
+def largest_multiple(form: Form, unit: Form, conditions: list[Form], terms_behind: int = 0) -> float:
+    """The largest a found such that form − a·unit ≥ 0 on all motions that satisfy the conditions; −inf if none is found.
+
+    terms_behind: length of the longest sum behind an entry, besides the size of the forms, for the rounding errors.
+    """
+    m = len(form.matrix)
+    diagonal = np.abs(np.diag(form.matrix)) + np.abs(np.diag(unit.matrix))
     scale = 1.0 / np.sqrt(diagonal + 1e-3 * diagonal.mean())
     scales = scale * scale[:, None]
-    rated = np.zeros((m, m))
-    rated[np.ix_(motions.moving, motions.moving)] = -weight
-    rated *= scales
-    unit = 1.0 / float(np.linalg.norm(rated, 2))
-    forms = [form.matrix * scales for form in motions.conditions]
-    norms = np.array([max(float(np.linalg.norm(form)), 1e-300) for form in forms])
-    terms = np.array([unit * rated, *(form / norm for form, norm in zip(forms, norms, strict=True))])
-    positive = np.array([False, *(form.positive for form in motions.conditions)])
-    constant, best = sign * motions.energy.matrix * scales, -np.inf
+    rated = -unit.matrix * scales
+    factor = 1.0 / float(np.linalg.norm(rated, 2))
+    scaled = [condition.matrix * scales for condition in conditions]
+    norms = np.array([max(float(np.linalg.norm(x)), 1e-300) for x in scaled])
+    terms = np.array([factor * rated, *(x / norm for x, norm in zip(scaled, norms, strict=True))])
+    positive = np.array([False, *(condition.positive for condition in conditions)])
+    constant, best = form.matrix * scales, -np.inf
     for margin in MARGINS:
         y, solved = maximise(constant - margin * np.eye(m), terms, positive)
-        sums = motions.energy.size + np.abs(y[0]) * unit * np.abs(rated) / scales
-        for h, norm, form in zip(y[1:], norms, motions.conditions, strict=True):
-            sums = sums + abs(h) / norm * form.size
+        sums = form.size + np.abs(y[0]) * factor * unit.size
+        for h, norm, condition in zip(y[1:], norms, conditions, strict=True):
+            sums = sums + abs(h) / norm * condition.size
         # The largest row sum of the errors of the entries is no less than their spectral norm.
-        radius = 16.0 * (m + tree.nv) * np.finfo(float).eps * float((sums * scales).sum(axis=1).max())
+        radius = 16.0 * (m + terms_behind) * np.finfo(float).eps * float((sums * scales).sum(axis=1).max())
         if exceeds_every_perturbation(constant + np.tensordot(y, terms, 1), radius):
-            best = max(best, float(y[0]) * unit)
+            best = max(best, float(y[0]) * factor)
             if solved:
                 break
     return best
@@ -156,7 +167,7 @@ def _settings() -> clarabel.DefaultSettings:
     return settings
 
 
-def _placed(tree: RigidTree, i: int) -> Float[np.ndarray, "6 6"]:
+def placed_twist(tree: RigidTree, i: int) -> Float[np.ndarray, "6 6"]:
     """Matrix from the parent's twist to that of frame i at q_i = 0; zero on the base."""
     placed = np.zeros((6, 6))
     if tree.parents[i] >= 0:

@@ -1,0 +1,130 @@
+"""Bounds of the Coriolis terms, of ∂M/∂q and of gravity's change in every pose, and of what a reference asks of them.
+
+Norms: |x|² = xᵀD₀x for velocities, |f|_* = √(fᵀD₀⁻¹f) for torques, |x|_M² = xᵀMx. With ±∂_iM ⪯ γ_iM and
+±∂_iM ⪯ γ'_iD₀ (`inertia/derivatives.py`), C(q, v)z is the sum of three terms ½xᵀ∂_vM z, ½xᵀ∂_zM v, −½vᵀ∂_xM z.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.certificates.constants import Constants
+from nbs_pin.certificates.sampled_motion import SampledMotion
+from nbs_pin.dynamics.rigid_tree import RigidTree
+from nbs_pin.inertia.bounds import largest_diagonal, largest_inertia_bound, least_inertia_bound
+from nbs_pin.inertia.derivatives import inertia_derivatives, rate_bound
+from nbs_pin.robots.robot import Robot
+
+MOST_JOINTS = 8
+"""Arms with more joints take too long."""
+
+
+class MotionBounds(NamedTuple):
+    """Greatest values of a reference: sums over the joints, and norms."""
+
+    turn: float
+    """Σ γ_i|v_d,i| [1/s]."""
+    turn_d: float
+    """Σ γ'_i|v_d,i|."""
+    speed_1: float
+    """Σ |v_d,i| [rad/s]."""
+    speed: float
+    """|v_d|."""
+    acceleration: float
+    """|a_d|."""
+    jerk: float
+    """|ȧ_d|."""
+
+
+@dataclass(frozen=True, eq=False)
+class CoriolisBounds:
+    """Constants of an arm and of D₀."""
+
+    relative: JointArray
+    """γ [1/rad]."""
+    by_floor: JointArray
+    """γ' [s/rad]."""
+    turn: float
+    """Σ γ_i|v_i| ≤ turn·|v|_M."""
+    turn_d: float
+    """Σ γ'_i|v_i| ≤ turn_d·|v|_M."""
+    sum_m: float
+    """Σ |v_i| ≤ sum_m·|v|_M."""
+    sum: float
+    """Σ |v_i| ≤ sum·|v|."""
+    spread: float
+    """Σ γ_i|v_i| ≤ spread·|v|."""
+    spread_d: float
+    """Σ γ'_i|v_i| ≤ spread_d·|v|."""
+    gravity: float
+    """|G(q + u) − G(q)|_* ≤ gravity·Σ|u_i|."""
+    loss_m: float
+    """|Λ^½f|_M ≤ loss_m·‖f‖."""
+    loss_inverse: float
+    """‖Λ^-½M^-½f‖ ≤ loss_inverse·‖f‖."""
+
+    @classmethod
+    def of(cls, robot: Robot, constants: Constants) -> "CoriolisBounds":
+        """The bounds for an arm; inf where a joint that slides or a failed search leaves none."""
+        floor, rate = constants.floor, constants.rate
+        return _bounds(_Key(robot), floor.tobytes(), rate.tobytes(), len(rate))
+
+    def motion(self, motion: SampledMotion, floor: Float[np.ndarray, "n n"]) -> MotionBounds:
+        """The bounds of a reference."""
+        jerk = np.diff(motion.a, axis=0) / np.diff(motion.t)[:, None]
+        largest = [float(np.sqrt(np.einsum("ti,ij,tj->t", x, floor, x).max())) for x in (motion.v, motion.a, jerk)]
+        speeds = [float(w @ motion.speed) for w in (self.relative, self.by_floor, np.ones(len(floor)))]
+        between = (motion.half * largest[1], motion.half * largest[2], 0.0)
+        return MotionBounds(*speeds, *(x + more for x, more in zip(largest, between, strict=True)))
+
+
+class _Key:
+    """A robot by its identity, for the cache."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self._state = (robot.sha256, str(robot.options), robot.model.armature.tobytes(), robot.model.gravity.vector.tobytes())
+
+    def __hash__(self) -> int:
+        return hash(self._state)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self._state == other._state
+
+
+@lru_cache(maxsize=8)
+def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> CoriolisBounds:
+    floor, rate = np.frombuffer(floor_bytes).reshape(n, n), np.frombuffer(rate_bytes)
+    tree, inverse = RigidTree.of(key.robot), np.abs(np.linalg.inv(floor))
+    relative = inertia_derivatives(tree)
+    heaviest = largest_inertia_bound(tree, floor).value
+    by_floor = np.minimum(inertia_derivatives(tree, floor), relative * heaviest)
+
+    def largest(weights: JointArray) -> float:
+        return math.sqrt(weights @ inverse @ weights)
+
+    weight = np.linalg.norm(key.robot.model.gravity.linear) * np.sqrt(_carried(tree) * largest_diagonal(tree))
+    above, below = np.diag(1.0 / rate), np.diag(1.0 / rate)
+    return CoriolisBounds(
+        relative=relative,
+        by_floor=by_floor,
+        turn=rate_bound(tree, relative),
+        turn_d=rate_bound(tree, by_floor),
+        sum_m=rate_bound(tree, np.ones(n)),
+        sum=largest(np.ones(n)),
+        spread=largest(relative),
+        spread_d=largest(by_floor),
+        gravity=largest(weight),
+        loss_m=math.sqrt(largest_inertia_bound(tree, above).value),
+        loss_inverse=1.0 / math.sqrt(max(least_inertia_bound(tree, below).value, 1e-300)),
+    )
+
+
+def _carried(tree: RigidTree) -> JointArray:
+    """Mass that each joint carries [kg]."""
+    return np.array([sum(tree.mass[k] for k in range(tree.nv) if i in tree.path(k)) for i in range(tree.nv)])

@@ -1,0 +1,118 @@
+"""Bounds of the loop as it runs, with every torque held for a period, where they can be proved."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.claims import Claim, Group, Label
+from nbs_pin.certificates.certificate import Start
+from nbs_pin.certificates.claims import Assumption, Condition
+from nbs_pin.certificates.comparison_system import ComparisonSystem
+from nbs_pin.certificates.constants import Constants
+from nbs_pin.certificates.coriolis import MOST_JOINTS, CoriolisBounds
+from nbs_pin.certificates.sampled_loop import SampledLaw, kept_level
+from nbs_pin.certificates.sampled_motion import SampledMotion
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.dynamics.analytic import AnalyticDynamics
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.robots.robot import Robot
+
+_HALVINGS, _BISECTIONS = 7, 4
+_HERE = "docs/certificates.md §12"
+
+
+@dataclass(frozen=True, eq=False)
+class HeldTorque:
+    """What is proved of a loop whose torque is held for a period."""
+
+    period: float
+    """h [s]."""
+    lookahead: float
+    """How far ahead the law is evaluated [s]."""
+    level: float
+    """Level of V' that no hold leaves from a start on the reference [J]; inf if none is proved."""
+    potential: float
+    """Largest Φ from a start on the reference, and in the limit [J]."""
+    potential_from_start: float
+    """Largest Φ from the given start [J]."""
+    longest: float
+    """Longest period found with a proof [s], 0 if there is none; `period` if that has one."""
+    why_not: str
+    """Why no proof was tried; empty if it was."""
+
+    @property
+    def is_proved(self) -> bool:
+        """Whether the bounds hold at this period."""
+        return math.isfinite(self.potential_from_start)
+
+    @property
+    def condition(self) -> Condition:
+        """The condition that stands for the assumption of continuous time."""
+        name = "longest period with a proof for held torques ≥ the period"
+        sides = self.longest * (1.0 + 1e-12), self.period
+        return Condition(name, *sides, "s", Label.PROVED, _HERE, checks=Assumption.TIME)
+
+    @property
+    def line(self) -> Claim:
+        """What is known of the held torque, for the table."""
+        if self.is_proved:
+            because = f"{_HERE}, torque held for {1e3 * self.period:g} ms"
+            return Claim("V' that no hold leaves", self.level, "J", Label.PROVED, because, Group.BOUNDS)
+        because = f"not provable at {1e3 * self.period:g} ms: " + (self.why_not or "the longest found that is")
+        return Claim("period with a proof for held torques", self.longest, "s", Label.PROVED, because, Group.CONSTANTS)
+
+
+def held_torque(
+    law: LyapunovLaw,
+    robot: Robot | None,
+    constants: Constants,
+    comparison: ComparisonSystem,
+    viscous: JointArray,
+    motion: SampledMotion | None,
+    least: float,
+    start: Start | None,
+    period: float,
+    lookahead: float | None,
+    other: str = "",
+) -> HeldTorque:
+    """The bounds for a period, or the longest period that has them.
+
+    viscous: friction of the joints within D₀. least: V∞ in continuous time. other: what else the proof does not cover.
+    """
+    lead = 0.5 * period if lookahead is None else lookahead
+    why_not = other or _why_not(law, robot, motion)
+    nothing = HeldTorque(period, lead, math.inf, math.inf, math.inf, 0.0, why_not)
+    if why_not or robot is None or motion is None:
+        return nothing
+    arm = CoriolisBounds.of(robot, constants)
+    bounds = arm.motion(motion, constants.floor)
+    share = float(np.max(viscous * np.diag(constants.metric)))
+    numbers = constants, arm, bounds, comparison.t, comparison.alpha, share
+
+    def kept(h: float, begin: float) -> tuple[float, float]:
+        return kept_level(SampledLaw(law, *numbers, h, lead * h / period), begin)
+
+    begin = max(least, 0.0 if start is None else start.storage)
+    level, potential = kept(period, least)
+    from_start = potential if begin == least else kept(period, begin)[1]
+    if math.isfinite(from_start):
+        return HeldTorque(period, lead, level, potential, from_start, period, "")
+    shorter = (period * 0.5**k for k in range(1, _HALVINGS + 1))
+    longest = next((h for h in shorter if math.isfinite(kept(h, begin)[1])), 0.0)
+    low, high = longest, 2.0 * longest
+    for _ in range(_BISECTIONS if longest > 0.0 else 0):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if math.isfinite(kept(middle, begin)[1]) else (low, middle)
+    return HeldTorque(period, lead, math.inf, math.inf, math.inf, low, "")
+
+
+def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None) -> str:
+    if motion is None:
+        return "give the reference"
+    if robot is None or type(law.dynamics) not in (PinocchioDynamics, AnalyticDynamics):
+        return "only for the exact model of an arm"
+    if law.nv > MOST_JOINTS:
+        return f"not tried for more than {MOST_JOINTS} joints"
+    return "friction that is fed forward is not part of the proof" if law.friction is not None else ""

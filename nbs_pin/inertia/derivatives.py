@@ -1,0 +1,158 @@
+"""Bounds of ∂M/∂q_i relative to M in every pose, by an S-procedure with momenta (docs/certificates.md §11).
+
+With rates x held fixed, the energy 2T = xᵀM(q)x changes with q_i as xᵀ∂_iM x = −2 z·(v×p + ω×l): (v, ω) is the twist of
+body i and (p, l) the momentum of all bodies that it carries, both in frame i. Twists satisfy the conditions of
+`multipliers`. The momentum of body k is I_k(v, ω) plus those of its children, and a joint that turns rotates a child's
+momentum about z by the angle by which it rotates the parent's twist back. So all products and cross products across z
+of v, ω, p, l are the same on both sides of the joint, and the z components of p and l too. No condition contains q.
+"""
+
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.rounding import up
+from nbs_pin.dynamics.rigid_tree import Arm, RigidTree
+from nbs_pin.inertia.multipliers import Form, Motions, largest_multiple, least_by_multipliers, placed_twist
+
+_TURNED = (0, 1, 3, 4)
+"""Components of a twist or a momentum across the axis."""
+
+
+def inertia_derivatives(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None) -> JointArray:
+    """γ with −γ_iW ⪯ ∂M/∂q_i ⪯ γ_iW in every pose, 0 where M does not depend on q_i.
+
+    inf at a joint that slides with an effect on M, at a joint that carries one, and where no multipliers are found.
+
+    Args:
+        weight: W, symmetric positive definite; None takes M(q) itself, which gives γ in 1/rad.
+    """
+    tree = RigidTree.of(arm)
+    return np.array([_derivative(tree, i, weight) for i in range(tree.nv)])
+
+
+def rate_bound(arm: Arm, weights: JointArray) -> float:
+    """The least C found with Σ w_i|q̇_i| ≤ C √(q̇ᵀMq̇) for all rates and in every pose, w ≥ 0; inf if none is found.
+
+    (Σ w_i|q̇_i|)² ≤ Σ w_i · Σ w_i q̇_i² for any split; here the split takes each joint's own bound into account.
+    """
+    tree = RigidTree.of(arm)
+    used = np.flatnonzero(weights > 0.0)
+    if not len(used):
+        return 0.0
+    if not np.isfinite(weights).all():
+        return np.inf
+    single = np.zeros(tree.nv)
+    for i in used:
+        single[i] = _largest_rate(tree, np.eye(tree.nv)[i])
+    if not np.isfinite(single).all():
+        return np.inf
+    share = weights * single
+    share = share / share.sum()
+    parts = np.divide(weights**2, share, out=np.zeros(tree.nv), where=share > 0.0)
+    return min(up(float(weights @ single)), _largest_rate(tree, parts))
+
+
+def _largest_rate(tree: RigidTree, weights: JointArray) -> float:
+    """√ of the least C found with Σ w_i q̇_i² ≤ C q̇ᵀMq̇."""
+    least = least_by_multipliers(tree, np.diag(weights))
+    return up(1.0 / np.sqrt(least)) if least > 0.0 else np.inf
+
+
+def _derivative(tree: RigidTree, joint: int, weight: Float[np.ndarray, "n n"] | None) -> float:
+    if tree.absent[joint]:
+        return 0.0
+    carried = [k for k in range(joint + 1, tree.nv) if joint in tree.path(k)]
+    if tree.prismatic[joint] or tree.prismatic[carried].any():
+        return np.inf
+    energy, change, conditions = _momenta(tree, joint, carried)
+    if not change.matrix.any():
+        return 0.0
+    unit = energy
+    if weight is not None:
+        moving = Motions.of(tree).moving
+        rates = np.zeros_like(energy.matrix)
+        rates[np.ix_(moving, moving)] = weight
+        unit = Form(rates, np.abs(rates))
+    # ±change + γ·unit ≥ 0, that is ±change − a·unit ≥ 0 with a = −γ.
+    bounds = [
+        -largest_multiple(Form(sign * change.matrix, change.size), unit, conditions, 2 * tree.nv)
+        for sign in (1.0, -1.0)
+    ]
+    return up(max(*bounds, 0.0))
+
+
+def _momenta(tree: RigidTree, joint: int, carried: list[int]) -> tuple[Form, Form, list[Form]]:
+    """2T, the change of 2T with q_joint, and the conditions, in the coordinates of `Motions` and those of momenta."""
+    motions = Motions.of(tree)
+    few = len(motions.energy.matrix)
+    m = few + len(_TURNED) * len(carried)
+    # In [0] the rows themselves, in [1] the sums of absolute values behind them.
+    twist = _widened(motions.twists, m)
+    momentum = np.zeros((2, tree.nv, 6, m))
+    conditions = [Form(_wide(c.matrix, m), _wide(c.size, m), c.positive) for c in motions.conditions]
+    for k in range(tree.nv - 1, joint - 1, -1):
+        if k != joint and k not in carried:
+            continue
+        inertia = tree.spatial_inertia(k)
+        momentum[0, k] += inertia @ twist[0, k]
+        momentum[1, k] += np.abs(inertia) @ twist[1, k]
+        if k == joint:
+            continue
+        first = few + len(_TURNED) * carried.index(k)
+        turned = momentum[:, k].copy()
+        turned[:, _TURNED] = 0.0
+        turned[:, _TURNED, range(first, first + len(_TURNED))] = 1.0
+        placed = placed_twist(tree, k)
+        momentum[0, tree.parents[k]] += placed.T @ turned[0]
+        momentum[1, tree.parents[k]] += np.abs(placed).T @ turned[1]
+        seen = np.stack([placed @ twist[0, tree.parents[k]], np.abs(placed) @ twist[1, tree.parents[k]]])
+        conditions += _rotated(_across(twist[:, k], momentum[:, k]), _across(seen, turned))
+    v, omega, p, l = (x for x in _across(twist[:, joint], momentum[:, joint]))
+    change = Form(-2.0 * (_cross(v[0], p[0]) + _cross(omega[0], l[0])), 2.0 * (_sums(v[1], p[1]) + _sums(omega[1], l[1])))
+    return Form(_wide(motions.energy.matrix, m), _wide(motions.energy.size, m)), change, conditions
+
+
+def _rotated(new: list[np.ndarray], old: list[np.ndarray]) -> list[Form]:
+    """Products with a momentum that a common rotation about z keeps; those of two twists are among the others."""
+    forms = []
+    pairs = [(a, b) for a, b in combinations(range(4), 2) if b > 1] + [(2, 2), (3, 3)]
+    for a, b in pairs:
+        size = _sums(new[a][1], new[b][1]) + _sums(old[a][1], old[b][1])
+        forms.append(Form(_dot(new[a][0], new[b][0]) - _dot(old[a][0], old[b][0]), size))
+        if a != b:
+            forms.append(Form(_cross(new[a][0], new[b][0]) - _cross(old[a][0], old[b][0]), size))
+    return forms
+
+
+def _across(twist: Float[np.ndarray, "2 6 m"], momentum: Float[np.ndarray, "2 6 m"]) -> list[np.ndarray]:
+    """v, ω, p, l across z, each with the sums behind it: (2, 2, m)."""
+    return [twist[:, :2], twist[:, 3:5], momentum[:, :2], momentum[:, 3:5]]
+
+
+def _dot(a: Float[np.ndarray, "2 m"], b: Float[np.ndarray, "2 m"]) -> Float[np.ndarray, "m m"]:
+    form = a.T @ b
+    return 0.5 * (form + form.T)
+
+
+def _cross(a: Float[np.ndarray, "2 m"], b: Float[np.ndarray, "2 m"]) -> Float[np.ndarray, "m m"]:
+    form = np.outer(a[0], b[1]) - np.outer(a[1], b[0])
+    return 0.5 * (form + form.T)
+
+
+def _sums(a: Float[np.ndarray, "2 m"], b: Float[np.ndarray, "2 m"]) -> Float[np.ndarray, "m m"]:
+    """Sums of absolute values behind the entries of `_dot` and `_cross`."""
+    form = np.outer(a.sum(axis=0), b.sum(axis=0))
+    return form + form.T
+
+
+def _wide(form: Float[np.ndarray, "few few"], m: int) -> Float[np.ndarray, "m m"]:
+    wide = np.zeros((m, m))
+    wide[: len(form), : len(form)] = form
+    return wide
+
+
+def _widened(rows: Float[np.ndarray, "2 n 6 few"], m: int) -> Float[np.ndarray, "2 n 6 m"]:
+    return np.concatenate([rows, np.zeros((*rows.shape[:-1], m - rows.shape[-1]))], axis=-1)
