@@ -127,7 +127,8 @@ def _arm(certificate: Certificate) -> dict[str, Any] | None:
     if arm is None:
         return None
     tree, names = RigidTree.of(arm), certificate.joint_names
-    described = robot if isinstance(arm, Robot) and type(model) is PinocchioDynamics else None
+    exact = type(model) is PinocchioDynamics and certificate.mismatch is None
+    described = robot if isinstance(arm, Robot) and exact else None
     continuous = np.zeros(tree.nv, dtype=bool) if robot is None else robot.continuous
     return {
         "name": "a model without an arm" if robot is None else robot.name,

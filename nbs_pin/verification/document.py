@@ -23,12 +23,14 @@ def read_document(path: Path) -> dict[str, Any]:
     content = path.read_bytes()
     try:
         document: dict[str, Any] = json.loads(
-            content, object_pairs_hook=_unique, parse_float=_finite, parse_constant=_finite
+            content, object_pairs_hook=_unique, parse_float=_finite, parse_constant=_finite, parse_int=_whole
         )
         jsonschema.validate(document, schema)
         _check_sizes(document)
     except jsonschema.ValidationError as error:
-        raise FileFormatError(f"{path}: {error.json_path}: {error.message:.200}; write the file again.") from error
+        rule = f"it does not satisfy {error.validator} {error.validator_value}"
+        fault = error.message if len(error.message) < 160 else f"{rule:.160}"
+        raise FileFormatError(f"{path}: {error.json_path}: {fault}; write the file again.") from error
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: no certificate of format 1 ({error}); write the file again.") from error
     return document
@@ -67,3 +69,8 @@ def _finite(text: str) -> float:
     if not math.isfinite(float(text)):
         raise ValueError(f"{text} is not finite")
     return float(text)
+
+
+def _whole(text: str) -> int:
+    _finite(text)
+    return int(text)

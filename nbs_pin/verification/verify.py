@@ -88,6 +88,8 @@ def _inertias(document: dict[str, Any], tree: list[Link]) -> Iterator[Check]:
     kappa, nu, n = document["constants"]["kappa"], document["constants"]["nu"], len(document["law"]["rate"])
     for line, used in zip(document["inertia"], (kappa, nu, None, None), strict=True):
         name, least = f"{line['side']} λ(W^-½MW^-½), W = {line['weight']}", line["side"] == "least"
+        if not (line["value"] or used):
+            continue  # no bound is claimed
         if line["label"] != "PROVED" or line["multipliers"] is None or line["value"] is None or not tree:
             if used or line["label"] == "PROVED":
                 yield Check(name, OPEN, f"{line['label']}: {line['because']}")
@@ -282,5 +284,7 @@ def _stated(document: dict[str, Any]) -> Iterator[Check]:
     given, kind = document["disturbance"], document["law"]["kind"]
     box = f"‖τ_d‖ ≤ {given['radius']:g} N·m" if given["box"] is None else f"|τ_d,i| ≤ {given['box']} N·m"
     yield Check("disturbance", TAKEN, box)
+    if any(any(document["friction"][key]) for key in ("viscous", "coulomb", "fed_viscous", "fed_coulomb")):
+        yield Check("joint friction and |v_d|", TAKEN, "b, c, b̂, ĉ, ε and the speed of the reference as in the file")
     yield Check(f"law {kind}", TAKEN, "Φ ≥ z1ᵀSz1, D ⪰ D₀, Λ, ω and ζ as in the file, by the structure of its code")
     yield from (Check(x["assumption"], TAKEN, f"assumption, {x['checked']}") for x in document["assumptions"])
