@@ -493,7 +493,9 @@ def test_the_arm_is_held_to_a_urdf_that_is_given(tmp_path, panda):
     assert verify(file, urdf=moved).confirmed
     moved.write_text(find("panda").path.read_text().replace('mass value="', 'mass value="1'))
     assert "the tree is the arm's" in statuses(verify(file, urdf=moved), FALSE)
-    with pytest.raises(FileFormatError, match=r"not the URDF of this certificate .*; give its own\.$"):
+    with pytest.raises(
+        FileFormatError, match=r"not the URDF of this certificate \(it has no joint 'panda_joint1'\); give its own\.$"
+    ):
         verify(file, urdf=find("two_link").path)
     moved.write_text("<robot")
     with pytest.raises(FileFormatError, match="not the URDF"):
@@ -560,12 +562,42 @@ def test_keys_types_and_sizes_are_checked(rubbing, tmp_path):
     assert "do not all fit 2 joints" in message(changed(rubbing, ("law", "floor"), lambda x: x[:1]))
     assert "do not all fit 2 joints" in message(changed(rubbing, ("friction", "speed"), lambda x: [*x, 1.0]))
     assert "do not all fit 2 joints" in message(changed(rubbing, ("arm", "joints"), lambda x: x[:1]))
+    assert "not symmetric" in message(changed(rubbing, ("law", "stiffness", 0, 1), lambda x: x + 1.0))
     assert "as many heights" in message(changed(rubbing, ("polygon", "heights"), lambda x: x[:-1]))
     assert "before its parent" in message(changed(rubbing, ("arm", "joints", 0, "parent"), lambda _: 1))
     assert "no rotation" in message(
         changed(rubbing, ("arm", "joints", 0, "rotation"), lambda _: np.ones((3, 3)).tolist())
     )
     assert "$.disturbance" in message(changed(rubbing, ("disturbance", "radius"), lambda _: 1.0))
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_a_mutilated_file_is_read_or_refused_and_nothing_else(rubbing, data, tmp_path_factory):
+    """A value of any kind in any place, or nothing there."""
+    document = copy.deepcopy(rubbing)
+    path = data.draw(st.sampled_from(list(nodes(rubbing))))
+    holder, kinds = (
+        part_of(document, path[:-1]),
+        [None, "x", -1, 0.0, [], {}, 1e308, 1e-308, -1e308, True, 2**70, [1.0]],
+    )
+    if data.draw(st.integers(0, 5)) == 0:
+        del holder[path[-1]]
+    else:
+        holder[path[-1]] = data.draw(st.sampled_from(kinds))
+    file = written(document, tmp_path_factory.mktemp("mutilated") / "c.json")
+    try:
+        verify(file)
+    except FileFormatError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+
+
+def nodes(value, path=()):
+    """Paths of everything but the whole."""
+    if isinstance(value, dict | list):
+        for key, part in value.items() if isinstance(value, dict) else enumerate(value):
+            yield (*path, key)
+            yield from nodes(part, (*path, key))
 
 
 def test_the_shell_writes_and_verifies(tmp_path, capsys, monkeypatch):

@@ -133,7 +133,7 @@ def _arm(certificate: Certificate) -> dict[str, Any] | None:
     return {
         "name": "a model without an arm" if robot is None else robot.name,
         "sha256": None if robot is None else robot.sha256,
-        "urdf": None if described is None else str(described.urdf.path),
+        "urdf": None if described is None else str(described.urdf.path.absolute()),
         "joints": [_joint(tree, i, names[i], bool(continuous[i])) for i in range(tree.nv)],
     }
 

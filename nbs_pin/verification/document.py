@@ -44,7 +44,7 @@ def is_unchanged(document: dict[str, Any]) -> bool:
 
 
 def _check_sizes(document: dict[str, Any]) -> None:
-    """Raise ValueError unless every list has one entry per joint where it should, and parents come first."""
+    """Raise ValueError unless lists fit the number of joints, forms are symmetric and parents come first."""
     law, friction, n = document["law"], document["friction"], len(document["law"]["rate"])
     joints, cut = document["arm"]["joints"] if document["arm"] else None, document["polygon"]
     rows = [document["disturbance"]["box"], joints, *(x for x in friction.values() if isinstance(x, list))]
@@ -53,6 +53,8 @@ def _check_sizes(document: dict[str, Any]) -> None:
         len(x) != n for x in rows if x is not None
     ):
         raise ValueError(f"its lists do not all fit {n} joints")
+    if any(not np.array_equal(x, np.transpose(x)) for x in (law["stiffness"], law["floor"])):
+        raise ValueError("S or D₀ is not symmetric")
     if cut and len(cut["steepness"]) != len(cut["heights"]):
         raise ValueError("its polygon has not as many heights as edges")
     if any(joint["parent"] >= i for i, joint in enumerate(joints or [])):

@@ -80,7 +80,8 @@ def _stated(joint: dict[str, Any]) -> Link:
     nearest = _frame(rotation[0], rotation[1])
     if not certain(abs(nearest - rotation) <= 1e-12):
         raise FileFormatError(f"the placement of joint '{joint['name']}' is no rotation; write the file again.")
-    body = (arb(joint["mass"]), balls(joint["centre"]), balls(joint["inertia"]), arb(joint["armature"]))
+    inertia = balls(joint["inertia"])  # of which only the quadratic form counts
+    body = (arb(joint["mass"]), balls(joint["centre"]), (inertia + inertia.T) / 2, arb(joint["armature"]))
     return Link(joint["parent"], joint["prismatic"], nearest, balls(joint["position"]), *body, _travel(joint))
 
 
@@ -96,6 +97,9 @@ class _Description:
         self.root, self.joints = root, joints
         self.above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
         named = {joint.get("name"): joint for joint in self.above.values()}
+        missing = [joint["name"] for joint in joints if joint["name"] not in named]
+        if missing:
+            raise ValueError(f"it has no joint '{missing[0]}'")
         self.elements = [named[joint["name"]] for joint in joints]
         self.axes = [_axes(element) for element in self.elements]
 

@@ -173,6 +173,9 @@ def _constants(document: dict[str, Any]) -> Iterator[Check]:
     )
     k: dict[str, Any] = {key: x if x is None else arb(x) for key, x in document["constants"].items()}
     stiffness, floor, rate = balls(law["stiffness"]), balls(law["floor"]), balls(law["rate"])
+    if not positive_definite(floor):
+        yield _decided("D₀", False, "D₀ ≻ 0, §1")
+        return
     yield _decided("ρ", positive_definite(2 * stiffness - np.diag(k["rho"] / rate)), "2S ≻ ρΛ⁻¹, §1")
     yield _decided("δ", positive_definite(floor - np.diag(k["delta"] / rate)), "D₀ ≻ δΛ⁻¹, §1")
     viscous, coulomb = (abs(balls(friction[x]) - balls(friction[f"fed_{x}"])) for x in ("viscous", "coulomb"))
