@@ -57,7 +57,7 @@ def rate_bound(arm: Arm, weights: JointArray) -> float:
 
 def _largest_rate(tree: RigidTree, weights: JointArray) -> float:
     """√ of the least C found with Σ w_i q̇_i² ≤ C q̇ᵀMq̇."""
-    least = least_by_multipliers(tree, np.diag(weights))
+    least = least_by_multipliers(tree, np.diag(weights)).value
     return up(1.0 / np.sqrt(least)) if least > 0.0 else np.inf
 
 
@@ -70,15 +70,11 @@ def _derivative(tree: RigidTree, joint: int, weight: Float[np.ndarray, "n n"] | 
     energy, change, conditions = _momenta(tree, joint, carried)
     if not change.matrix.any():
         return 0.0
-    unit = energy
-    if weight is not None:
-        moving = Motions.of(tree).moving
-        rates = np.zeros_like(energy.matrix)
-        rates[np.ix_(moving, moving)] = weight
-        unit = Form(rates, np.abs(rates))
+    more = len(_TURNED) * len(carried)
+    unit = energy if weight is None else Motions.of(tree).rates(weight, more)
     # ±change + γ·unit ≥ 0, that is ±change − a·unit ≥ 0 with a = −γ.
     bounds = [
-        -largest_multiple(Form(sign * change.matrix, change.size), unit, conditions, 2 * tree.nv)
+        -largest_multiple(Form(sign * change.matrix, change.size), unit, energy, conditions, 2 * tree.nv).value
         for sign in (1.0, -1.0)
     ]
     return up(max(*bounds, 0.0))

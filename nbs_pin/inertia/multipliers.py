@@ -9,6 +9,7 @@ semidefinite program, solved by clarabel, finds good multipliers, and its result
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import clarabel
 import numpy as np
@@ -75,52 +76,67 @@ class Motions:
             conditions += _conditions(tree, i, own[:, i], seen)
         return cls(Form(energy, sums), moving, conditions, own)
 
+    def rates(self, weight: Float[np.ndarray, "n n"], more: int = 0) -> Form:
+        """q̇ᵀWq̇ in x, followed by `more` further coordinates."""
+        form = np.zeros((len(self.energy.matrix) + more,) * 2)
+        form[np.ix_(self.moving, self.moving)] = weight
+        return Form(form, np.abs(form))
 
-def least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"] | None = None) -> float:
+
+class Extreme(NamedTuple):
+    """A bound of the inertia, and the multipliers that prove it."""
+
+    value: float
+    multipliers: tuple[float, ...] | None = None
+    """One per condition of `Motions`, for forms in SI units; None without a proof."""
+
+
+def least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"] | None = None) -> Extreme:
     """Nearly tight lower bound of min_q λ_min(W^-½ M(q) W^-½), W = I by default; 0 if no multipliers are found."""
-    return max(0.0, _extreme(tree, np.eye(tree.nv) if weight is None else weight, 1.0))
+    found = _extreme(tree, np.eye(tree.nv) if weight is None else weight, 1.0)
+    return found if found.value > 0.0 else Extreme(0.0)
 
 
-def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> float:
+def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> Extreme:
     """Nearly tight upper bound of max_q λ_max(W^-½ M(q) W^-½); inf if no multipliers are found."""
-    least = -_extreme(tree, weight, -1.0)
-    return least if least > 0.0 else np.inf
+    found = _extreme(tree, weight, -1.0)
+    return Extreme(-found.value, found.multipliers) if found.value < 0.0 else Extreme(np.inf)
 
 
-def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> float:
+def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> Extreme:
     """The largest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf if none is found."""
     motions = Motions.of(tree)
-    rates = np.zeros_like(motions.energy.matrix)
-    rates[np.ix_(motions.moving, motions.moving)] = weight
     energy = Form(sign * motions.energy.matrix, motions.energy.size)
-    return largest_multiple(energy, Form(rates, np.abs(rates)), motions.conditions, tree.nv)
+    return largest_multiple(energy, motions.rates(weight), motions.energy, motions.conditions, tree.nv)
 
 
-def largest_multiple(form: Form, unit: Form, conditions: list[Form], terms_behind: int = 0) -> float:
+def largest_multiple(form: Form, unit: Form, energy: Form, conditions: list[Form], terms: int) -> Extreme:
     """The largest a found such that form − a·unit ≥ 0 on all motions that satisfy the conditions; −inf if none is found.
 
-    terms_behind: length of the longest sum behind an entry, besides the size of the forms, for the rounding errors.
+    energy: 2T, for the scales of the motions. terms: length of the sums behind the entries, for their rounding errors.
     """
     m = len(form.matrix)
-    diagonal = np.abs(np.diag(form.matrix)) + np.abs(np.diag(unit.matrix))
+    diagonal = np.abs(np.diag(energy.matrix))
     scale = 1.0 / np.sqrt(diagonal + 1e-3 * diagonal.mean())
     scales = scale * scale[:, None]
     rated = -unit.matrix * scales
     factor = 1.0 / float(np.linalg.norm(rated, 2))
     scaled = [condition.matrix * scales for condition in conditions]
     norms = np.array([max(float(np.linalg.norm(x)), 1e-300) for x in scaled])
-    terms = np.array([factor * rated, *(x / norm for x, norm in zip(scaled, norms, strict=True))])
+    matrices = np.array([factor * rated, *(x / norm for x, norm in zip(scaled, norms, strict=True))])
     positive = np.array([False, *(condition.positive for condition in conditions)])
-    constant, best = form.matrix * scales, -np.inf
+    constant, best = form.matrix * scales, Extreme(-np.inf)
     for margin in MARGINS:
-        y, solved = maximise(constant - margin * np.eye(m), terms, positive)
+        y, solved = maximise(constant - margin * np.eye(m), matrices, positive)
         sums = form.size + np.abs(y[0]) * factor * unit.size
         for h, norm, condition in zip(y[1:], norms, conditions, strict=True):
             sums = sums + abs(h) / norm * condition.size
         # The largest row sum of the errors of the entries is no less than their spectral norm.
-        radius = 16.0 * (m + terms_behind) * np.finfo(float).eps * float((sums * scales).sum(axis=1).max())
-        if exceeds_every_perturbation(constant + np.tensordot(y, terms, 1), radius):
-            best = max(best, float(y[0]) * factor)
+        radius = 16.0 * (m + terms) * np.finfo(float).eps * float((sums * scales).sum(axis=1).max())
+        if exceeds_every_perturbation(constant + np.tensordot(y, matrices, 1), radius):
+            # Undoing the scaling is a congruence, so these multipliers prove it for the forms as they are.
+            found = Extreme(float(y[0]) * factor, tuple((y[1:] / norms).tolist()))
+            best = max(best, found, key=lambda extreme: extreme.value)
             if solved:
                 break
     return best
