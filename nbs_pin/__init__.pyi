@@ -16,6 +16,7 @@ from .certificates.admissible import Admissible as Admissible
 from .certificates.attack import Attack as Attack, attack as attack
 from .certificates.certificate import Certificate as Certificate
 from .certificates.certify import certify as certify
+from .certificates.encoders import Encoders as Encoders
 from .certificates.monitor import Monitored as Monitored, monitor as monitor
 from .certificates.online_monitor import Watch as Watch
 from .certificates.propose import Proposal as Proposal, propose as propose

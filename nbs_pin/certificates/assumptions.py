@@ -38,11 +38,13 @@ def check_certificate(certificate: Any) -> None:
 def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption, str], *, is_recorded: bool) -> str:
     """The verdict. at: the exceeded bounds and the time. failed: the violated assumptions with their times.
 
-    is_recorded: whether the disturbance is recorded, so that it can be distinguished from a model error.
+    is_recorded: whether the disturbance is recorded, so that it can be distinguished from a model error; from readings
+    of encoders neither can be told from a false measurement.
     """
     said = {name: name + when for name, when in failed.items()}
     if not is_recorded and Assumption.MODEL in said and Assumption.DISTURBANCE in said:
-        said[Assumption.MODEL] = f"{Assumption.MODEL}, or {said.pop(Assumption.DISTURBANCE)}"
+        like = [said.pop(name) for name in (Assumption.MEASUREMENT, Assumption.DISTURBANCE) if name in said]
+        said[Assumption.MODEL] = ", or ".join([Assumption.MODEL, *like])
     named = "; ".join(said.values())
     if is_kept:
         return "promise kept" + (f", though assumptions failed: {named}" if named else "")

@@ -29,7 +29,9 @@ from nbs_pin.certificates.assumptions import (
 )
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
+from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, storage_of
+from nbs_pin.certificates.window_watch import UNEXPLAINED, Glance, WindowMemory, WindowWatch
 from nbs_pin.controllers.controller import MemorylessController
 
 
@@ -79,6 +81,8 @@ class Watched(NamedTuple):
     """V̇ and its terms over the last period; None at the first instant."""
     verdict: str
     """One sentence, as in `Monitored`."""
+    suspects: tuple[str, ...] = ()
+    """From encoders: simple faults each of which would explain the torques of the last window."""
 
     @property
     def is_kept(self) -> bool:
@@ -115,6 +119,8 @@ class Watch:
     """
 
     certificate: Certificate
+    encoders: Encoders | None = None
+    """How positions are measured; None for exact states, as a simulation has them."""
 
     def __post_init__(self) -> None:
         check_certificate(self.certificate)
@@ -125,25 +131,28 @@ class Watch:
 
     def step(
         self,
-        memory: WatchMemory | None,
+        memory: WatchMemory | WindowMemory | None,
         t: float,
         q: JointArray,
         v: JointArray,
         reference: Reference,
         tau: JointArray,
         tau_command: JointArray,
-    ) -> tuple[Watched, WatchMemory | None]:
+    ) -> tuple[Watched, WatchMemory | WindowMemory | None]:
         """The result at time t [s], and the memory for the next step; `memory` is None at first.
 
         The torque `tau` acts from t on [N·m]. A number that is not finite breaks the promise at this instant and is
         left out of the memory. Raises ArgumentError unless t is finite and after the previous instant.
         """
-        now = LoopSamples(np.array(t), q, v, reference.q, reference.v, reference.a, tau, tau_command)
         if not math.isfinite(t):
             raise ArgumentError(f"the instant is t = {t} s, expected a finite time; give the time of the sample.")
-        _, what = not_finite(LoopSamples(*(x[None] for x in now)), self.certificate.joint_names)
+        sample = np.array([q, v, *reference, tau, tau_command], dtype=float)
+        if self.encoders is not None or isinstance(memory, WindowMemory):
+            return self._through_window(memory, t, sample)
+        what = self._what_is_lost(sample)
         if what:
             return self._lost(memory, what), None if memory is None else memory._replace(has_gap=True)
+        now = LoopSamples(np.array(t), *sample)
         storage = float(storage_of(self.certificate.controller, now))
         if memory is None:
             memory = WatchMemory(t, storage, now, storage, 0.0, 0.0, 1.0, ())
@@ -169,7 +178,55 @@ class Watch:
         memory = memory._replace(broken=self._broken(memory, flow, setting, both, seen))
         return self._said(memory, flow, seen), memory
 
-    def _lost(self, memory: WatchMemory | None, what: str) -> Watched:
+    @cached_property
+    def _windows(self) -> WindowWatch:
+        return WindowWatch(self.certificate, self.encoders or Encoders(0.0))
+
+    def _through_window(
+        self, memory: WatchMemory | WindowMemory | None, t: float, sample: Float[np.ndarray, "7 n"]
+    ) -> tuple[Watched, WatchMemory | WindowMemory | None]:
+        """The result for readings of encoders."""
+        if isinstance(memory, WatchMemory) or (memory is not None and self.encoders is None):
+            raise ArgumentError("the memory is that of a Watch of another kind; give the one that this Watch returned.")
+        what = self._what_is_lost(sample)
+        if what:
+            return self._lost(memory, what), None if memory is None else self._windows.lost(memory)
+        if memory is None:
+            memory = self._windows.begin(t, sample)
+            glance = self._windows.first(memory)
+        else:
+            glance, memory = self._windows.step(memory, t, sample)
+        return self._glanced(glance, memory.broken), memory
+
+    def _glanced(self, glance: Glance, broken: tuple[Assumption, ...]) -> Watched:
+        if glance.excesses and not broken and not glance.is_wrong:
+            broken = UNEXPLAINED
+        verdict = "promise kept"
+        if glance.excesses or broken:
+            at, failed = f" by {listed(glance.excesses)}", dict.fromkeys(broken, "")
+            verdict = sentence(at, not glance.excesses, glance.is_wrong, failed, is_recorded=False)
+            verdict += f"; this looks like {' or '.join(glance.suspects)}" if glance.suspects else ""
+        return Watched(
+            storage=glance.storage,
+            promise=glance.promise,
+            error=float(glance.errors[0]),
+            error_bound=float(glance.bounds[0]),
+            joint_errors=glance.errors[1:],
+            joint_bounds=glance.bounds[1:],
+            excesses=glance.excesses,
+            broken=broken,
+            balance=None,
+            verdict=verdict,
+            suspects=glance.suspects,
+        )
+
+    def _what_is_lost(self, sample: Float[np.ndarray, "7 n"]) -> str:
+        """A name for the first number that is not finite, empty if there is none."""
+        if np.isfinite(sample).all():
+            return ""
+        return not_finite(LoopSamples(np.zeros(1), *sample[:, None]), self.certificate.joint_names)[1]
+
+    def _lost(self, memory: WatchMemory | WindowMemory | None, what: str) -> Watched:
         """The result at an instant with a number that is not finite."""
         nothing, n = math.nan, self.certificate.controller.nv
         broken = () if memory is None else memory.broken
