@@ -10,11 +10,13 @@ is printed. With any false alarm, or any fault that is not named in `SOON`, the 
 """
 
 import argparse
+import collections
+import json
 import sys
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,16 +24,20 @@ from typing import Any
 import numpy as np
 
 import nbs_pin as nbs
+from nbs_pin.certificates.attack import random_disturbances
+from nbs_pin.certificates.claims import Assumption
+from nbs_pin.certificates.online_monitor import Watched
 from nbs_pin.identification.measurement import quantised
 from nbs_pin.robots.catalogue import find
 
 ARMS = ("two_link", "ur5", "panda", "kinova")
 PERIOD, BEGINS, SOON = 0.001, 0.5, 0.2
 """Control period, begin of a fault, and the time in which it has to be named [s]."""
-TIPS = {"ur5": "tool0", "panda": "panda_link8", "kinova": "end_effector_link"}
+BOX = 0.5
+"""Bound of the disturbance of every joint [N·m]."""
 LOAD = """<robot><link name="nbs_load"><inertial><mass value="{mass}"/><inertia ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0"
  ixz="0" iyz="0"/></inertial></link><joint name="nbs_load_joint" type="fixed"><parent link="{tip}"/>
- <child link="nbs_load"/><origin xyz="0 0 {out}"/></joint></robot>"""
+ <child link="nbs_load"/><origin xyz="0 0 0.05"/></joint></robot>"""
 
 
 @dataclass
@@ -52,7 +58,8 @@ class Loop:
     """The plant from `begins` on."""
     read: Callable[[float, np.ndarray, list[np.ndarray]], np.ndarray] = lambda t, q, before: q
     act: Callable[[float, np.ndarray, list[np.ndarray], np.ndarray], np.ndarray] = lambda t, tau, before, v: tau
-    effort: np.ndarray = field(default_factory=lambda: np.array(np.inf))
+    limit: Callable[[float, np.ndarray], np.ndarray] = lambda t, limit: limit
+    aim: Callable[[np.ndarray, nbs.Reference], nbs.Reference] = lambda t, aim: aim
     stops: bool = False
 
     def run(self) -> nbs.Run:
@@ -60,13 +67,12 @@ class Loop:
         n, h, steps = self.arm.nv, PERIOD, round(self.duration / PERIOD)
         law, lead = self.law.compile(), 0.5 * PERIOD
         t = h * np.arange(steps + 1)
-        aim, ahead = self.reference(t), self.reference(t + lead)
+        aim, ahead = (self.aim(x, self.reference(x)) for x in (t, t + lead))
         q, v = self.q0, self.v0
         step = 2.0**-self.bits
         readings = [quantised(q - h * v, step, self.arm.prismatic)]
         rows, asked = [], []
         command = np.zeros(n)
-        limit = np.minimum(self.arm.effort_limit, self.effort)
         for k in range(steps + 1):
             reading = self.read(t[k], quantised(q, step, self.arm.prismatic), readings)
             speed = (reading - readings[-1]) / h
@@ -74,6 +80,7 @@ class Loop:
             dv = lead * aim.a[k]
             if np.isfinite(reading + speed).all():  # else the last torque is held
                 command = law.torque(reading + lead * (speed + 0.5 * dv), speed + dv, ahead.q[k], ahead.v[k], ahead.a[k])
+            limit = self.limit(t[k], self.arm.effort_limit)
             applied = np.clip(command, -limit, limit)
             asked.append(applied)
             rows.append((reading, speed, applied, command))
@@ -85,6 +92,122 @@ class Loop:
         measured, speeds, tau, commands = (np.array(x) for x in zip(*rows, strict=True))
         return nbs.Run(
             t=t, q=measured, v=speeds, tau=tau, tau_command=commands, disturbance=0.0 * tau,
-            q_ref=aim.q, v_ref=aim.v, a_ref=aim.a, effort_limit=limit, continuous=self.arm.continuous,
+            q_ref=aim.q, v_ref=aim.v, a_ref=aim.a, effort_limit=self.arm.effort_limit, continuous=self.arm.continuous,
             joint_names=self.arm.joint_names, period=h, robot=self.arm.source, robot_sha256=self.arm.sha256,
         )
+
+
+@cache
+def arm(name: str) -> nbs.Robot:
+    return nbs.load_robot(name)
+
+
+@cache
+def plant(name: str) -> nbs.Plant:
+    return nbs.MujocoPlant(arm(name))
+
+
+@cache
+def loaded(name: str, mass: float) -> nbs.Plant:
+    """The arm with a mass [kg] at its last link that its model does not have."""
+    entry, robot = find(name), arm(name)
+    tree = ET.parse(entry.path)
+    tip = tree.getroot().find(f"joint[@name='{robot.joint_names[-1]}']/child").get("link")
+    tree.getroot().extend(ET.fromstring(LOAD.format(mass=mass, tip=tip)))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.urdf"
+        tree.write(path)
+        return nbs.MujocoPlant(nbs.load_robot(path, lock=entry.lock, gravity=robot.gravity_vector))
+
+
+@cache
+def rough(name: str, coulomb: float) -> nbs.Plant:
+    """The arm with dry friction [N·m] in every joint."""
+    n = arm(name).nv
+    return nbs.MujocoPlant(arm(name), joint_friction=nbs.JointFriction(np.zeros(n), np.full(n, coulomb)))
+
+
+@cache
+def tilted(name: str, degrees: float) -> nbs.Plant:
+    """The arm on a floor that is not level."""
+    robot = arm(name)
+    g, c, s = robot.gravity_vector, np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    return nbs.MujocoPlant(nbs.load_robot(name, gravity=turn @ g))
+
+
+def honest(name: str, seed: int, bits: int = 16, duration: float = 1.0, *, is_moving: bool = False) -> tuple[nbs.Certificate, Loop]:
+    """A random loop that keeps every assumption; `is_moving`: its reference does not rest."""
+    rng, robot, n = np.random.default_rng(seed), arm(name), arm(name).nv
+    law = nbs.NeuralBackstepping.for_robot(robot, bandwidth=float(rng.choice([4.0, 8.0, 12.0])))
+    reference = nbs.Sinusoid.for_robot(robot, rng.uniform(0.5, 2.0), rng.uniform(0.1, 0.6))
+    if rng.uniform() < 0.2 and not is_moving:
+        reference = nbs.Hold(reference(np.zeros(1)).q[0])
+    certificate = nbs.certify(law, np.full(n, BOX), reference=reference, period=PERIOD)
+    steps = round(duration / PERIOD) + 1
+    torque = random_disturbances(certificate.admissible, steps, PERIOD, 8, rng)[seed % 8]
+    begin, off = reference(np.zeros(1)), rng.uniform(0.0, 0.1)
+    q0, v0 = begin.q[0] + off * rng.uniform(-1.0, 1.0, n), begin.v[0] + off * rng.normal(size=n)
+    while (np.abs(law.torque(q0, v0, *(x[0] for x in begin))) > 0.4 * robot.effort_limit).any() and off > 1e-3:
+        q0, v0, off = 0.5 * (q0 + begin.q[0]), 0.5 * (v0 + begin.v[0]), 0.5 * off
+    act = lambda t: torque[min(round(t / PERIOD), steps - 1)]
+    return certificate, Loop(robot, law, plant(name), reference, q0, v0, act, bits, duration)
+
+
+def alone(joint: int, n: int) -> np.ndarray:
+    return np.eye(n)[joint % n]
+
+
+def faulty(fault: str, name: str, seed: int, bits: int = 16) -> tuple[nbs.Certificate, Loop]:
+    """The loop of `honest`, to which a fault happens at `BEGINS`."""
+    certificate, loop = honest(name, seed, bits, is_moving=True)
+    n, joint = loop.arm.nv, seed % 2
+    since = lambda t: t >= BEGINS - 1e-9
+    if fault == "wrong sign":
+        loop.act = lambda t, tau, before, v: tau * (1.0 - 2.0 * alone(joint, n)) if since(t) else tau
+    elif fault == "0.2 kg of payload":
+        loop.late = loaded(name, 0.2)
+    elif fault == "delay of 3 samples":
+        # An arm at rest off its reference; its brakes' last torque acts until the first command arrives.
+        start = loop.reference(np.zeros(1)).q[0] + 0.1 * (1.0 - 2.0 * (np.arange(n) % 2))
+        held = nbs.bias(nbs.PinocchioDynamics(loop.arm), start, np.zeros(n))
+        loop.begins, loop.q0, loop.v0 = 0.0, start, np.zeros(n)
+        loop.act = lambda t, tau, before, v: before[-4] if len(before) > 3 else held
+    elif fault == "saturation":
+        loop.limit = lambda t, limit: 0.02 * limit if since(t) else limit
+    elif fault == "friction":
+        loop.late = rough(name, 3.0)
+    elif fault == "reading that is no number":
+        loop.read = lambda t, q, before: np.where(alone(joint, n), np.nan, q) if abs(t - BEGINS) < 1e-9 else q
+    elif fault == "frozen encoder":
+        loop.read = lambda t, q, before: np.where(alone(joint, n), before[round(BEGINS / PERIOD)], q) if since(t) else q
+    elif fault == "tilted base":
+        loop.late = tilted(name, 10.0)
+    elif fault == "reference that jumps":
+        loop.aim = lambda t, aim: aim._replace(q=aim.q + 0.1 * since(t)[:, None])
+    elif fault == "encoder that slips":
+        loop.read = lambda t, q, before: q + 0.05 * alone(joint, n) if since(t) else q
+    elif fault == "exchanged encoders":
+        loop.read = lambda t, q, before: q[[1, 0, *range(2, n)]] if since(t) else q
+    elif fault == "motor that stops":
+        loop.act = lambda t, tau, before, v: tau * (1.0 - alone(joint, n)) if since(t) else tau
+    else:
+        raise ValueError(fault)
+    return certificate, loop
+
+
+FAULTS: dict[str, Assumption | None] = {
+    "wrong sign": Assumption.MODEL,
+    "0.2 kg of payload": Assumption.MODEL,
+    "delay of 3 samples": Assumption.TIME,
+    "saturation": Assumption.EFFORT,
+    "friction": Assumption.FRICTION,
+    "reading that is no number": None,
+    "frozen encoder": Assumption.MEASUREMENT,
+    "tilted base": Assumption.MODEL,
+    "reference that jumps": Assumption.REFERENCE,
+    "encoder that slips": Assumption.MEASUREMENT,
+    "exchanged encoders": Assumption.MEASUREMENT,
+    "motor that stops": Assumption.MODEL,
+}
+"""The assumption that each fault breaks; None for a number that is not finite."""

@@ -82,9 +82,17 @@ class PlainModel(LoopModel):
         v, a = 0.5 * (ahead + behind) / period, (ahead - behind) / period**2
         torque = 0.5 * (samples[0, at.TAU] + now[at.TAU])
         asked = self._torque(now[at.Q], now[at.V], now[at.Q_REF], now[at.V_REF], now[at.A_REF])
+        lag = now[at.COMMAND] - np.clip(now[at.COMMAND], *np.sort([asked, self._ahead(now, samples[2], period)], axis=0))
         e = law.errors(now[at.Q], v, now[at.Q_REF], now[at.V_REF], now[at.A_REF])
         unexplained = inverse_dynamics(law.dynamics, now[at.Q], v, a) - torque
-        return np.array([unexplained, torque, now[at.COMMAND] - asked, asked, e.z1, e.z2, v, now[at.Q]])
+        return np.array([unexplained, torque, lag, asked, e.z1, e.z2, v, now[at.Q]])
+
+    def _ahead(self, now: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float) -> JointArray:
+        """The law a period ahead, at the state predicted with the reference's acceleration [N·m]."""
+        q, v, q_ref, v_ref, a = now[at.Q : at.A_REF + 1]
+        ahead = (x + h * (rate + 0.5 * h * a) for x, rate in ((q, v), (q_ref, v_ref)))
+        q, q_ref = ahead
+        return np.asarray(self._torque(q, v + h * a, q_ref, v_ref + h * a, after[at.A_REF]))
 
     def centre(
         self, mean: Float[np.ndarray, "8 n"], q: JointArray, resolution: JointArray, width: float

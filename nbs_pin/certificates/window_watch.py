@@ -167,12 +167,11 @@ class WindowWatch:
     def _window(self, memory: WindowMemory) -> "_Told":
         """What the window up to the last instant says."""
         history, half, h, n = memory.history, memory.half, memory.period, len(self.resolution)
-        means, more = np.empty((at.SIGNALS + at.LAGS, n)), np.empty((at.MORE, n))
-        mean, delayed, found = means[: at.SIGNALS], means[at.SIGNALS :], np.empty(verdicts.WINDOW)
-        at.average(history, half, h, mean, delayed, more)
+        mean, more, found = np.empty((at.SIGNALS, n)), np.empty((at.MORE, n)), np.empty(verdicts.WINDOW)
+        at.average(history, half, mean, more)
         q = history[at.LAGS + half - 1, at.READING]
         (phi, phi_slack, kinetic, slack), share = self.model.centre(mean, q, self.resolution, half * h)
-        verdicts.judge_window(mean, delayed, more, share, h, half, q, *self.limits, found)
+        verdicts.judge_window(mean, history, more, share, h, half, q, *self.limits, found)
         speed = float(np.abs(mean[at.SPEED]).sum())
         least = max(math.sqrt(kinetic) - math.sqrt(slack), 0.0) ** 2 / (1.0 + 2.0 * half * h * speed)
         failed = UNEXPLAINED if found[verdicts.EXCEEDS] else ()
@@ -180,24 +179,30 @@ class WindowWatch:
             failed = (*failed, Assumption.TIME)
         if found[verdicts.RUBS]:
             failed = (*failed, Assumption.FRICTION)
-        suspects = self._suspects(mean, more, found) if failed else ()
+        moved = mean[at.SPEED] - mean[at.Z2]
+        suspects = self._suspects(mean, more, found, 2.0 * half * h * moved) if failed else ()
         storage = float(phi + kinetic)
         return _Told(storage, max(float(phi - phi_slack), 0.0) + least, float(found[verdicts.RATIO]), failed, suspects)
 
-    def _suspects(self, mean: np.ndarray, more: np.ndarray, found: np.ndarray) -> tuple[str, ...]:
-        """Simple faults each of which would explain the mean torque."""
-        rest, tolerance = more[at.SPREAD], more[at.VARIED]
-        room = np.minimum(self.limits.rows[verdicts.BOX], self.limits.numbers[verdicts.RADIUS]) + tolerance
-        names = [f"readings of {name} that do not change" for name, x in zip(self._names, more[at.FROZEN], strict=True) if x]
+    def _suspects(
+        self, mean: np.ndarray, more: np.ndarray, found: np.ndarray, moved: JointArray
+    ) -> tuple[str, ...]:
+        """Simple faults each of which would explain the mean torque; moved: what v_r asks for in the window [rad]."""
+        rest, room = more[at.SPREAD], self.limits.rows[verdicts.BOX]
+        room = np.minimum(room, self.limits.numbers[verdicts.RADIUS]) + more[at.VARIED]
+        still = more[at.FROZEN].astype(bool) & (np.abs(moved) > 4.0 * self.resolution)
+        names = [f"readings of {self._names[i]} that do not change" for i in np.flatnonzero(still)]
         if found[verdicts.DELAY]:
             names.append(f"a torque that acts {found[verdicts.DELAY]:.0f} periods late")
         if found[verdicts.LATE]:
             names.append("commands that are not the law's of their instant")
         if found[verdicts.EXCEEDS] and np.count_nonzero(rest) == 1:
             i = int(np.flatnonzero(rest)[0])
-            u, torque = mean[at.U, i], mean[at.TORQUE, i]
-            names += [f"a torque of {self._names[i]} with the wrong sign"] if abs(u + 2.0 * torque) <= room[i] else []
-            names += [f"a torque of {self._names[i]} that does not act"] if abs(u + torque) <= room[i] else []
+            u, torque, is_clear = mean[at.U, i], mean[at.TORQUE, i], abs(mean[at.TORQUE, i]) > 2.0 * room[i]
+            if is_clear and abs(u + 2.0 * torque) <= room[i]:
+                names.append(f"a torque of {self._names[i]} with the wrong sign")
+            if is_clear and abs(u + torque) <= room[i]:
+                names.append(f"a torque of {self._names[i]} that does not act")
         return tuple(names)
 
     def _glance(

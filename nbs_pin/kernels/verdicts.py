@@ -20,14 +20,16 @@ from nbs_pin.kernels.watching import (
     LAW,
     Q_REF,
     SPEED,
+    SPARE,
+    OTHER,
     SPREAD,
     TAU,
     TORQUE,
-    TURN,
     V_REF,
     VARIED,
     Q,
     U,
+    earlier,
 )
 
 RESOLUTION, BOX, GAP_VISCOUS, GAP_COULOMB, VISCOUS, COULOMB, LOWER, UPPER, WRAPS, LIMITS = range(10)
@@ -45,13 +47,13 @@ OF_RATE, OF_ACCELERATION, ROUNDING = 1e-3, 0.02, 1e-9
 OF_TORQUE = 1e-3
 """Shares that `certificates/sampled_motion.py` and `certificates/assumptions.py` allow."""
 
-_VEC, _MAT = float64[::1], float64[:, ::1]
+_VEC, _MAT, _CUBE = float64[::1], float64[:, ::1], float64[:, :, ::1]
 
 
 def compile_verdicts() -> None:
     """Compile the entry points for float64, so that no first call waits for the compiler."""
     compile_for(instant, int64(_MAT, _MAT, _VEC, float64, _MAT))
-    compile_for(judge_window, void(_MAT, _MAT, _MAT, _VEC, float64, int64, _VEC, _MAT, _VEC, _VEC))
+    compile_for(judge_window, void(_MAT, _CUBE, _MAT, _VEC, float64, int64, _VEC, _MAT, _VEC, _VEC))
 
 
 @inlined
@@ -115,7 +117,7 @@ def _outside(torque: Vec, tolerance: Vec, limits: Mat, radius: float, rest: Vec)
 @kernel
 def judge_window(
     mean: Mat,
-    delayed: Mat,
+    history: Mat,
     more: Mat,
     share: Vec,
     period: float,
@@ -129,7 +131,7 @@ def judge_window(
 
     Args:
         mean: (8, n) of `watching.average`; U is written with the friction that is fed forward.
-        delayed: (`LAGS`, n) of it.
+        history: what it averaged.
         more: (4, n) of it; SPREAD and VARIED are written with the part of U that is too large, and its tolerance.
         share: |M|r, of `watching.centre`.
         period: [s].
@@ -153,7 +155,7 @@ def judge_window(
     size_q, size_v, gap = math.sqrt(size_q), math.sqrt(size_v), math.sqrt(gap)
     granted = gap + numbers[OF_Q] * size_q + numbers[OF_V] * size_v + numbers[CONSTANT]
     fraction = OF_TORQUE + (period * size_v) ** 2
-    tolerance, rest = more[VARIED], more[SPREAD]
+    tolerance, rest, other = more[VARIED], more[SPREAD], more[SPARE]
     ratio = 1.0
     for i in range(n):
         v, slack, loudest = mean[SPEED, i], limits[RESOLUTION, i] / width + abs(more[VARIED, i]), more[SPREAD, i]
@@ -165,21 +167,23 @@ def judge_window(
         reached = abs(mean[U, i]) + tolerance[i] + 2.0 * loudest + abs(mean[LAG, i])
         ratio = max(ratio, reached / bound if bound > 0.0 else math.inf)
     out[RATIO], out[EXCEEDS], out[DELAY], out[RUBS], out[LATE] = ratio, 0.0, 0.0, 0.0, 0.0
-    lag, allowed = delayed[0], delayed[1]
+    for i in range(n):
+        other[i] = OF_TORQUE * math.sqrt(asked)
+    if _outside(mean[LAG], other, limits, radius, rest) > 0.0:
+        out[LATE] = 1.0
     exceeds = _outside(mean[U], tolerance, limits, radius, rest) > granted
     if exceeds:
         out[EXCEEDS], out[RUBS] = 1.0, 1.0
         for i in range(n):
             if rest[i] * mean[SPEED, i] > 0.0:
                 out[RUBS] = 0.0
+        late = more[OTHER]
         for k in range(LAGS):
+            earlier(history, half, k + 1, late)
+            clear = False
             for i in range(n):
-                delayed[k, i] = mean[U, i] + mean[TORQUE, i] - delayed[k, i]
-            if out[DELAY] == 0.0 and _outside(delayed[k], tolerance, limits, radius, rest) <= granted:
+                change, room = mean[TORQUE, i] - late[i], min(limits[BOX, i], radius) + tolerance[i]
+                clear = clear or (rest[i] != 0.0 and abs(change) > 0.5 * room)
+                late[i] = mean[U, i] + change
+            if clear and out[DELAY] == 0.0 and _outside(late, tolerance, limits, radius, other) <= granted:
                 out[DELAY] = k + 1.0
-        _outside(mean[U], tolerance, limits, radius, rest)
-    for i in range(n):
-        lag[i] = mean[LAG, i]
-        allowed[i] = period * abs(more[TURN, i]) + OF_TORQUE * math.sqrt(asked)
-    if _outside(lag, allowed, limits, radius, delayed[2]) > 0.0:
-        out[LATE] = 1.0

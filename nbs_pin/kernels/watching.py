@@ -6,7 +6,8 @@ the central differences of the readings:
 
     U      M(q)v̇ + C(q, v)v + G(q) − TAU, without friction [N·m]
     TAU    torque applied around this instant: the mean of those before and after it [N·m]
-    LAG    command less law [N·m]
+    LAG    distance of the command from the torques that the law asks for at the recorded state, or up to a period ahead
+           of it, as `simulate` evaluates it [N·m]
     LAW    law at the recorded state [N·m]
     Z1, Z2, V, Q
 
@@ -33,9 +34,9 @@ U, TORQUE, LAG, LAW, Z1, Z2, SPEED, READING, SIGNALS = range(9)
 """Rows of the signals of one instant, and their number."""
 LAGS = 5
 """The longest delay that is tried as an explanation [periods]."""
-TURN, VARIED, SPREAD, FROZEN, MORE = range(5)
-"""Rows beside the means: rate of LAW, change of V from one half of the window to the other, largest change
-of TORQUE in a period, 1 for joints whose readings are all equal, and their number."""
+VARIED, SPREAD, FROZEN, SPARE, OTHER, MORE = range(6)
+"""Rows beside the means: change of V from one half of the window to the other, largest change of TORQUE in a period, 1
+for joints whose readings are all equal, scratch space, and their number."""
 PHI, PHI_SLACK, KINETIC, KINETIC_SLACK, CENTRE = range(5)
 """Numbers at the centre of a window: Φ(z̄1), its error, ½z̄2ᵀM z̄2, ½δᵀ|M|δ, and their number."""
 
@@ -45,7 +46,7 @@ _VEC, _MAT, _CUBE, _PACKED = float64[::1], float64[:, ::1], float64[:, :, ::1], 
 def compile_watching() -> None:
     """Compile the entry points for float64, so that no first call waits for the compiler."""
     compile_for(observe, void(_CUBE, float64, *_PACKED, _VEC, _MAT))
-    compile_for(average, void(_CUBE, int64, float64, _MAT, _MAT, _MAT))
+    compile_for(average, void(_CUBE, int64, _MAT, _MAT))
     compile_for(centre, void(_MAT, _VEC, _VEC, float64, *_PACKED, _VEC, _VEC, _VEC))
 
 
@@ -100,45 +101,62 @@ def observe(samples: Mat, period: float, layout: Vec, weights: Vec, work: Vec, o
     rate = vector(law, at.FIRST)
     for i in range(n):
         out[U, i] -= out[TORQUE, i]
-        out[LAG, i] = now[COMMAND, i] - out[LAW, i]
         out[Z2, i] = out[SPEED, i] - now[V_REF, i] + rate[i] * before[i]
         out[READING, i] = now[Q, i]
+    _ahead(now, samples[2, A_REF], period, law, tree, work, out)
 
 
 @kernel
-def average(history: Mat, half: int, period: float, mean: Mat, delayed: Mat, more: Mat) -> None:
+def _ahead(now: Mat, a_next: Vec, period: float, law: Packed, tree: Packed, work: Vec, out: Mat) -> None:
+    """LAG: the distance of the command from what the law asks for between now and a period ahead."""
+    n, h = law.layout[at.JOINTS], period
+    q, v, q_ref, v_ref, work = take4(work, n)
+    for i in range(n):
+        a = now[A_REF, i]
+        q[i], v[i] = now[Q, i] + h * (now[V, i] + 0.5 * h * a), now[V, i] + h * a
+        q_ref[i], v_ref[i] = now[Q_REF, i] + h * (now[V_REF, i] + 0.5 * h * a), now[V_REF, i] + h * a
+    torque_of(State(q, v), Target(q_ref, v_ref, a_next), law, tree, work, out[LAG])
+    for i in range(n):
+        low, high = min(out[LAW, i], out[LAG, i]), max(out[LAW, i], out[LAG, i])
+        out[LAG, i] = now[COMMAND, i] - min(max(now[COMMAND, i], low), high)
+
+
+@kernel
+def average(history: Mat, half: int, mean: Mat, more: Mat) -> None:
     """Means of the signals over the hat φ, which ends at the last row.
 
     Args:
         history: (2m − 1 + `LAGS`, 8, n), oldest first.
         half: m.
-        period: [s].
         mean: written, (8, n).
-        delayed: written, (`LAGS`, n), means of TORQUE 1, 2, … periods earlier.
-        more: written, (4, n).
+        more: written, (`MORE`, n).
     """
     n, size = history.shape[2], float(half * half)
     for i in range(n):
         for f in range(SIGNALS):
             mean[f, i] = 0.0
-        for k in range(LAGS):
-            delayed[k, i] = 0.0
-        more[TURN, i], more[VARIED, i], more[SPREAD, i], more[FROZEN, i] = 0.0, 0.0, 0.0, 1.0
+        more[VARIED, i], more[SPREAD, i], more[FROZEN, i] = 0.0, 0.0, 1.0
     for j in range(2 * half - 1):
         weight, row = float(half - abs(j - half + 1)) / size, history[LAGS + j]
         for f in range(SIGNALS):
             for i in range(n):
                 mean[f, i] += weight * row[f, i]
-        for k in range(LAGS):
-            for i in range(n):
-                delayed[k, i] += weight * history[LAGS + j - k - 1, TORQUE, i]
         side = 0.0 if j == half - 1 else (1.0 if j >= half else -1.0)
         for i in range(n):
-            more[TURN, i] += side * row[LAW, i] / (size * period)
             more[VARIED, i] += side * row[SPEED, i] / float(half)
             if row[READING, i] != history[LAGS, READING, i]:
                 more[FROZEN, i] = 0.0
             more[SPREAD, i] = max(more[SPREAD, i], abs(row[TORQUE, i] - history[LAGS + j - 1, TORQUE, i]))
+
+
+@kernel
+def earlier(history: Mat, half: int, lag: int, torque: Vec) -> None:
+    """The mean of TORQUE over the window that ends `lag` periods earlier → torque."""
+    torque[:] = 0.0
+    for j in range(2 * half - 1):
+        weight = float(half - abs(j - half + 1)) / float(half * half)
+        for i in range(len(torque)):
+            torque[i] += weight * history[LAGS + j - lag, TORQUE, i]
 
 
 @kernel
