@@ -6,12 +6,15 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.certificates.energy_balance import LoopSamples, balance
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.equations import inverse_dynamics
+from nbs_pin.kernels import periods
 from nbs_pin.kernels import watching as at
 from nbs_pin.kernels.laws import pack_tree_law
 from nbs_pin.kernels.layout import LAW, LawCode
+from nbs_pin.kernels.periods import compile_periods
 from nbs_pin.kernels.watching import compile_watching
 
 
@@ -26,6 +29,16 @@ class LoopModel(ABC):
             return PlainModel(controller)
         law = controller.packed_law()
         return CompiledModel(controller) if law.layout[LAW] == LawCode.BACKSTEPPING else PlainModel(controller)
+
+    @abstractmethod
+    def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
+        """V [J]."""
+
+    @abstractmethod
+    def period(
+        self, before: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float, last: float
+    ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
+        """The energy balance between two samples h [s] apart (`periods.period_terms`); last: V of the first [J]."""
 
     @abstractmethod
     def observe(self, samples: Float[np.ndarray, "3 7 n"], period: float) -> Float[np.ndarray, "8 n"]:
@@ -46,10 +59,23 @@ class CompiledModel(LoopModel):
 
     def __init__(self, controller: LyapunovLaw) -> None:
         compile_watching()
+        compile_periods()
         law, tree = controller.packed_law(), controller.dynamics.packed_tree()
         assert tree is not None
         self._packed = (*pack_tree_law(law, tree), np.empty(at.watch_workspace(law, tree)))
         self._n = controller.nv
+
+    def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
+        """As in `LoopModel`."""
+        return float(periods.storage(sample, *self._packed))
+
+    def period(
+        self, before: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float, last: float
+    ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
+        """As in `LoopModel`."""
+        terms, vectors = np.empty(periods.TERMS), np.empty((periods.VECTORS, self._n))
+        periods.period_terms(before, after, h, last, *self._packed, terms, vectors)
+        return terms, vectors
 
     def observe(self, samples: Float[np.ndarray, "3 7 n"], period: float) -> Float[np.ndarray, "8 n"]:
         """As in `LoopModel`."""
@@ -72,7 +98,22 @@ class PlainModel(LoopModel):
     def __init__(self, controller: LyapunovLaw) -> None:
         self._law = controller
         compiled = controller.compile()
-        self._torque = compiled.torque if isinstance(compiled, MemorylessController) else controller.torque
+        self._quick = compiled if isinstance(compiled, MemorylessController) else controller
+        self._torque = self._quick.torque
+
+    def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
+        """As in `LoopModel`."""
+        return float(self._law.storage(*sample[at.Q : at.V_REF + 1]))
+
+    def period(
+        self, before: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float, last: float
+    ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
+        """As in `LoopModel`."""
+        value, t = self.storage(after), np.array([0.0, h])
+        rows = [LoopSamples(t[k : k + 1], *x[:, None]) for k, x in enumerate((before, after))]
+        flow = balance(self._law, *rows, np.array([value - last]), self._quick)
+        numbers = (x[0] for x in flow[:6])
+        return np.array([value, *numbers, *flow.state_norms[0]]), np.concatenate(flow[6:10])
 
     def observe(self, samples: Float[np.ndarray, "3 7 n"], period: float) -> Float[np.ndarray, "8 n"]:
         """As in `LoopModel`."""

@@ -17,16 +17,11 @@ from nbs_pin.certificates.assumptions import ROUNDING
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders, Limits
+from nbs_pin.certificates.glance import BITS, Glance, bound, labels
 from nbs_pin.certificates.loop_model import LoopModel
 from nbs_pin.kernels import verdicts
 from nbs_pin.kernels import watching as at
 
-_BITS = {
-    verdicts.EFFORT: Assumption.EFFORT,
-    verdicts.WRAP: Assumption.WRAP,
-    verdicts.REFERENCE: Assumption.REFERENCE,
-    verdicts.STOPS: Assumption.STOPS,
-}
 UNEXPLAINED = (Assumption.MODEL, Assumption.MEASUREMENT, Assumption.DISTURBANCE)
 """What a torque that the readings do not explain can come from."""
 _UNEVEN = 1e-3  # share of a period by which instants may be off their raster
@@ -61,25 +56,6 @@ class WindowMemory(NamedTuple):
     """Whether an instant was not finite or missing, so that what torques did then is not known."""
 
 
-class Glance(NamedTuple):
-    """What one instant shows."""
-
-    storage: float
-    """V of the means over the window, NaN before there is one [J]."""
-    promise: float
-    """Bound of V where the window begins [J]."""
-    errors: Float[np.ndarray, " errors"]
-    """‖z1‖ and each |z1_i| now [rad]."""
-    bounds: Float[np.ndarray, " errors"]
-    """Their bounds [rad]."""
-    excesses: tuple[str, ...]
-    is_wrong: bool
-    failed: tuple[Assumption, ...]
-    """The assumptions that failed now."""
-    suspects: tuple[str, ...]
-    """Simple faults that would explain the torque."""
-
-
 class WindowWatch:
     """The check, for one certificate and one kind of encoder."""
 
@@ -89,7 +65,7 @@ class WindowWatch:
         self.resolution = encoders.resolution(certificate)
         self.limits = Limits.of(certificate, self.resolution)
         self._names = certificate.joint_names
-        self._labels = ("‖z1‖", *(f"|z1| of {name}" for name in self._names))
+        self._labels = labels(certificate)
         self._reach = 0.5 * np.array([np.linalg.norm(self.resolution), *self.resolution])
 
     @cached_property
@@ -97,9 +73,11 @@ class WindowWatch:
         """Law and model."""
         return LoopModel.of(self.certificate.controller)
 
-    def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> WindowMemory:
-        """The memory after the first instant."""
-        return self._promising(WindowMemory(t, t, 0.0, np.zeros(0), sample[None]), sample, 0.0 * self.resolution)
+    def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WindowMemory]:
+        """What the first instant shows, and the memory after it."""
+        memory = WindowMemory(t, t, 0.0, np.zeros(0), sample[None])
+        memory = self._promising(memory, sample, 0.0 * self.resolution)
+        return self._first(memory), memory
 
     def step(self, memory: WindowMemory, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WindowMemory]:
         """What this instant shows, and the memory for the next one."""
@@ -108,10 +86,10 @@ class WindowWatch:
             raise ArgumentError(f"the instant t = {t} s is not after the last one, {memory.t} s; give them in order.")
         if not len(memory.samples):
             memory = memory._replace(t=t, samples=sample[None])
-            return self.first(memory), memory
+            return self._first(memory), memory
         z1 = np.empty(len(self.resolution))
         bits = verdicts.instant(memory.samples[-1], sample, z1, period, self.limits.rows)
-        failed = tuple(name for bit, name in _BITS.items() if bits & bit)
+        failed = tuple(name for bit, name in BITS.items() if bits & bit)
         memory, told = self._in_time(memory, period), None
         memory = memory._replace(t=t, samples=np.concatenate([memory.samples[-2:], sample[None]]))
         if len(memory.samples) == 3:
@@ -125,7 +103,7 @@ class WindowWatch:
             memory = memory._replace(broken=broken)
         return glance, memory
 
-    def first(self, memory: WindowMemory) -> Glance:
+    def _first(self, memory: WindowMemory) -> Glance:
         """What an instant shows that none precedes."""
         dynamics, sample = self.certificate.controller.dynamics, memory.samples[-1]
         return self._glance(memory, np.asarray(dynamics.difference(sample[at.Q], sample[at.Q_REF])), None, ())
@@ -209,11 +187,11 @@ class WindowWatch:
         self, memory: WindowMemory, z1: JointArray, told: "_Told | None", failed: tuple[Assumption, ...]
     ) -> Glance:
         certificate, t, first = self.certificate, memory.t - memory.began, max(memory.initial, self.certificate.storage)
-        fallen = math.sqrt(self._bound(memory.initial, t) / first) if first > 0.0 else 1.0
+        fallen = math.sqrt(bound(certificate, memory.initial, t) / first) if first > 0.0 else 1.0
         errors, bounds = np.array([math.sqrt(z1 @ z1), *np.abs(z1)]), fallen * memory.bounds
         over = (errors - self._reach > bounds * (1.0 + ROUNDING)).nonzero()[0].tolist()
-        excesses = [self._labels[k] for k in over]
-        promise = self._bound(memory.initial, t - (0.0 if told is None else 2.0 * memory.half * memory.period))
+        excesses = [self._labels[k + 1] for k in over]
+        promise = bound(certificate, memory.initial, t - (0.0 if told is None else 2.0 * memory.half * memory.period))
         if told is not None and not told.least <= promise * (1.0 + ROUNDING):
             excesses.insert(0, "V")
         failed = failed if told is None else (*failed, *told.failed)
@@ -223,13 +201,7 @@ class WindowWatch:
             is_wrong = told.least > max(largest, promise) or bool((errors - self._reach > memory.ratio * bounds).any())
         suspects = () if told is None else told.suspects
         storage = math.nan if told is None else told.storage
-        return Glance(storage, promise, errors, bounds, tuple(excesses), is_wrong, failed, suspects)
-
-    def _bound(self, initial: float, t: float) -> float:
-        """`Certificate.storage_bound` at one time."""
-        level = self.certificate.level
-        first = initial * math.exp(-level.c * max(t, 0.0))
-        return min(first + level.storage, max(initial, level.storage))
+        return Glance(storage, promise, errors, bounds, tuple(excesses), is_wrong, UNEXPLAINED, failed, suspects)
 
 
 class _Told(NamedTuple):

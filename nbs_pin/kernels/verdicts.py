@@ -96,7 +96,7 @@ def instant(before: Mat, now: Mat, z1: Vec, period: float, limits: Mat) -> int:
 
 
 @inlined
-def _outside(torque: Vec, tolerance: Vec, limits: Mat, radius: float, rest: Vec) -> float:
+def outside(torque: Vec, tolerance: Vec, limits: Mat, radius: float, rest: Vec) -> float:
     """Distance of a torque from the admissible set, enlarged by a tolerance per joint; the joints' shares → rest."""
     size, room = 0.0, 0.0
     for i in range(len(torque)):
@@ -169,9 +169,9 @@ def judge_window(
     out[RATIO], out[EXCEEDS], out[DELAY], out[RUBS], out[LATE] = ratio, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         other[i] = OF_TORQUE * math.sqrt(asked)
-    if _outside(mean[LAG], other, limits, radius, rest) > 0.0:
+    if outside(mean[LAG], other, limits, radius, rest) > 0.0:
         out[LATE] = 1.0
-    exceeds = _outside(mean[U], tolerance, limits, radius, rest) > granted
+    exceeds = outside(mean[U], tolerance, limits, radius, rest) > granted
     if exceeds:
         out[EXCEEDS], out[RUBS] = 1.0, 1.0
         for i in range(n):
@@ -185,5 +185,5 @@ def judge_window(
                 change, room = mean[TORQUE, i] - late[i], min(limits[BOX, i], radius) + tolerance[i]
                 clear = clear or (rest[i] != 0.0 and abs(change) > 0.5 * room)
                 late[i] = mean[U, i] + change
-            if clear and out[DELAY] == 0.0 and _outside(late, tolerance, limits, radius, other) <= granted:
+            if clear and out[DELAY] == 0.0 and outside(late, tolerance, limits, radius, other) <= granted:
                 out[DELAY] = k + 1.0

@@ -53,11 +53,11 @@ def compile_watching() -> None:
 def watch_workspace(law: Packed, tree: Packed) -> int:
     """Size of the scratch space that these kernels need for a law and its model."""
     n = int(law.layout[at.JOINTS])
-    return law_workspace(law, tree) + 8 * n + n * n
+    return law_workspace(law, tree) + 16 * n + n * n
 
 
 @inlined
-def _parts(layout: Vec, weights: Vec) -> tuple[Packed, Packed]:
+def parts(layout: Vec, weights: Vec) -> tuple[Packed, Packed]:
     """The law and the tree of `laws.pack_tree_law`."""
     return Packed(layout[2:], weights), Packed(layout[layout[0] :], weights[layout[1] :])
 
@@ -84,7 +84,7 @@ def observe(samples: Mat, period: float, layout: Vec, weights: Vec, work: Vec, o
         work: scratch space (`watch_workspace`).
         out: written, (8, n).
     """
-    law, tree = _parts(layout, weights)
+    law, tree = parts(layout, weights)
     n = law.layout[at.JOINTS]
     now, wraps = samples[1], vector(law, at.WRAPS)
     before, after, a, half, work = take4(work, n)
@@ -176,7 +176,7 @@ def centre(
         out: written, (4,), in [J].
         share: written, |M| r [kg·m²·rad], (n,).
     """
-    law, tree = _parts(layout, weights)
+    law, tree = parts(layout, weights)
     n = law.layout[at.JOINTS]
     gradient, bend, radius, work = take3(work, n)
     flat, work = take(work, n * n)
