@@ -11,7 +11,6 @@ is printed. With any false alarm, or any fault that is not named in `SOON`, the 
 
 import argparse
 import collections
-import json
 import sys
 import tempfile
 import xml.etree.ElementTree as ET
@@ -25,6 +24,7 @@ import numpy as np
 
 import nbs_pin as nbs
 from nbs_pin.certificates.attack import random_disturbances
+from nbs_pin.certificates.assumptions import WRONG
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.online_monitor import Watched
 from nbs_pin.identification.measurement import quantised
@@ -79,7 +79,9 @@ class Loop:
             readings.append(reading)
             dv = lead * aim.a[k]
             if np.isfinite(reading + speed).all():  # else the last torque is held
-                command = law.torque(reading + lead * (speed + 0.5 * dv), speed + dv, ahead.q[k], ahead.v[k], ahead.a[k])
+                command = law.torque(
+                    reading + lead * (speed + 0.5 * dv), speed + dv, ahead.q[k], ahead.v[k], ahead.a[k]
+                )
             limit = self.limit(t[k], self.arm.effort_limit)
             applied = np.clip(command, -limit, limit)
             asked.append(applied)
@@ -91,9 +93,21 @@ class Loop:
                 q, v = np.clip(q, self.arm.lower, self.arm.upper), np.where(hit, 0.0, v)
         measured, speeds, tau, commands = (np.array(x) for x in zip(*rows, strict=True))
         return nbs.Run(
-            t=t, q=measured, v=speeds, tau=tau, tau_command=commands, disturbance=0.0 * tau,
-            q_ref=aim.q, v_ref=aim.v, a_ref=aim.a, effort_limit=self.arm.effort_limit, continuous=self.arm.continuous,
-            joint_names=self.arm.joint_names, period=h, robot=self.arm.source, robot_sha256=self.arm.sha256,
+            t=t,
+            q=measured,
+            v=speeds,
+            tau=tau,
+            tau_command=commands,
+            disturbance=0.0 * tau,
+            q_ref=aim.q,
+            v_ref=aim.v,
+            a_ref=aim.a,
+            effort_limit=self.arm.effort_limit,
+            continuous=self.arm.continuous,
+            joint_names=self.arm.joint_names,
+            period=h,
+            robot=self.arm.source,
+            robot_sha256=self.arm.sha256,
         )
 
 
@@ -132,11 +146,15 @@ def tilted(name: str, degrees: float) -> nbs.Plant:
     """The arm on a floor that is not level."""
     robot = arm(name)
     g, c, s = robot.gravity_vector, np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.array(
+        [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]
+    )
     return nbs.MujocoPlant(nbs.load_robot(name, gravity=turn @ g))
 
 
-def honest(name: str, seed: int, bits: int = 16, duration: float = 1.0, *, is_moving: bool = False) -> tuple[nbs.Certificate, Loop]:
+def honest(
+    name: str, seed: int, bits: int = 16, duration: float = 1.0, *, is_moving: bool = False
+) -> tuple[nbs.Certificate, Loop]:
     """A random loop that keeps every assumption; `is_moving`: its reference does not rest."""
     rng, robot, n = np.random.default_rng(seed), arm(name), arm(name).nv
     law = nbs.NeuralBackstepping.for_robot(robot, bandwidth=float(rng.choice([4.0, 8.0, 12.0])))
@@ -211,3 +229,89 @@ FAULTS: dict[str, Assumption | None] = {
     "motor that stops": Assumption.MODEL,
 }
 """The assumption that each fault breaks; None for a number that is not finite."""
+
+
+def watched(certificate: nbs.Certificate, run: nbs.Run, bits: int) -> list[Watched]:
+    """What a `Watch` says at every instant of the run."""
+    watch, memory, said = nbs.Watch(certificate, nbs.Encoders.of_bits(bits)), None, []
+    for k in range(len(run.t)):
+        aim = nbs.Reference(run.q_ref[k], run.v_ref[k], run.a_ref[k])
+        now, memory = watch.step(memory, float(run.t[k]), run.q[k], run.v[k], aim, run.tau[k], run.tau_command[k])
+        said.append(now)
+    return said
+
+
+def alarm(said: list[Watched]) -> int | None:
+    """The row of the first alarm."""
+    return next((k for k, one in enumerate(said) if one.verdict != "promise kept"), None)
+
+
+def naming(fault: str, said: list[Watched]) -> int | None:
+    """The first row that names what the fault breaks."""
+    broken = FAULTS[fault]
+    if broken is None:
+        return next((k for k, one in enumerate(said) if any("not finite" in name for name in one.excesses)), None)
+    return next((k for k, one in enumerate(said) if broken in one.broken), None)
+
+
+def blames_certificate(said: list[Watched]) -> bool:
+    """Whether it was ever called wrong."""
+    return any(WRONG in one.verdict for one in said)
+
+
+def check_honest(count: int, bits: int, seed: int) -> int:
+    """The number of honest runs with an alarm, each of which is printed."""
+    false, closest = 0, collections.defaultdict(float)
+    for k in range(count):
+        name = ARMS[k % len(ARMS)]
+        certificate, loop = honest(name, seed + k, bits)
+        said = watched(certificate, loop.run(), bits)
+        closest[name] = max(closest[name], *(one.error / one.error_bound for one in said))
+        row = alarm(said)
+        if row is not None:
+            false += 1
+            print(f"  false alarm: {name}, seed {seed + k}, t = {row * PERIOD:.3f} s: {said[row].verdict}")
+    print(f"{count} honest runs, {bits} bits: {false} false alarms; ", end="")
+    print("largest ‖z1‖ ÷ bound: " + ", ".join(f"{name} {x:.2f}" for name, x in closest.items()))
+    return false
+
+
+def check_faults(seeds: int, bits: int, seed: int) -> int:
+    """The number of faults that are not named in `SOON`, or for which the certificate is blamed."""
+    missed = 0
+    for fault in FAULTS:
+        times, words = [], ""
+        for k in range(seeds * len(ARMS)):
+            certificate, loop = faulty(fault, ARMS[k % len(ARMS)], seed + k // len(ARMS), bits)
+            said = watched(certificate, loop.run(), bits)
+            row, early = naming(fault, said), alarm(said)
+            after = np.inf if row is None else row * PERIOD - loop.begins
+            is_early = early is not None and early * PERIOD < loop.begins - 1.5 * PERIOD
+            if after > SOON or is_early or blames_certificate(said):
+                missed += 1
+                print(f"  missed: {fault}, {ARMS[k % len(ARMS)]}, seed {seed + k // len(ARMS)}: {said[-1].verdict}")
+            times.append(max(after, 0.0))
+            if row is not None:
+                words = str(FAULTS[fault] or said[row].excesses[0])
+                words += f"; this looks like {said[-1].suspects[0]}" if said[-1].suspects else ""
+        print(
+            f"{fault:26} named after {np.median(times):.3f} s, {max(times):.3f} s at worst, in {len(times)} runs: {words}"
+        )
+    return missed
+
+
+def main() -> int:
+    """Prints the figures; 1 if any is not as it should be."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--honest", type=int, default=200, help="honest runs")
+    parser.add_argument("--seeds", type=int, default=3, help="runs of each fault on each arm")
+    parser.add_argument("--bits", type=int, default=16, help="of the encoders")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    false = check_honest(options.honest, options.bits, options.seed)
+    missed = check_faults(options.seeds, options.bits, options.seed)
+    return int(false + missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -269,3 +269,11 @@ def jumps(controller: LyapunovLaw, at: LoopSamples) -> dict[Assumption, Bool[np.
     for rest, allowed in unexplained_steps(at.t, at.q_ref, at.v_ref, at.a_ref):
         broken = broken | (rest > allowed).any(axis=-1)
     return {Assumption.WRAP: np.asarray(wrapped), Assumption.REFERENCE: np.asarray(broken)}
+
+
+def stops(certificate: Certificate, at: LoopSamples) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
+    """When a joint is at a position limit, or beyond it."""
+    robot = certificate.robot
+    q = at.q[1:]
+    reached = np.zeros(q.shape, dtype=bool) if robot is None else (q <= robot.lower) | (q >= robot.upper)
+    return {Assumption.STOPS: np.asarray(reached.any(axis=-1))}

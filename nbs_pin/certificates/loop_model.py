@@ -10,8 +10,7 @@ from nbs_pin.certificates.energy_balance import LoopSamples, balance
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.equations import inverse_dynamics
-from nbs_pin.kernels import periods
-from nbs_pin.kernels import watching as at
+from nbs_pin.kernels import periods, watching as at
 from nbs_pin.kernels.laws import pack_tree_law
 from nbs_pin.kernels.layout import LAW, LawCode
 from nbs_pin.kernels.periods import compile_periods
@@ -110,8 +109,8 @@ class PlainModel(LoopModel):
     ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
         """As in `LoopModel`."""
         value, t = self.storage(after), np.array([0.0, h])
-        rows = [LoopSamples(t[k : k + 1], *x[:, None]) for k, x in enumerate((before, after))]
-        flow = balance(self._law, *rows, np.array([value - last]), self._quick)
+        first, second = (LoopSamples(t[k : k + 1], *x[:, None]) for k, x in enumerate((before, after)))
+        flow = balance(self._law, first, second, np.array([value - last]), self._quick)
         numbers = (x[0] for x in flow[:6])
         return np.array([value, *numbers, *flow.state_norms[0]]), np.concatenate(flow[6:10])
 
@@ -123,7 +122,9 @@ class PlainModel(LoopModel):
         v, a = 0.5 * (ahead + behind) / period, (ahead - behind) / period**2
         torque = 0.5 * (samples[0, at.TAU] + now[at.TAU])
         asked = self._torque(now[at.Q], now[at.V], now[at.Q_REF], now[at.V_REF], now[at.A_REF])
-        lag = now[at.COMMAND] - np.clip(now[at.COMMAND], *np.sort([asked, self._ahead(now, samples[2], period)], axis=0))
+        lag = now[at.COMMAND] - np.clip(
+            now[at.COMMAND], *np.sort([asked, self._ahead(now, samples[2], period)], axis=0)
+        )
         e = law.errors(now[at.Q], v, now[at.Q_REF], now[at.V_REF], now[at.A_REF])
         unexplained = inverse_dynamics(law.dynamics, now[at.Q], v, a) - torque
         return np.array([unexplained, torque, lag, asked, e.z1, e.z2, v, now[at.Q]])
@@ -143,6 +144,6 @@ class PlainModel(LoopModel):
         error = resolution / width + self._law.rate_like(q) * np.abs(bend)
         out, share = np.empty(at.CENTRE), np.empty(len(q))
         mass = np.ascontiguousarray(self._law.dynamics.mass_matrix(q))
-        at.settle(mean[at.Z2], mass, np.asarray(gradient), error, resolution, out, share)
+        at.settle(mean[at.Z2], mass, np.ascontiguousarray(gradient), error, resolution, out, share)
         out[at.PHI] = value
         return out, share

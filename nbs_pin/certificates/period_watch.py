@@ -15,8 +15,7 @@ from nbs_pin.certificates.encoders import Limits
 from nbs_pin.certificates.energy_balance import Balance
 from nbs_pin.certificates.glance import BITS, Glance, bound, labels
 from nbs_pin.certificates.loop_model import LoopModel
-from nbs_pin.kernels import periods, verdicts
-from nbs_pin.kernels import watching as at
+from nbs_pin.kernels import periods, verdicts, watching as at
 
 
 class WatchMemory(NamedTuple):
@@ -66,9 +65,10 @@ class PeriodWatch:
     def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WatchMemory]:
         """What the first instant shows, and the memory after it."""
         initial, certificate = self.model.storage(sample), self.certificate
-        first, widest = (certificate.from_start(x) for x in (initial, max(initial, certificate.storage) or 1.0))
-        bounds = (np.array([size, *joints]) for size, joints in (first, widest))
-        memory = WatchMemory(t, t, initial, *bounds, sample, initial)
+        largest = max(initial, certificate.storage) or 1.0
+        (size, joints), (most, mosts) = certificate.from_start(initial), certificate.from_start(largest)
+        bounds, widest = np.array([size, *joints]), np.array([most, *mosts])
+        memory = WatchMemory(t, t, initial, bounds, widest, sample, initial)
         z1 = certificate.controller.dynamics.difference(sample[at.Q], sample[at.Q_REF])
         return self._glance(memory, np.asarray(z1), None, False), memory
 
@@ -115,9 +115,8 @@ class PeriodWatch:
         values = np.array([memory.storage, math.sqrt(z1 @ z1), *np.abs(z1)])
         promised = np.array([promise, *bounds])
         over = ~(values <= promised * (1.0 + ROUNDING) + EPS * (1.0 + memory.initial))
-        excesses, is_wrong = (), False
-        if over.any():
-            excesses = tuple(self._labels[k] for k in np.flatnonzero(over))
+        excesses, is_wrong = tuple(self._labels[k] for k in over.nonzero()[0].tolist()), False
+        if excesses:
             lifted = promise * (1.0 + DIFFERENCES) + memory.excess
             reached = math.sqrt(lifted / (largest or 1.0)) * memory.widest
             scaled = memory.ratio * bounds if math.isfinite(memory.ratio) else np.full(len(bounds), np.inf)
@@ -138,5 +137,9 @@ class PeriodWatch:
 
 def _balance(terms: Float[np.ndarray, " terms"], vectors: Float[np.ndarray, "4 n"]) -> Balance:
     """As rows of one period."""
-    row = terms[:, None]
-    return Balance(*row[periods.CHANGE : periods.SIZE_Q], *vectors[:, None], terms[None, periods.SIZE_Q : periods.TERMS])
+    change, potential, damping, disturbance, held, saturation = terms[periods.CHANGE : periods.SIZE_Q, None]
+    z2, unexplained, lag, cut = vectors[:, None]
+    norms = terms[None, periods.SIZE_Q : periods.TERMS]
+    return Balance(
+        change, potential, damping, disturbance, held, saturation, z2, unexplained, lag, cut, state_norms=norms
+    )

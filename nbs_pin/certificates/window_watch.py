@@ -1,7 +1,7 @@
 """Check of a closed loop whose state is read from encoders, one control instant after the other.
 
-Torques are compared as means over a window, which an admissible disturbance keeps in its box whatever it does, and which
-readings tell to within a bound that follows from the encoder step (docs/certificates.md §11).
+Torques are compared as means over a window: an admissible disturbance keeps its mean in the box whatever it does, and
+readings tell the mean to within a bound that follows from the encoder step (docs/certificates.md §11).
 """
 
 import math
@@ -19,8 +19,7 @@ from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders, Limits
 from nbs_pin.certificates.glance import BITS, Glance, bound, labels
 from nbs_pin.certificates.loop_model import LoopModel
-from nbs_pin.kernels import verdicts
-from nbs_pin.kernels import watching as at
+from nbs_pin.kernels import verdicts, watching as at
 
 UNEXPLAINED = (Assumption.MODEL, Assumption.MEASUREMENT, Assumption.DISTURBANCE)
 """What a torque that the readings do not explain can come from."""
@@ -44,7 +43,7 @@ class WindowMemory(NamedTuple):
     """Time between instants [s]; NaN before the second one."""
     half: int = 0
     """Half the length of the window [periods]."""
-    history: Float[np.ndarray, "rows 8 n"] | None = None
+    history: Float[np.ndarray, "rows 8 n"] = np.empty((0, at.SIGNALS, 0))
     """Signals of the instants in the window and shortly before."""
     filled: int = 0
     """How many of them there are."""
@@ -112,9 +111,7 @@ class WindowWatch:
         """The memory after an instant that is not finite: the window begins anew."""
         return memory._replace(samples=memory.samples[:0], filled=0, has_gap=True)
 
-    def _promising(
-        self, memory: WindowMemory, sample: Float[np.ndarray, "7 n"], error: JointArray
-    ) -> WindowMemory:
+    def _promising(self, memory: WindowMemory, sample: Float[np.ndarray, "7 n"], error: JointArray) -> WindowMemory:
         """The memory with the bounds from the state of a sample, whose z2 is known to within `error` [rad/s]."""
         law, q = self.certificate.controller, sample[at.Q]
         e, mass = law.errors(q, *sample[at.V : at.A_REF + 1]), law.dynamics.mass_matrix(q)
@@ -162,9 +159,7 @@ class WindowWatch:
         storage = float(phi + kinetic)
         return _Told(storage, max(float(phi - phi_slack), 0.0) + least, float(found[verdicts.RATIO]), failed, suspects)
 
-    def _suspects(
-        self, mean: np.ndarray, more: np.ndarray, found: np.ndarray, moved: JointArray
-    ) -> tuple[str, ...]:
+    def _suspects(self, mean: np.ndarray, more: np.ndarray, found: np.ndarray, moved: JointArray) -> tuple[str, ...]:
         """Simple faults each of which would explain the mean torque; moved: what v_r asks for in the window [rad]."""
         rest, room = more[at.SPREAD], self.limits.rows[verdicts.BOX]
         room = np.minimum(room, self.limits.numbers[verdicts.RADIUS]) + more[at.VARIED]

@@ -1,5 +1,7 @@
-"""The energy balance of V over one control period of exact states, and what it says: `certificates/energy_balance.py` and
-`certificates/assumptions.py` for one period, with which tests hold it together."""
+"""The energy balance of V over one control period of exact states, and what it says.
+
+`certificates/energy_balance.py` and `certificates/assumptions.py` define both; tests hold the two together.
+"""
 
 import math
 
@@ -13,18 +15,8 @@ from nbs_pin.kernels.laws import difference, friction, torque_of
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.records import Dual, Mat, Motion, State, Target, Vec
 from nbs_pin.kernels.trees import tree_torque
-from nbs_pin.kernels.verdicts import (
-    BOX,
-    CONSTANT,
-    GAP_COULOMB,
-    GAP_VISCOUS,
-    OF_Q,
-    OF_TORQUE,
-    OF_V,
-    RADIUS,
-    outside,
-)
-from nbs_pin.kernels.views import damping_in, numbers, potential_in, take, take2, take3, take4, vector
+from nbs_pin.kernels.verdicts import BOX, CONSTANT, GAP_COULOMB, GAP_VISCOUS, OF_Q, OF_TORQUE, OF_V, RADIUS, outside
+from nbs_pin.kernels.views import damping_in, numbers, potential_in, take, take3, take4, vector
 from nbs_pin.kernels.watching import A_REF, COMMAND, Q_REF, TAU, V_REF, Q, V, inertia, parts
 
 STORAGE, CHANGE, POTENTIAL, DAMPING, DISTURBANCE, HELD, SATURATION, SIZE_Q, SIZE_V, TERMS = range(10)

@@ -7,21 +7,20 @@ over one period: the latter is `certificates/assumptions.py` for one period, and
 import math
 
 import numpy as np
-from numba import boolean, float64, int64, void
+from numba import float64, int64, void
 
 from nbs_pin.kernels.jit import compile_for, exact_kernel, inlined, kernel
 from nbs_pin.kernels.records import Mat, Vec
 from nbs_pin.kernels.watching import (
     A_REF,
     COMMAND,
-    FROZEN,
     LAG,
     LAGS,
     LAW,
-    Q_REF,
-    SPEED,
-    SPARE,
     OTHER,
+    Q_REF,
+    SPARE,
+    SPEED,
     SPREAD,
     TAU,
     TORQUE,
@@ -132,7 +131,7 @@ def judge_window(
     Args:
         mean: (8, n) of `watching.average`; U is written with the friction that is fed forward.
         history: what it averaged.
-        more: (4, n) of it; SPREAD and VARIED are written with the part of U that is too large, and its tolerance.
+        more: (`MORE`, n) of it; SPREAD and VARIED are written with the part of U that is too large, and its tolerance.
         share: |M|r, of `watching.centre`.
         period: [s].
         half: m, half the length of the window [periods].
@@ -143,7 +142,7 @@ def judge_window(
     """
     n, width = len(q), half * period
     radius, transition = numbers[RADIUS], numbers[TRANSITION]
-    size_q, size_v, gap, torque, asked, spread, speed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    size_q, size_v, gap, torque, asked = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         v = mean[SPEED, i]
         size_q, size_v = size_q + q[i] * q[i], size_v + v * v
@@ -151,7 +150,6 @@ def judge_window(
         unknown = limits[GAP_VISCOUS, i] * (abs(v) + slack) + limits[GAP_COULOMB, i]
         gap += unknown * unknown
         torque, asked = torque + mean[TORQUE, i] ** 2, asked + mean[LAW, i] ** 2
-        spread = max(spread, more[SPREAD, i])
     size_q, size_v, gap = math.sqrt(size_q), math.sqrt(size_v), math.sqrt(gap)
     granted = gap + numbers[OF_Q] * size_q + numbers[OF_V] * size_v + numbers[CONSTANT]
     fraction = OF_TORQUE + (period * size_v) ** 2

@@ -1,4 +1,4 @@
-"""A closed loop as a monitor reads it: samples to torques and errors, and their means over a window of encoder readings.
+"""A closed loop as a monitor reads it: samples to torques and errors, and their means over a window of readings.
 
 A sample is a matrix (7, n): q, v, q_d, v_d, a_d, the torque applied from then on, and the one commanded. From the
 readings of three instants in a row follow the signals of the middle one, (8, n), in the order below, where v and v̇ are
@@ -14,9 +14,6 @@ the central differences of the readings:
 The hat φ of half-width m has the weights (m − |j|)/m², which sum to 1 (docs/certificates.md §11).
 """
 
-import math
-
-import numpy as np
 from numba import float64, int64, void
 
 from nbs_pin.kernels import layout as at
@@ -26,7 +23,7 @@ from nbs_pin.kernels.laws import difference, law_workspace, torque_of
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.records import Dual, Mat, Motion, State, Target, Vec
 from nbs_pin.kernels.trees import place, tree_mass, tree_torque
-from nbs_pin.kernels.views import potential_in, take, take2, take3, take4, vector
+from nbs_pin.kernels.views import potential_in, take, take3, take4, vector
 
 Q, V, Q_REF, V_REF, A_REF, TAU, COMMAND, SAMPLE = range(8)
 """Rows of a sample, and their number."""
@@ -132,21 +129,23 @@ def average(history: Mat, half: int, mean: Mat, more: Mat) -> None:
         more: written, (`MORE`, n).
     """
     n, size = history.shape[2], float(half * half)
+    flat = mean.reshape(SIGNALS * n)
+    flat[:] = 0.0
     for i in range(n):
-        for f in range(SIGNALS):
-            mean[f, i] = 0.0
         more[VARIED, i], more[SPREAD, i], more[FROZEN, i] = 0.0, 0.0, 1.0
+    first, before = history[LAGS], history[LAGS - 1]
     for j in range(2 * half - 1):
-        weight, row = float(half - abs(j - half + 1)) / size, history[LAGS + j]
-        for f in range(SIGNALS):
-            for i in range(n):
-                mean[f, i] += weight * row[f, i]
-        side = 0.0 if j == half - 1 else (1.0 if j >= half else -1.0)
+        row = history[LAGS + j]
+        weight, numbers = float(half - abs(j - half + 1)) / size, row.reshape(SIGNALS * n)
+        for i in range(SIGNALS * n):
+            flat[i] += weight * numbers[i]
+        side = 0.0 if j == half - 1 else (1.0 / half if j >= half else -1.0 / half)
         for i in range(n):
-            more[VARIED, i] += side * row[SPEED, i] / float(half)
-            if row[READING, i] != history[LAGS, READING, i]:
+            more[VARIED, i] += side * row[SPEED, i]
+            more[SPREAD, i] = max(more[SPREAD, i], abs(row[TORQUE, i] - before[TORQUE, i]))
+            if row[READING, i] != first[READING, i]:
                 more[FROZEN, i] = 0.0
-            more[SPREAD, i] = max(more[SPREAD, i], abs(row[TORQUE, i] - history[LAGS + j - 1, TORQUE, i]))
+        before = row
 
 
 @kernel
