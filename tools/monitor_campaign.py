@@ -3,8 +3,8 @@
     python tools/monitor_campaign.py                    # 200 honest runs and 10 kinds of fault on four arms
     python tools/monitor_campaign.py --honest 20 --bits 18 --seed 3
 
-Every run is a MuJoCo arm at 1 kHz whose law sees what a real one does: positions rounded to encoder steps and velocities
-as their differences. Honest runs start off the reference, at random, under random admissible disturbances; any
+Every run is a MuJoCo arm at 1 kHz whose law sees what a real one does: positions rounded to encoder steps, and their
+differences as velocities. Honest runs start off the reference, at random, under random admissible disturbances; any
 assumption that the monitor names there is a false alarm. A fault begins at `BEGINS`; what is named, and after how long,
 is printed. With any false alarm, or any fault that is not named in `SOON`, the exit code is 1.
 """
@@ -15,7 +15,7 @@ import sys
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 import nbs_pin as nbs
-from nbs_pin.certificates.attack import random_disturbances
 from nbs_pin.certificates.assumptions import WRONG
+from nbs_pin.certificates.attack import random_disturbances
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.online_monitor import Watched
 from nbs_pin.identification.measurement import quantised
@@ -60,7 +60,6 @@ class Loop:
     act: Callable[[float, np.ndarray, list[np.ndarray], np.ndarray], np.ndarray] = lambda t, tau, before, v: tau
     limit: Callable[[float, np.ndarray], np.ndarray] = lambda t, limit: limit
     aim: Callable[[np.ndarray, nbs.Reference], nbs.Reference] = lambda t, aim: aim
-    stops: bool = False
 
     def run(self) -> nbs.Run:
         """The run as the arm's own log has it: measured states, and the torques that were asked for."""
@@ -88,9 +87,6 @@ class Loop:
             rows.append((reading, speed, applied, command))
             plant = self.plant if self.late is None or t[k] < self.begins else self.late
             q, v = plant.step(q, v, self.act(t[k], applied, asked, v) + self.torque(t[k]), h)
-            if self.stops:
-                hit = (q < self.arm.lower) | (q > self.arm.upper)
-                q, v = np.clip(q, self.arm.lower, self.arm.upper), np.where(hit, 0.0, v)
         measured, speeds, tau, commands = (np.array(x) for x in zip(*rows, strict=True))
         return nbs.Run(
             t=t,
@@ -113,11 +109,13 @@ class Loop:
 
 @cache
 def arm(name: str) -> nbs.Robot:
+    """The arm."""
     return nbs.load_robot(name)
 
 
 @cache
 def plant(name: str) -> nbs.Plant:
+    """The arm in MuJoCo."""
     return nbs.MujocoPlant(arm(name))
 
 
@@ -168,11 +166,13 @@ def honest(
     q0, v0 = begin.q[0] + off * rng.uniform(-1.0, 1.0, n), begin.v[0] + off * rng.normal(size=n)
     while (np.abs(law.torque(q0, v0, *(x[0] for x in begin))) > 0.4 * robot.effort_limit).any() and off > 1e-3:
         q0, v0, off = 0.5 * (q0 + begin.q[0]), 0.5 * (v0 + begin.v[0]), 0.5 * off
-    act = lambda t: torque[min(round(t / PERIOD), steps - 1)]
-    return certificate, Loop(robot, law, plant(name), reference, q0, v0, act, bits, duration)
+    return certificate, Loop(
+        robot, law, plant(name), reference, q0, v0, lambda t: torque[min(round(t / PERIOD), steps - 1)], bits, duration
+    )
 
 
 def alone(joint: int, n: int) -> np.ndarray:
+    """1 for that joint, 0 for the others."""
     return np.eye(n)[joint % n]
 
 
@@ -180,7 +180,10 @@ def faulty(fault: str, name: str, seed: int, bits: int = 16) -> tuple[nbs.Certif
     """The loop of `honest`, to which a fault happens at `BEGINS`."""
     certificate, loop = honest(name, seed, bits, is_moving=True)
     n, joint = loop.arm.nv, seed % 2
-    since = lambda t: t >= BEGINS - 1e-9
+
+    def since(t: float) -> bool:
+        return t >= BEGINS - 1e-9
+
     if fault == "wrong sign":
         loop.act = lambda t, tau, before, v: tau * (1.0 - 2.0 * alone(joint, n)) if since(t) else tau
     elif fault == "0.2 kg of payload":
@@ -294,9 +297,8 @@ def check_faults(seeds: int, bits: int, seed: int) -> int:
             if row is not None:
                 words = str(FAULTS[fault] or said[row].excesses[0])
                 words += f"; this looks like {said[-1].suspects[0]}" if said[-1].suspects else ""
-        print(
-            f"{fault:26} named after {np.median(times):.3f} s, {max(times):.3f} s at worst, in {len(times)} runs: {words}"
-        )
+        span = f"{np.median(times):.3f} s, {max(times):.3f} s at worst"
+        print(f"{fault:26} named after {span}, in {len(times)} runs: {words}")
     return missed
 
 

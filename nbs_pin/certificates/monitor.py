@@ -127,6 +127,17 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0, encoders: Enc
     at, recorded, lost, what = _without_gaps(run, start, certificate.joint_names)
     if encoders is not None:
         return _read(certificate, encoders, at, lost, what)
+    return _exact(certificate, at, recorded, lost, what)
+
+
+def _exact(
+    certificate: Certificate,
+    at: LoopSamples,
+    recorded: Float[np.ndarray, "rows n"],
+    lost: Bool[np.ndarray, " rows"],
+    what: str,
+) -> Monitored:
+    """The check of exact states; `lost` are the rows with `what`, a number that is not finite."""
     controller = certificate.controller
     storage, z1 = storage_of(controller, at), controller.dynamics.difference(at.q, at.q_ref)
     flow = balance(controller, at.rows(slice(-1)), at.rows(slice(1, None)), np.diff(storage))
@@ -138,8 +149,7 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0, encoders: Enc
     jumped = jumps(controller, at) | stops(certificate, at)
     failed = _outside(failures(flow, setting, jumped, held, bool(over.any()), recorded), lost)
     power, ratio = excess_of(flow, setting)
-    so_far = np.maximum.accumulate(np.concatenate([[1.0], ratio]))
-    accounted = promise.accounted(bounds, summed(power, steps, decay), so_far)
+    accounted = promise.accounted(bounds, summed(power, steps, decay), np.maximum.accumulate(np.append(1.0, ratio)))
     known = ~np.maximum.accumulate(lost)[:, None]  # a gap hides torques
     is_wrong = not any(name in failed for name in JUMPS) and bool((over & known & (values > accounted)).any())
     if over.any() and not failed and not is_wrong and not lost.any():
