@@ -13,6 +13,7 @@ import argparse
 import collections
 import sys
 import tempfile
+import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -302,6 +303,24 @@ def check_faults(seeds: int, bits: int, seed: int) -> int:
     return missed
 
 
+def cost(bits: int) -> dict[str, float]:
+    """Median time of a step on each arm [µs], over 10,000 of them."""
+    times = {}
+    for name in ARMS:
+        certificate, loop = honest(name, 1, bits, duration=2.0, is_moving=True)
+        run, watch, spent = loop.run(), nbs.Watch(certificate, nbs.Encoders.of_bits(bits)), []
+        for _ in range(5):
+            memory = None
+            for k in range(len(run.t)):
+                aim = nbs.Reference(run.q_ref[k], run.v_ref[k], run.a_ref[k])
+                row = (float(run.t[k]), run.q[k], run.v[k], aim, run.tau[k], run.tau_command[k])
+                begin = time.perf_counter()
+                _, memory = watch.step(memory, *row)
+                spent.append(time.perf_counter() - begin)
+        times[name] = 1e6 * float(np.median(spent))
+    return times
+
+
 def main() -> int:
     """Prints the figures; 1 if any is not as it should be."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -311,6 +330,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     false = check_honest(options.honest, options.bits, options.seed)
+    print("Watch, per step: " + ", ".join(f"{name} {x:.0f} µs" for name, x in cost(options.bits).items()))
     missed = check_faults(options.seeds, options.bits, options.seed)
     return int(false + missed > 0)
 
