@@ -58,8 +58,8 @@ def random_damping(n: int, widths: tuple[int, ...], form: str, seed: int = 0) ->
         [(rng.normal(size=(b, a)) / np.sqrt(a), rng.normal(size=b)) for a, b in pairwise((n, *widths, outputs))]
         for outputs in (n, n * (n - 1) // 2)
     ]
-    code = DampingCode.PAPER if form == "paper" else DampingCode.BOUNDED
-    return pack_damping(tuple(networks), code, 0.3, rng.uniform(0.5, 2.0, n), rng.normal(size=(n, n)))
+    code, ceiling = (DampingCode.PAPER, None) if form == "paper" else (DampingCode.BOUNDED, rng.uniform(0.3, 3.0))
+    return pack_damping(tuple(networks), code, 0.3, rng.uniform(0.5, 2.0, n), rng.normal(size=(n, n)), ceiling)
 
 
 def random_law(law: int, n: int, form: str, *, friction: bool, seed: int = 0) -> Packed:
@@ -103,7 +103,7 @@ def torch_potential(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor, 
 def torch_damping(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
     """D(z) z."""
     n, depth, form = layout[:3].tolist()
-    scale, floor = weights[1 : 1 + n], weights[1 + n :][: n * n].reshape(n, n)
+    scale, floor = weights[2 : 2 + n], weights[2 + n :][: n * n].reshape(n, n)
     outputs = []
     for first in (0, depth):
         h = scale * z
@@ -114,7 +114,8 @@ def torch_damping(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor) ->
     below = torch.zeros(n, n, dtype=z.dtype)
     below[*np.tril_indices(n, -1)] = outputs[1]
     t = torch.diag(diagonal) + below
-    return floor @ z + scale * (t.T @ (t @ (scale * z)))
+    share = 1.0 / (1.0 + (t * t).sum() * weights[1])
+    return floor @ z + share * scale * (t.T @ (t @ (scale * z)))
 
 
 def part(law: Packed, weights: torch.Tensor, in_layout: int, in_weights: int) -> tuple[np.ndarray, torch.Tensor]:
@@ -123,10 +124,10 @@ def part(law: Packed, weights: torch.Tensor, in_layout: int, in_weights: int) ->
 
 
 def without_adjoint(law: Packed) -> list[int]:
-    """Weights that get no cotangent: which joints wrap, σ's parameter, f(0), m."""
+    """Weights that get no cotangent: which joints wrap, σ's parameter, f(0), m, and the ceiling."""
     potential, damping = law.layout[POTENTIAL_WEIGHTS], law.layout[DAMPING_WEIGHTS]
     own = list(range(law.layout[JOINTS]))
-    return [*own, potential, potential + 1, damping] if law.layout[LAW] == LawCode.BACKSTEPPING else own
+    return [*own, potential, potential + 1, damping, damping + 1] if law.layout[LAW] == LawCode.BACKSTEPPING else own
 
 
 def torch_law(law: Packed, weights: torch.Tensor, q, v, q_ref, v_ref, a_ref):
@@ -212,7 +213,7 @@ def test_damping_adjoint_is_the_gradient(n, widths, form, seed):
 
     inputs = leaves(z, part.weights)
     expected = gradients(torch_damping(part.layout, inputs[1], inputs[0]) @ torch.tensor(force_bar), inputs)
-    expected[1][0] = 0.0  # m
+    expected[1][:2] = 0.0  # m and the ceiling
     assert_close(z_bar, expected[0])
     assert_close(weights_bar, expected[1])
 
