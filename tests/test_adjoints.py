@@ -9,7 +9,7 @@ import torch
 
 from nbs_pin.kernels.convex import subtract_tangent
 from nbs_pin.kernels.convex_adjoint import pull_back, room_for_potential, taped
-from nbs_pin.kernels.damping import damping_adjoint, room_for_damping
+from nbs_pin.kernels.damping import damping_adjoint, damping_force, room_for_damping
 from nbs_pin.kernels.law_adjoints import adjoint_workspace, law_adjoint, pid_adjoint
 from nbs_pin.kernels.laws import law_signals, law_workspace, pid
 from nbs_pin.kernels.layout import (
@@ -29,6 +29,7 @@ from nbs_pin.kernels.layout import (
     pack_damping,
     pack_law,
     pack_potential,
+    workspace,
 )
 from nbs_pin.kernels.records import Dual, Memory, Signals, State, Target
 
@@ -199,6 +200,30 @@ def test_potential_adjoint_is_the_gradient(n, widths, form, seed):
     expected[2][:2] = 0.0  # the activation's parameter and f(0)
     for found, wanted in zip((z_bar, dz_bar, weights_bar), expected, strict=True):
         assert_close(found, wanted)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_damping_adjoint_is_what_finite_differences_say(seed):
+    """Of the kernel of the force itself, under a ceiling, by z and by each weight that has a cotangent."""
+    part = random_damping(3, (5, 4), "bounded", seed)
+    z, force_bar = np.random.default_rng(seed).normal(size=(2, 3))
+    z_bar, weights_bar, h = np.zeros(3), np.zeros_like(part.weights), 1e-6
+    with scratch(room_for_damping(part)) as room:
+        damping_adjoint(z, force_bar, part, room, z_bar, weights_bar)
+
+    def power(at: np.ndarray) -> float:
+        force = np.empty(3)
+        with scratch(workspace(part)) as room:
+            damping_force(at[:3].copy(), Packed(part.layout, at[3:].copy()), room, force)
+        return float(force @ force_bar)
+
+    at, steps = np.concatenate([z, part.weights]), h * np.eye(3 + len(part.weights))
+    expected = np.array([power(at + step) - power(at - step) for step in steps]) / (2.0 * h)
+    padding = part.weights == 0.0
+    found = np.concatenate([z_bar, np.where(padding, 0.0, weights_bar)])
+    expected[3:][padding] = 0.0
+    expected[3:5] = 0.0  # m and the ceiling
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(("n", "widths"), SIZES)

@@ -131,6 +131,15 @@ class Damping(nn.Module):
         return matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
 
     @property
+    def stretch(self) -> float:
+        """r with R² ⪯ rD₀, rounded up: the largest eigenvalue of D₀^−½R²D₀^−½; inf if there is no D₀."""
+        if self.floor is None:
+            return math.inf
+        d0, r = self._constants(numpy=True)
+        least = least_eigenvalue(d0 / r / r[:, None])
+        return up(1.0 / least) if least > 0.0 else math.inf
+
+    @property
     def is_packable(self) -> bool:
         """Whether the kernels implement all parts; False for a subclass."""
         return defines(self, "packed") and all(defines(network, "layers") for network in (self.diagonal, self.lower))
@@ -156,17 +165,14 @@ class Damping(nn.Module):
     def share(self, radius: float) -> float:
         """n with D(z) ⪯ (1 + n) D₀ while zᵀD₀z ≤ radius² [W], for the present weights; inf if there is no D₀.
 
-        With r = λ_max(D₀^−½R²D₀^−½): D − D₀ ⪯ ‖T‖_F² R² ⪯ r‖T‖_F² D₀, and ‖Rz‖ ≤ √r radius (docs/theory.md §4).
+        With r of `stretch`: D − D₀ ⪯ ‖T‖_F² R² ⪯ r‖T‖_F² D₀, and ‖Rz‖ ≤ √r radius (docs/theory.md §4).
         """
-        if self.floor is None:
+        stretch = self.stretch
+        if math.isinf(stretch):
             return math.inf
-        d0, r = self._constants(numpy=True)
-        least = least_eigenvalue(d0 / r / r[:, None])
-        if not least > 0.0:
-            return math.inf
-        reached = up(radius / math.sqrt(least))
+        reached = up(radius * math.sqrt(stretch))
         square = self.diagonal.largest_square(reached) + self.lower.largest_square(reached)
-        return up(float(self._limited(np.float64(up(square)))) / least)
+        return up(float(self._limited(np.float64(up(square)))) * stretch)
 
     def _limited(self, square: Numbers) -> Numbers:
         """‖T‖_F² from that of the networks' T', which it does not exceed, and increases with."""

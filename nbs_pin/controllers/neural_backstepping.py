@@ -153,7 +153,7 @@ class NeuralBackstepping(LyapunovLaw):
             >>> import nbs_pin as nbs
             >>> law, zero = nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link")), [0.0, 0.0]
             >>> law.torque(zero, zero, [0.1, 0.1], zero, zero).round(1)
-            array([141.9,  79.6])
+            array([141.8,  79.6])
         """
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         e = self._errors(q, v, q_ref, v_ref, a_ref)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import Array, JointArray, is_torch_array
 from nbs_pin.base.claims import Claim, Known, Label, known, refuse
 from nbs_pin.base.known_code import first_foreign, foreign_code
-from nbs_pin.base.rounding import least_eigenvalue
+from nbs_pin.base.rounding import least_eigenvalue, up
 from nbs_pin.controllers.activations import Activation
 from nbs_pin.controllers.damping import DAMPINGS, Damping
 from nbs_pin.controllers.falsification import SAMPLES, falsify_activation, falsify_damping, falsify_potential
@@ -64,7 +64,7 @@ def damping_claims(damping: Damping) -> tuple[Claim, ...]:
         least = least_eigenvalue(floor)
         claims = [Claim(DAMPING, least, "N·m·s/rad", *known(why or odd, "D = D₀ + TᵀT ⪰ D₀ for every weight of T"))]
         if damping.ceiling is not None:
-            said = f"‖T‖_F² < {float(damping.ceiling):g} for every weight of T, and D = D₀ + R TᵀT R"
+            said = f"D = D₀ + R TᵀT R with ‖T‖_F² < {float(damping.ceiling):g} for every weight of T"
             claims.append(Claim(CEILING, share, "", *known(why or odd, said)))
         return tuple(claims)
     if damping.form != "paper" or not 0.0 < damping.m < np.inf:
@@ -142,7 +142,7 @@ def _ceiling(damping: Damping) -> float:
         return np.inf
     if damping.ceiling.shape != () or not 0.0 < float(damping.ceiling) < np.inf:
         refuse(f"the ceiling of D is {damping.ceiling.tolist()}", "it must be a positive number")
-    return damping.share(np.inf)
+    return up(float(damping.ceiling) * damping.stretch)
 
 
 def _scale(name: str, scale: JointArray) -> None:
