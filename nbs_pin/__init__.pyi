@@ -15,6 +15,7 @@ from .base.records import Reference as Reference, Run as Run
 from .certificates.admissible import Admissible as Admissible
 from .certificates.attack import Attack as Attack, attack as attack
 from .certificates.certificate import Certificate as Certificate
+from .certificates.certificate_file import write_certificate as write_certificate
 from .certificates.certify import certify as certify
 from .certificates.monitor import Monitored as Monitored, monitor as monitor
 from .certificates.online_monitor import Watch as Watch
@@ -80,5 +81,6 @@ from .simulation.plant import Plant as Plant
 from .simulation.simulate import simulate as simulate, stream as stream
 from .storage.checkpoints import about as about, load as load, save as save
 from .training.train import Training as Training, train as train
+from .verification.verify import Verification as Verification, verify as verify
 
 __version__: str

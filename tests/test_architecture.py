@@ -21,7 +21,7 @@ FLOORS = [
     {"controllers", "inertia"},
     {"simulation", "storage"},
     {"accuracy", "identification", "training"},
-    {"certificates", "cli"},
+    {"certificates", "cli", "verification"},
     {"reports"},
     {"benchmarks", "reproduction"},
     {"commands"},
@@ -35,6 +35,8 @@ HOMES = {
     "trimesh": {"robots.meshes", "robots.visuals", "reports.replay"},
     "scipy": {"motions", "inertia", "accuracy", "identification"},
     "clarabel": {"inertia.multipliers"},
+    "flint": {"verification.balls"},
+    "jsonschema": {"verification.document"},
     "threadpoolctl": {"identification.chain_fit"},
     "xacrodoc": {"robots.urdf_source"},
     "numba": {"kernels", "benchmarks.bench"},
@@ -108,6 +110,14 @@ def test_the_library_never_imports_what_re_makes_a_paper_or_measures_speed():
             assert not {room(t) for t in targets} & {"reproduction", "benchmarks", "commands"}, module
 
 
+def test_the_checker_of_certificates_shares_no_code_with_what_makes_them():
+    known = {"nbs_pin.base.exceptions"}
+    for path in (PACKAGE / "verification").glob("*.py"):
+        ours = {m for m in imports(path) if m.startswith("nbs_pin")}
+        assert all(m in known or m.startswith("nbs_pin.verification.") for m in ours), path
+    assert len((PACKAGE / "verification" / "verify.py").read_text().splitlines()) <= 300
+
+
 @pytest.mark.parametrize("library", HOMES)
 def test_a_library_stays_in_its_rooms(library):
     users = {module_name(f) for f in FILES if any(m.split(".")[0] == library for m in imports(f))}
@@ -118,7 +128,19 @@ def test_a_library_stays_in_its_rooms(library):
 def test_importing_the_package_is_light():
     code = "import nbs_pin, sys; nbs_pin.load_robot; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    heavy = {"torch", "matplotlib", "mujoco", "meshcat", "yourdfpy", "trimesh", "scipy", "numba", "clarabel"}
+    heavy = {
+        "torch",
+        "matplotlib",
+        "mujoco",
+        "meshcat",
+        "yourdfpy",
+        "trimesh",
+        "scipy",
+        "numba",
+        "clarabel",
+        "flint",
+        "jsonschema",
+    }
     assert not heavy & set(loaded)
 
 

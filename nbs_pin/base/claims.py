@@ -54,6 +54,8 @@ class Claim:
     because: str
     """Its origin, and its assumptions in addition to those of the certificate."""
     group: Group = Group.STRUCTURE
+    evidence: tuple[float, ...] | None = None
+    """Multipliers by which others can check the claim again (docs/certificates.md §6, §11); None if it has none."""
 
     def __post_init__(self) -> None:
         if math.isnan(self.value):

@@ -70,6 +70,17 @@ class Level(NamedTuple):
     """V∞ [J], inf where c is 0."""
 
 
+class Polygon(NamedTuple):
+    """Accepted edges from (Φ, 0) up to the line Φ + W = V∞ or above it; `heights` rise from edge to edge."""
+
+    start: float
+    """Φ at W = 0 [J]."""
+    steepness: tuple[float, ...]
+    """m = −dW/dΦ of each edge."""
+    heights: tuple[float, ...]
+    """W at the upper end of each edge [J]."""
+
+
 def decay(comparison: ComparisonSystem, share: float = 0.0) -> float:
     """The largest c found with x² − axy + (1 − β − share)y² + 2ωW ≥ c(Φ + W) [1/s], 0 if there is none.
 
@@ -104,35 +115,46 @@ def level(comparison: ComparisonSystem) -> Level:
 def reach(comparison: ComparisonSystem, storage: float) -> float:
     """Φ∞ [J]: the least one found such that {V ≤ V∞}, cut off by a polygon from (Φ∞, 0) upwards, is invariant.
 
-    storage: V∞ of `level`. An edge of steepness m = −dW/dΦ is accepted only if Ẇ + mΦ̇ ≤ 0 on all of it, for every
-    choice of x, y, s, σ.
+    storage: V∞ of `level`.
+    """
+    found = polygon(comparison, storage)
+    return storage if found is None else min(storage, found.start * _OUTWARD)
+
+
+def polygon(comparison: ComparisonSystem, storage: float) -> Polygon | None:
+    """The polygon behind `reach`; None if there is none below the level.
+
+    An edge of steepness m = −dW/dΦ is accepted only if Ẇ + mΦ̇ ≤ 0 on all of it, for every choice of x, y, s, σ.
     """
     if not 0.0 < storage < np.inf:
-        return storage
+        return None
     k = replace(comparison, t=comparison.t * _OUTWARD, power=comparison.power * _OUTWARD)
-    low, high = 0.0, storage
+    low, high, best = 0.0, storage, None
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        if _closes(k, middle, storage):
-            high = middle
-        else:
+        found = _closed(k, middle, storage)
+        if found is None:
             low = middle
-    return min(storage, high * _OUTWARD)
+        else:
+            high, best = middle, found
+    return best
 
 
-def _closes(k: ComparisonSystem, potential: float, storage: float) -> bool:
-    """Whether accepted edges lead from (Φ, 0) up to the line Φ + W = V∞."""
+def _closed(k: ComparisonSystem, potential: float, storage: float) -> Polygon | None:
+    """Accepted edges from (Φ, 0) up to the line Φ + W = V∞; None if they do not reach it."""
     rows = storage * np.linspace(0.0, 1.0, _ROWS + 1) ** 2
-    phi = potential
+    phi, edges = potential, []
     for low, high in zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True):
         end = phi - (high - low) / _STEEPNESS
         steep = np.flatnonzero((end >= 0.0) & (_growth(k, end, low, high) <= 0.0))
         if not len(steep):
-            return False
+            return None
         phi = float(end[steep[-1]])
+        edges.append((float(_STEEPNESS[steep[-1]]), high))
         if phi + high >= storage:
-            return True
-    return False
+            steepness, heights = zip(*edges, strict=True)
+            return Polygon(potential, steepness, heights)
+    return None
 
 
 def _growth(k: ComparisonSystem, end: np.ndarray, low: float, high: float) -> np.ndarray:

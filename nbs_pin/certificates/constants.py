@@ -15,6 +15,8 @@ from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.inertia.bounds import largest_inertia_bound, least_inertia_bound
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.robots.robot import Robot
 
 _SAMPLES = 2000
 
@@ -89,7 +91,7 @@ def constants_of(law: LyapunovLaw, viscous: JointArray | None = None) -> Constan
 def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tuple[Claim, ...]:
     """1/κ, 1/ν [s], a₂ and a₁ [kg·m²]: rigorous for a rigid tree, learned or given, sampled for other models."""
     names = ("1/κ ≥ λ_max(D₀^-½MD₀^-½)", "1/ν ≤ λ_min(D₀^-½MD₀^-½)", "a₂ ≥ λ_max(M)", "a₁ ≤ λ_min(M)")
-    arm = dynamics.robot if type(dynamics) is PinocchioDynamics else dynamics.packed_tree()
+    arm = rigid_arm(dynamics)
     if arm is not None:
         weights = (floor, np.eye(len(floor)))
         known = [bound for w in weights for bound in (largest_inertia_bound(arm, w), least_inertia_bound(arm, w))]
@@ -98,6 +100,11 @@ def _inertia(dynamics: DynamicsProvider, floor: Float[np.ndarray, "n n"]) -> tup
     units = ("s", "s", "kg·m²", "kg·m²")
     rows = zip(names, units, known, strict=True)
     return tuple(replace(x, name=name, unit=unit, group=Group.INERTIA) for name, unit, x in rows)
+
+
+def rigid_arm(dynamics: DynamicsProvider) -> Robot | Packed | None:
+    """The rigid tree that a model is, given or learned; None for a model of another kind."""
+    return dynamics.robot if type(dynamics) is PinocchioDynamics else dynamics.packed_tree()
 
 
 def _sampled(mass: Float[np.ndarray, "count n n"], floor: Float[np.ndarray, "n n"]) -> list[Claim]:

@@ -35,8 +35,10 @@ class FrictionGap(NamedTuple):
     """Δc [N·m], (n,)."""
     arm: JointFriction
     """Friction of the arm."""
+    width: float
+    """ε, the larger one of f̂ and f [rad/s]."""
     power: float
-    """P = max_x x(1 − tanh x) Σ ĉ_i ε [W], with the larger ε of f̂ and f."""
+    """P = max_x x(1 − tanh x) Σ ĉ_i ε [W]."""
 
     @classmethod
     def of(cls, nv: int, friction: JointFriction | None, fed: JointFriction | None) -> "FrictionGap":
@@ -44,7 +46,8 @@ class FrictionGap(NamedTuple):
         none = JointFriction(np.zeros(nv), np.zeros(nv))
         arm, law = friction or none, fed or none
         widest = max(arm.transition, law.transition)
-        return cls(arm.viscous - law.viscous, arm.coulomb - law.coulomb, arm, _WORST * widest * law.coulomb.sum())
+        power = _WORST * widest * law.coulomb.sum()
+        return cls(arm.viscous - law.viscous, arm.coulomb - law.coulomb, arm, widest, power)
 
     def torque(self, v: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows n"]:
         """Bound of each torque that is not fed forward [N·m]."""
@@ -59,6 +62,8 @@ class FrictionError(NamedTuple):
     alpha: float
     lines: tuple[Claim, ...]
     conditions: tuple[Condition, ...]
+    speed: JointArray
+    """Bound of |v_d| that they rest on [rad/s], inf where there is none."""
 
 
 def friction_error(gap: FrictionGap, constants: Constants, speed: JointArray, source: str) -> FrictionError:
@@ -68,7 +73,7 @@ def friction_error(gap: FrictionGap, constants: Constants, speed: JointArray, so
     """
     viscous = np.abs(gap.viscous)
     if not (viscous.any() or gap.coulomb.any() or gap.power):
-        return FrictionError(gap, 0.0, 0.0, (), ())
+        return FrictionError(gap, 0.0, 0.0, (), (), speed)
     bounded = np.isfinite(speed)
     box = gap.torque(np.where(bounded, speed, 0.0))
     t = math.sqrt(Admissible.of(box, len(box)).energy(constants.metric))
@@ -82,7 +87,7 @@ def friction_error(gap: FrictionGap, constants: Constants, speed: JointArray, so
         Claim("P of Coulomb friction fed forward smoothly", gap.power, "W", Label.PROVED, here, Group.FRICTION),
     )
     if not viscous.any():
-        return FrictionError(gap, t, alpha, lines, ())
+        return FrictionError(gap, t, alpha, lines, (), speed)
     name, fastest = "∞ > speed of the reference, for viscous friction", float(speed[viscous > 0.0].max())
     known = Condition(name, math.inf, fastest, "rad/s", Label.PROVED, f"|v_d| {source}", checks=Assumption.FRICTION)
-    return FrictionError(gap, t, alpha, lines, (known,))
+    return FrictionError(gap, t, alpha, lines, (known,), speed)

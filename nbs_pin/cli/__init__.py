@@ -29,6 +29,7 @@ from nbs_pin.cli.robots import Robots
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import OptionError
+from nbs_pin.cli.verify import Verify
 
 COMMANDS: dict[str, type] = {
     "track": Track,
@@ -37,6 +38,7 @@ COMMANDS: dict[str, type] = {
     "learn": Learn,
     "compare": Compare,
     "certify": Certify,
+    "verify": Verify,
     "replay": Replay,
     "reproduce": Reproduce,
     "bench": Bench,
@@ -46,7 +48,7 @@ COMMANDS: dict[str, type] = {
 BAD_INPUT, NO_PROMISE, INTERRUPTED = 2, 3, 130
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` lists the options of a command, "
-    "`nbs-pin --version` prints the version. Exit codes: 0 success, 2 bad input, 3 no promise from certify, "
+    "`nbs-pin --version` prints the version. Exit codes: 0 success, 2 bad input, 3 no promise from certify or verify, "
     "130 interrupted."
 )
 
@@ -63,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run `nbs-pin` with these arguments, or the shell's, and return the exit code.
 
     It is 0 for success, 2 for bad input (one sentence on stderr), 3 if `certify` gives no promise (refused, or a
-    condition fails), 130 after Ctrl-C, 143 after SIGTERM.
+    condition fails) or `verify` does not confirm one, 130 after Ctrl-C, 143 after SIGTERM.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -48,7 +48,8 @@ class Certify:
     """Certify a controller: bound its tracking error under any bounded disturbance, and say how each bound is known.
 
     Print every constant, condition and bound with its label PROVED, VERIFIED, PROBABILISTIC or EMPIRICAL, and write
-    certificate.png, run.npz (the worst motion found) and summary.json. With --wanted, also design gains and a control
+    certificate.png, run.npz (the worst motion found) and summary.json. With --json, also write certificate.json, which
+    nbs-pin verify checks again. With --wanted, also design gains and a control
     period that certify an error, and write controller.nbs.
 
     Example: nbs-pin certify panda --disturbance 5 --attack
@@ -94,6 +95,8 @@ class Certify:
     """The true arm; the error of an inexact model is bounded on closed loops with it (Theorem 4)."""
     trajectories: Annotated[int | None, integer("--trajectories", least=1, most=100_000), default("374")] = None
     """Closed loops that bound the error of an inexact model; with 374 the bound holds for 95 % of further ones."""
+    json: bool = False
+    """Write certificate.json, with every number behind the bounds, for nbs-pin verify."""
     attack: bool = False
     """Search for the worst disturbance along gradients through the closed loop, not only among waves."""
     monitor: Annotated[Path | None, tyro.conf.arg(metavar="RUN.npz"), default("none")] = None

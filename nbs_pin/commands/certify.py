@@ -12,6 +12,7 @@ from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design
+from nbs_pin.certificates.certificate_file import write_certificate
 from nbs_pin.certificates.loads import MARGIN
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.cli import NO_PROMISE
@@ -29,8 +30,8 @@ from nbs_pin.storage.checkpoints import load, save
 
 FILES = ("certificate.png", "run.npz", SUMMARY)
 """Files of `write_results`, the summary last; run.npz only if a worst motion was found."""
-MONITOR, DESIGNED = "monitor.png", "controller.nbs"
-"""Further files, for a monitored run and for a design."""
+MONITOR, DESIGNED, CERTIFICATE = "monitor.png", "controller.nbs", "certificate.json"
+"""Further files, for a monitored run, for a design and for `nbs-pin verify`."""
 
 
 def run(options: Certify, console: Console, notes: Console) -> int:
@@ -43,7 +44,7 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         robot = arm_of(controller, task)
         watched = None if options.monitor is None else Run.load(options.monitor)
     results = Results.of(options, robot.name, robot, against=robot.source)
-    results.check((*FILES, MONITOR, DESIGNED), options.force, whose="another certificate")
+    results.check((*FILES, MONITOR, DESIGNED, CERTIFICATE), options.force, whose="another certificate")
     with results.made() as folder:
         proposal = None
         if options.wanted is not None:
@@ -52,7 +53,7 @@ def run(options: Certify, console: Console, notes: Console) -> int:
             controller, task = proposal.controller, dataclasses.replace(task, period=proposal.period)
         result = assess(controller, task, thorough=options.attack, run=watched, proposal=proposal, progress=True)
         with notes.status(f"drawing the picture into {folder}"):
-            found, written = write_results(result, results)
+            found, written = write_results(result, results, as_file=options.json)
     law = Path(options.controller).name if options.controller.endswith(SAVED) else "a law built for it"
     print_certificate(console, f"{robot.name}, {law}", found)
     results.show(console, written)
@@ -188,9 +189,10 @@ def figures(result: Certified) -> dict[str, Any]:
     return plained
 
 
-def write_results(result: Certified, results: Results) -> tuple[dict[str, Any], list[str]]:
+def write_results(result: Certified, results: Results, *, as_file: bool = False) -> tuple[dict[str, Any], list[str]]:
     """Write the files; returns the figures and the names of the files.
 
+    as_file: whether to write `CERTIFICATE`; one of another certificate in the folder does not stay there.
     Raises OSError if they cannot be written.
     """
     found, folder, written = figures(result), results.folder, [FILES[0]]
@@ -204,6 +206,11 @@ def write_results(result: Certified, results: Results) -> tuple[dict[str, Any], 
     if result.proposal is not None:
         save(result.proposal.controller, folder / DESIGNED)
         written.append(DESIGNED)
+    if as_file:
+        write_certificate(result.certificate, folder / CERTIFICATE)
+        written.append(CERTIFICATE)
+    else:
+        (folder / CERTIFICATE).unlink(missing_ok=True)
     results.write_summary(found)
     return found, [*written, SUMMARY]
 

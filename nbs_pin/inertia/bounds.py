@@ -38,9 +38,9 @@ def largest_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> Claim:
     if len(tree.endless):
         because = f"joint {int(tree.endless[0]) + 1} slides without position limits, so the inertia has no upper bound"
         return Claim(name, np.inf, "", Label.PROVED, because)
-    value = up(largest_by_multipliers(tree, weight))
-    if np.isfinite(value):
-        return Claim(name, value, "", Label.PROVED, MULTIPLIERS)
+    found = largest_by_multipliers(tree, weight)
+    if np.isfinite(found.value):
+        return Claim(name, up(found.value), "", Label.PROVED, MULTIPLIERS, evidence=found.multipliers)
     bounds = {
         "trace of W⁻¹M by the largest lever arms": trace_bound(tree, weight),
         "finitely many poses, with a bound of trigonometric polynomials": trigonometric_bound(tree, weight),
@@ -64,9 +64,9 @@ def least_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None
     tree = RigidTree.of(arm)
     weight = np.eye(tree.nv) if weight is None else weight
     _check_weight(weight, tree.nv)
-    name, value = "least inertia over W, min λ(W^-½MW^-½)", down(least_by_multipliers(tree, weight))
-    if value > 0.0:
-        return Claim(name, value, "", Label.PROVED, MULTIPLIERS)
+    name, found = "least inertia over W, min λ(W^-½MW^-½)", least_by_multipliers(tree, weight)
+    if found.value > 0.0:
+        return Claim(name, down(found.value), "", Label.PROVED, MULTIPLIERS, evidence=found.multipliers)
     bounds = {
         "speeds of the bodies (pencil)": pencil_bound(tree),
         "determinant by articulated inertias": determinant_bound(tree),

@@ -9,6 +9,7 @@ semidefinite program, solved by clarabel, finds good multipliers, and its result
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import clarabel
 import numpy as np
@@ -74,18 +75,27 @@ class Motions:
         return cls(Form(energy, sums), moving, conditions)
 
 
-def least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"] | None = None) -> float:
+class Extreme(NamedTuple):
+    """A bound of the inertia, and the multipliers that prove it."""
+
+    value: float
+    multipliers: tuple[float, ...] | None = None
+    """One per condition of `Motions`, for forms in SI units; None without a proof."""
+
+
+def least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"] | None = None) -> Extreme:
     """Nearly tight lower bound of min_q λ_min(W^-½ M(q) W^-½), W = I by default; 0 if no multipliers are found."""
-    return max(0.0, _extreme(tree, np.eye(tree.nv) if weight is None else weight, 1.0))
+    found = _extreme(tree, np.eye(tree.nv) if weight is None else weight, 1.0)
+    return found if found.value > 0.0 else Extreme(0.0)
 
 
-def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> float:
+def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> Extreme:
     """Nearly tight upper bound of max_q λ_max(W^-½ M(q) W^-½); inf if no multipliers are found."""
-    least = -_extreme(tree, weight, -1.0)
-    return least if least > 0.0 else np.inf
+    found = _extreme(tree, weight, -1.0)
+    return Extreme(-found.value, found.multipliers) if found.value < 0.0 else Extreme(np.inf)
 
 
-def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> float:
+def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> Extreme:
     """The largest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf if none is found."""
     motions = Motions.of(tree)
     m = len(motions.energy.matrix)
@@ -100,7 +110,7 @@ def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> 
     norms = np.array([max(float(np.linalg.norm(form)), 1e-300) for form in forms])
     terms = np.array([unit * rated, *(form / norm for form, norm in zip(forms, norms, strict=True))])
     positive = np.array([False, *(form.positive for form in motions.conditions)])
-    constant, best = sign * motions.energy.matrix * scales, -np.inf
+    constant, best = sign * motions.energy.matrix * scales, Extreme(-np.inf)
     for margin in MARGINS:
         y, solved = maximise(constant - margin * np.eye(m), terms, positive)
         sums = motions.energy.size + np.abs(y[0]) * unit * np.abs(rated) / scales
@@ -109,7 +119,10 @@ def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> 
         # The largest row sum of the errors of the entries is no less than their spectral norm.
         radius = 16.0 * (m + tree.nv) * np.finfo(float).eps * float((sums * scales).sum(axis=1).max())
         if exceeds_every_perturbation(constant + np.tensordot(y, terms, 1), radius):
-            best = max(best, float(y[0]) * unit)
+            # Undoing the scaling is a congruence, so these multipliers prove it for the forms as they are.
+            best = max(
+                best, Extreme(float(y[0]) * unit, tuple((y[1:] / norms).tolist())), key=lambda found: found.value
+            )
             if solved:
                 break
     return best

@@ -1,0 +1,53 @@
+"""`nbs-pin verify`: a certificate file checked again by an independent program."""
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from nbs_pin.cli import NO_PROMISE
+from nbs_pin.cli.verify import Verify
+from nbs_pin.verification.verify import FALSE, OPEN, TAKEN, VERIFIED, Verification, verify
+
+_TITLES = {
+    FALSE: "not shown true",
+    OPEN: "not re-verified",
+    VERIFIED: "re-verified",
+    TAKEN: "taken as stated: what the rest assumes",
+}
+
+
+def run(options: Verify, console: Console, notes: Console) -> int:
+    """Verify, print and return the exit code; raises NbsPinError or OSError."""
+    with notes.status(f"checking {options.certificate}"):
+        found = verify(options.certificate, urdf=options.urdf)
+    for status, title in _TITLES.items():
+        if any(check.status == status for check in found.checks):
+            console.print(_table(title, found, status))
+    console.print(_verdict(found), highlight=False, markup=False, soft_wrap=True)
+    return 0 if found.confirmed else NO_PROMISE
+
+
+def _table(title: str, found: Verification, status: str) -> Table:
+    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", show_header=False)
+    table.add_column(overflow="fold")
+    table.add_column(overflow="fold")
+    style = "bold red" if status in (FALSE, OPEN) else ""
+    for check in found.checks:
+        if check.status == status:
+            table.add_row(Text(check.name, style=style), Text(check.because))
+    return table
+
+
+def _verdict(found: Verification) -> str:
+    """One line: what was re-verified, or why the bounds are not confirmed."""
+    count = {status: sum(check.status == status for check in found.checks) for status in _TITLES}
+    if found.confirmed:
+        return (
+            f"PROVED, and re-verified in {count[VERIFIED]} checks, given the {count[TAKEN]} statements taken as stated"
+        )
+    parts = [] if found.label == "PROVED" else [f"the file says {found.label}"]
+    parts += [f"{count[FALSE]} not shown true"] * (count[FALSE] > 0) + [f"{count[OPEN]} not re-verified"] * (
+        count[OPEN] > 0
+    )
+    return f"not confirmed: {', '.join(parts)}"
