@@ -36,7 +36,7 @@ TESTS: dict[str, str] = {
     "controllers/convex": "networks",
     "controllers/activations": "networks certificates",
     "controllers/lyapunov_law": "lyapunov_laws controllers monitor",
-    "controllers/part_claims": "structure_checks certificates",
+    "controllers/part_claims": "structure_checks certificates lyapunov_laws",
     "controllers/falsification": "structure_checks",
     "kernels/laws": "kernels compiled",
     "kernels/law_adjoints": "kernels adjoints",
