@@ -17,6 +17,7 @@ from .certificates.attack import Attack as Attack, attack as attack
 from .certificates.certificate import Certificate as Certificate
 from .certificates.certificate_file import write_certificate as write_certificate
 from .certificates.certify import certify as certify
+from .certificates.encoders import Encoders as Encoders
 from .certificates.monitor import Monitored as Monitored, monitor as monitor
 from .certificates.online_monitor import Watch as Watch
 from .certificates.propose import Proposal as Proposal, propose as propose

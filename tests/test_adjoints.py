@@ -9,7 +9,7 @@ import torch
 
 from nbs_pin.kernels.convex import subtract_tangent
 from nbs_pin.kernels.convex_adjoint import pull_back, room_for_potential, taped
-from nbs_pin.kernels.damping import damping_adjoint, room_for_damping
+from nbs_pin.kernels.damping import damping_adjoint, damping_force, room_for_damping
 from nbs_pin.kernels.law_adjoints import adjoint_workspace, law_adjoint, pid_adjoint
 from nbs_pin.kernels.laws import law_signals, law_workspace, pid
 from nbs_pin.kernels.layout import (
@@ -29,6 +29,7 @@ from nbs_pin.kernels.layout import (
     pack_damping,
     pack_law,
     pack_potential,
+    workspace,
 )
 from nbs_pin.kernels.records import Dual, Memory, Signals, State, Target
 
@@ -58,8 +59,8 @@ def random_damping(n: int, widths: tuple[int, ...], form: str, seed: int = 0) ->
         [(rng.normal(size=(b, a)) / np.sqrt(a), rng.normal(size=b)) for a, b in pairwise((n, *widths, outputs))]
         for outputs in (n, n * (n - 1) // 2)
     ]
-    code = DampingCode.PAPER if form == "paper" else DampingCode.BOUNDED
-    return pack_damping(tuple(networks), code, 0.3, rng.uniform(0.5, 2.0, n), rng.normal(size=(n, n)))
+    code, ceiling = (DampingCode.PAPER, None) if form == "paper" else (DampingCode.BOUNDED, rng.uniform(0.3, 3.0))
+    return pack_damping(tuple(networks), code, 0.3, rng.uniform(0.5, 2.0, n), rng.normal(size=(n, n)), ceiling)
 
 
 def random_law(law: int, n: int, form: str, *, friction: bool, seed: int = 0) -> Packed:
@@ -103,7 +104,7 @@ def torch_potential(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor, 
 def torch_damping(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
     """D(z) z."""
     n, depth, form = layout[:3].tolist()
-    scale, floor = weights[1 : 1 + n], weights[1 + n :][: n * n].reshape(n, n)
+    scale, floor = weights[2 : 2 + n], weights[2 + n :][: n * n].reshape(n, n)
     outputs = []
     for first in (0, depth):
         h = scale * z
@@ -114,7 +115,8 @@ def torch_damping(layout: np.ndarray, weights: torch.Tensor, z: torch.Tensor) ->
     below = torch.zeros(n, n, dtype=z.dtype)
     below[*np.tril_indices(n, -1)] = outputs[1]
     t = torch.diag(diagonal) + below
-    return floor @ z + scale * (t.T @ (t @ (scale * z)))
+    share = 1.0 / (1.0 + (t * t).sum() * weights[1])
+    return floor @ z + share * scale * (t.T @ (t @ (scale * z)))
 
 
 def part(law: Packed, weights: torch.Tensor, in_layout: int, in_weights: int) -> tuple[np.ndarray, torch.Tensor]:
@@ -123,10 +125,10 @@ def part(law: Packed, weights: torch.Tensor, in_layout: int, in_weights: int) ->
 
 
 def without_adjoint(law: Packed) -> list[int]:
-    """Weights that get no cotangent: which joints wrap, σ's parameter, f(0), m."""
+    """Weights that get no cotangent: which joints wrap, σ's parameter, f(0), m, and the ceiling."""
     potential, damping = law.layout[POTENTIAL_WEIGHTS], law.layout[DAMPING_WEIGHTS]
     own = list(range(law.layout[JOINTS]))
-    return [*own, potential, potential + 1, damping] if law.layout[LAW] == LawCode.BACKSTEPPING else own
+    return [*own, potential, potential + 1, damping, damping + 1] if law.layout[LAW] == LawCode.BACKSTEPPING else own
 
 
 def torch_law(law: Packed, weights: torch.Tensor, q, v, q_ref, v_ref, a_ref):
@@ -200,6 +202,30 @@ def test_potential_adjoint_is_the_gradient(n, widths, form, seed):
         assert_close(found, wanted)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_damping_adjoint_is_what_finite_differences_say(seed):
+    """Of the kernel of the force itself, under a ceiling, by z and by each weight that has a cotangent."""
+    part = random_damping(3, (5, 4), "bounded", seed)
+    z, force_bar = np.random.default_rng(seed).normal(size=(2, 3))
+    z_bar, weights_bar, h = np.zeros(3), np.zeros_like(part.weights), 1e-6
+    with scratch(room_for_damping(part)) as room:
+        damping_adjoint(z, force_bar, part, room, z_bar, weights_bar)
+
+    def power(at: np.ndarray) -> float:
+        force = np.empty(3)
+        with scratch(workspace(part)) as room:
+            damping_force(at[:3].copy(), Packed(part.layout, at[3:].copy()), room, force)
+        return float(force @ force_bar)
+
+    at, steps = np.concatenate([z, part.weights]), h * np.eye(3 + len(part.weights))
+    expected = np.array([power(at + step) - power(at - step) for step in steps]) / (2.0 * h)
+    padding = part.weights == 0.0
+    found = np.concatenate([z_bar, np.where(padding, 0.0, weights_bar)])
+    expected[3:][padding] = 0.0
+    expected[3:5] = 0.0  # m and the ceiling
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize(("n", "widths"), SIZES)
 @pytest.mark.parametrize("form", ["bounded", "paper"])
 @pytest.mark.parametrize("seed", [0, 1])
@@ -212,7 +238,7 @@ def test_damping_adjoint_is_the_gradient(n, widths, form, seed):
 
     inputs = leaves(z, part.weights)
     expected = gradients(torch_damping(part.layout, inputs[1], inputs[0]) @ torch.tensor(force_bar), inputs)
-    expected[1][0] = 0.0  # m
+    expected[1][:2] = 0.0  # m and the ceiling
     assert_close(z_bar, expected[0])
     assert_close(weights_bar, expected[1])
 

@@ -50,7 +50,9 @@ def by_hand(robot, activation):
         root @ root.T + np.eye(n), widths=(5, 3), activation=activation, scale=np.arange(1.0, n + 1),
         least_share=0.25, seed=3,
     )  # fmt: skip
-    damping = Damping(n, floor=0.1 * np.eye(n), widths=(4,), scale=np.full(n, 0.7), gain=0.5, least_share=0.0, seed=4)
+    damping = Damping(
+        n, floor=0.1 * np.eye(n), widths=(4,), scale=np.full(n, 0.7), gain=0.5, least_share=0.0, seed=4, ceiling=0.3
+    )
     friction = JointFriction(np.full(n, 0.3), np.arange(float(n)), transition=0.02)
     return NeuralBackstepping(
         dynamics, potential, damping, rate=np.full(n, 0.3), inertial_rate=2.0, friction=friction, least_share=0.9

@@ -104,12 +104,13 @@ def test_potential_kernel_is_the_potential(seed, nv, widths, form, activation, a
     nv=st.integers(1, 31),
     widths=st.lists(st.integers(1, 40), max_size=3),
     paper=st.booleans(),
+    ceiling=st.sampled_from([None, 1e-3, 1.0, 30.0]),
     size=st.sampled_from([0.0, 1e-9, 1.0, 1e3]),
 )
-def test_damping_kernel_is_the_damping(seed, nv, widths, paper, size):
+def test_damping_kernel_is_the_damping(seed, nv, widths, paper, ceiling, size):
     rng = np.random.default_rng(seed)
     floor, scale = positive_definite(rng, nv), rng.uniform(0.1, 5.0, nv)
-    options = {"form": "paper"} if paper else {"floor": floor}
+    options = {"form": "paper"} if paper else {"floor": floor, "ceiling": ceiling}
     damping = Damping(nv, widths=tuple(widths), scale=scale, **options)
     randomise(damping, seed)
     z = size * rng.normal(size=nv)

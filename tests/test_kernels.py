@@ -71,10 +71,10 @@ def test_every_activation_is_its_kernel(code):
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.parametrize("code", DampingCode)
-def test_every_damping_is_its_kernel_and_its_adjoint(code):
+@pytest.mark.parametrize(("code", "ceiling"), [*((code, None) for code in DampingCode), (DampingCode.BOUNDED, 0.4)])
+def test_every_damping_is_its_kernel_and_its_adjoint(code, ceiling):
     form = code.name.lower()
-    damping = Damping(3, form=form, floor=None if form == "paper" else np.eye(3), gain=0.8)
+    damping = Damping(3, form=form, floor=None if form == "paper" else np.eye(3), ceiling=ceiling, gain=0.8)
     part = damping.packed()
     assert part.layout[CODE] == code
     z, force_bar = np.random.default_rng(0).normal(size=(2, 3))

@@ -8,7 +8,9 @@ import nbs_pin as nbs
 from nbs_pin.base.claims import Label
 from nbs_pin.base.exceptions import CertificateRefused
 from nbs_pin.certificates.structure import check_structure
+from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.controllers.part_claims import CEILING
 from nbs_pin.controllers.registry import LAWS, build_law
 
 ROBOT = nbs.load_robot("three_link").with_effort_limit(1e3)
@@ -59,6 +61,56 @@ def test_the_constants_bound_what_they_are_constants_of(name):
     e = law.errors(z, dz, 0.0 * z, 0.0 * z, 0.0 * z)
     np.testing.assert_allclose(e.v_r, -v.rate * gradient, rtol=1e-12)
     assert any("friction" in claim.name for claim in v.claims)
+
+
+@pytest.mark.parametrize("name", CERTIFIED)
+@pytest.mark.parametrize("radius", [0.01, 0.5, 20.0, np.inf])
+def test_the_share_of_the_damping_holds_all_its_values(name, radius):
+    """D(z2) ⪯ (1 + n)D₀ while z2ᵀD₀z2 ≤ radius², D₀ of the law's own constants."""
+    law = build_law(name, ROBOT)
+    n, floor = law.damping_share(radius), law.lyapunov().floor
+    z = np.linalg.solve(np.linalg.cholesky(floor).T, np.random.default_rng(0).normal(size=(3, 200))).T
+    z *= min(radius, 1e4) * np.random.default_rng(1).uniform(0.0, 1.0, (200, 1)) / np.linalg.norm(z, axis=1)[:, None]
+    if name == "nbs-paper":  # whose D has no floor for every weight
+        assert n == np.inf
+        return
+    z[0] = 0.0
+    assert np.linalg.eigvalsh(law.damping_matrix(z) - (1.0 + n) * floor).max() <= 1e-12 * (1.0 + n) * floor.max()
+    assert n < {"nbs": 1.0 + 1e-6, "slotine-li": 1e-9, "sliding-mode": np.inf}[name]
+
+
+def test_the_ceiling_is_a_claim_and_a_share_of_trained_gains():
+    """As the floor sinks to a share φ of D₀, the ceiling b of the initial D₀ is b/φ of it."""
+    law = build_law("nbs", ROBOT)
+    claims = {claim.name: claim for claim in law.lyapunov().claims}
+    assert claims[CEILING].label is Label.PROVED
+    assert claims[CEILING].value == pytest.approx(1.0, rel=1e-6)
+    law.damping.floor.change.data.fill_(-50.0)
+    claims = {claim.name: claim for claim in law.lyapunov().claims}
+    assert claims[CEILING].value == pytest.approx(2.0, rel=1e-6)
+    assert law.damping_share(0.1) < law.damping_share(np.inf) < 2.0
+    free = nbs.NeuralBackstepping.for_robot(ROBOT, damping_ceiling=None)
+    assert CEILING not in {claim.name for claim in free.lyapunov().claims}
+    assert free.damping_share(np.inf) > free.damping_share(0.1)
+    law.damping.ceiling.fill_(-1.0)
+    with pytest.raises(CertificateRefused, match="ceiling of D is -1"):
+        law.lyapunov()
+
+
+class Unlimited(Damping):
+    """A damping that forgets its ceiling."""
+
+    def factor(self, x):
+        return 10.0 * super().factor(x)
+
+
+def test_a_damping_that_is_above_its_ceiling_is_refused_and_has_no_share():
+    law = build_law("nbs", ROBOT)
+    mild = law.damping
+    law.damping = Unlimited(3, floor=mild.floor.nominal, scale=mild.scale, ceiling=1.0, seed=1)
+    assert law.damping_share(1.0) == np.inf
+    with pytest.raises(CertificateRefused, match="which its ceiling states"):
+        law.lyapunov()
 
 
 @pytest.mark.parametrize("friction", [None, FRICTION])

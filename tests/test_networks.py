@@ -89,10 +89,10 @@ def test_closed_forms_are_the_derivatives(seed, nv, form):
 
 
 @any_weights
-@given(seed=seeds, nv=sizes, form=st.sampled_from(POTENTIALS))
-def test_numpy_and_torch_are_one_law(seed, nv, form):
+@given(seed=seeds, nv=sizes, form=st.sampled_from(POTENTIALS), ceiling=st.sampled_from([None, 0.5]))
+def test_numpy_and_torch_are_one_law(seed, nv, form, ceiling):
     potential = random_potential(form, nv, seed)
-    damping = Damping(nv, floor=np.eye(nv), widths=(8, 8))
+    damping = Damping(nv, floor=np.eye(nv), widths=(8, 8), ceiling=ceiling)
     randomise(damping, seed)
     z, dz = np.random.default_rng(seed).normal(size=(2, 4, nv))
     z[0] = 0.0
@@ -139,15 +139,84 @@ def check_strong_convexity(potential: Potential, seed: int) -> None:
     assert (strong >= potential.modulus * (step * step).sum(-1) - slack).all()
 
 
-@any_weights
-@given(seed=seeds, nv=sizes)
-def test_bounded_damping_is_above_its_floor(seed, nv):
+def random_damping(nv: int, seed: int, *, ceiling: float | None = None, gain: float = 3.0) -> Damping:
+    """D₀ and R of any shape, gains within their shares, and weights of any sign."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(nv, nv))
     floor = root @ root.T + 0.05 * np.eye(nv)
-    damping = Damping(nv, floor=0.5 * (floor + floor.T), widths=(8, 8), scale=rng.uniform(0.2, 5.0, nv))
-    randomise(damping, seed, gain=3.0)
-    check_floor(damping, seed)
+    scale = rng.uniform(0.2, 5.0, nv)
+    damping = Damping(nv, floor=0.5 * (floor + floor.T), widths=(8, 8), scale=scale, ceiling=ceiling)
+    randomise(damping, seed, gain=gain)
+    return damping
+
+
+@any_weights
+@given(seed=seeds, nv=sizes, ceiling=st.sampled_from([None, 0.1, 4.0]))
+def test_bounded_damping_is_above_its_floor(seed, nv, ceiling):
+    check_floor(random_damping(nv, seed, ceiling=ceiling), seed)
+
+
+@settings(any_weights, max_examples=30)
+@given(seed=seeds, nv=sizes, ceiling=st.floats(1e-3, 1e3), gain=st.sampled_from([0.3, 3.0, 30.0]))
+def test_a_ceiling_is_above_the_damping_for_every_weight(seed, nv, ceiling, gain):
+    """D ≺ D₀ + bR² and TᵀT ≺ b1; and the ceiling only scales T."""
+    damping = random_damping(nv, seed, ceiling=ceiling, gain=gain)
+    free = random_damping(nv, seed, gain=gain)
+    z = np.random.default_rng(seed).normal(size=(60, nv)) * np.geomspace(1e-3, 1e3, 60)[:, None]
+    r, matrix, floor = damping.scale.numpy(), damping.matrix(z), damping.floor.numpy()
+    most = np.linalg.eigvalsh(floor + ceiling * np.diag(r**2) - matrix).min(axis=-1)
+    assert (most >= -1e-12 * np.abs(matrix).max()).all()
+    t, plain = damping.factor(r * z), free.factor(r * z)
+    assert (t**2).sum(axis=(-2, -1)).max() < ceiling * (1.0 + 1e-12)
+    share = np.sqrt(1.0 + (plain**2).sum(axis=(-2, -1), keepdims=True) / ceiling)
+    np.testing.assert_allclose(t * share, plain, rtol=1e-12, atol=1e-12)
+
+
+@any_weights
+@given(
+    seed=seeds,
+    nv=sizes,
+    ceiling=st.sampled_from([None, 0.5, 20.0]),
+    gain=st.sampled_from([0.1, 1.0, 5.0]),
+    radius=st.sampled_from([0.0, 1e-3, 0.3, 10.0, np.inf]),
+)
+def test_the_share_of_a_damping_holds_all_its_values(seed, nv, ceiling, gain, radius):
+    """D ⪯ (1 + n)D₀ on the ellipsoid, its surface included, for D₀ and R of any shape."""
+    damping = random_damping(nv, seed, ceiling=ceiling, gain=gain)
+    floor, rng = damping.floor.numpy(), np.random.default_rng(seed)
+    z = np.linalg.solve(np.linalg.cholesky(floor).T, rng.normal(size=(nv, 80)))
+    z /= np.sqrt((z * (floor @ z)).sum(axis=0))
+    z = (z * np.where(np.arange(80) % 2, 1.0, rng.uniform(0.0, 1.0, 80)) * min(radius, 1e6)).T
+    n = damping.share(radius)
+    lack = np.linalg.eigvalsh((1.0 + n) * floor - damping.matrix(z)).min(axis=-1)
+    assert (lack >= -1e-12 * (1.0 + n) * np.abs(floor).max()).all()
+    assert n <= damping.share(2.0 * radius) <= damping.share(np.inf) < np.inf
+    if ceiling is not None:
+        stretched = np.linalg.eigvals(np.linalg.solve(floor, np.diag(damping.scale.numpy() ** 2))).real.max()
+        assert damping.share(np.inf) <= ceiling * stretched * (1.0 + 1e-6)
+
+
+def test_the_share_of_networks_without_a_hidden_layer_is_that_of_a_matrix():
+    """T is affine in Rz, so that without a ceiling there is no bound everywhere, and with one there is."""
+    for ceiling, most in ((None, np.inf), (2.0, 2.0)):
+        damping = Damping(2, floor=np.eye(2), widths=(), ceiling=ceiling)
+        damping.diagonal.w0.data.copy_(torch.tensor([[3.0, 0.0], [0.0, 1.0]]))
+        damping.lower.w0.data.zero_()
+        square = (3.0 * 0.7) ** 2  # the largest ‖T‖_F² over ‖z‖ ≤ 0.7, at z = (0.7, 0)
+        expected = square if ceiling is None else square / (1.0 + square / ceiling)
+        assert damping.share(0.7) == pytest.approx(expected, rel=1e-6)
+        assert damping.share(np.inf) == pytest.approx(most, rel=1e-6)
+    assert Damping(2, form="paper").share(1.0) == np.inf
+
+
+def test_without_a_ceiling_nothing_is_computed_otherwise():
+    """A ceiling of None is the form of old files, to the last bit; one that is never felt is near it."""
+    free, high = Damping(3, floor=np.eye(3)), Damping(3, floor=np.eye(3), ceiling=1e12)
+    assert "ceiling" not in free.state_dict()
+    z = np.random.default_rng(0).normal(size=(20, 3))
+    x = free.factor(z)
+    np.testing.assert_array_equal(free.matrix(z), np.eye(3) + np.swapaxes(x, -1, -2) @ x)
+    np.testing.assert_allclose(high.force(z), free.force(z), rtol=1e-11)
 
 
 def check_floor(damping: Damping, seed: int) -> None:
@@ -200,14 +269,20 @@ def test_initial_weights_of_the_potential_are_those_of_the_theory():
     assert weights.max() == pytest.approx(0.2, rel=0.05)
 
 
-@given(seed=st.integers(0, 2**31), radius=st.floats(0.01, 3.0), scale=st.floats(0.1, 10.0))
+@given(
+    seed=st.integers(0, 2**31),
+    radius=st.floats(0.01, 3.0),
+    scale=st.floats(0.1, 10.0),
+    ceiling=st.sampled_from([None, 0.02, 1.0]),
+)
 @settings(max_examples=30, deadline=None)
-def test_for_one_joint_the_range_of_damping_holds_all_its_values(seed, radius, scale):
-    damping = Damping(1, floor=np.array([[1.0]]), scale=np.array([scale]), seed=seed)
+def test_for_one_joint_the_range_of_damping_holds_all_its_values(seed, radius, scale, ceiling):
+    damping = Damping(1, floor=np.array([[1.0]]), scale=np.array([scale]), ceiling=ceiling, seed=seed)
     z = np.linspace(-radius, radius, 501)[:, None]
     more, found = damping.matrix(z)[:, 0, 0] - 1.0, damping.excess(radius)
     assert found.low <= more.min() <= more.max() <= found.high
-    plain = Damping(1, floor=np.array([[1.0]]), seed=seed).excess(scale * radius)
+    assert more.max() <= damping.share(radius)
+    plain = Damping(1, floor=np.array([[1.0]]), ceiling=ceiling, seed=seed).excess(scale * radius)
     assert found.high == pytest.approx(scale**2 * plain.high, rel=1e-9)
 
 
@@ -222,6 +297,9 @@ def test_for_one_joint_the_range_of_damping_holds_all_its_values(seed, radius, s
         (lambda: Damping(2, form="fancy"), "choose one of bounded, paper"),
         (lambda: Damping(2), "'bounded' needs one"),
         (lambda: Damping(2, form="paper", floor=np.eye(2)), "'paper' has none"),
+        (lambda: Damping(2, floor=np.eye(2), ceiling=0.0), "ceiling 0.0; give 'bounded' a positive number or None"),
+        (lambda: Damping(2, floor=np.eye(2), ceiling=np.inf), "ceiling inf; give 'bounded' a positive number"),
+        (lambda: Damping(2, form="paper", ceiling=1.0), "'paper' was given ceiling 1.0"),
         (lambda: Damping(2, form="paper", m=0.0), "m is 0.0; give a positive number"),
         (lambda: Damping(2, floor=np.zeros((2, 2))), "floor D₀ has the eigenvalue 0"),
         (lambda: SmoothedReLU(0.0), "give a positive number"),

@@ -23,9 +23,10 @@ WRONG = "the certificate is wrong"
 """The verdict if no violated assumption accounts for an exceeded bound."""
 ROUNDING, DIFFERENCES = 1e-9, 1e-3
 """Relative tolerances of a bound: for V itself, and for energies summed over periods."""
+EPS = float(np.finfo(float).eps)
+"""Absolute one of V and of errors, per unit of 1 + V(0)."""
 _NOTICEABLE = 0.01
 _MOST = 0.4  # above this h(ω + ν) a period is no longer sound
-_EPS = float(np.finfo(float).eps)
 _OF_BOUND, _OF_TORQUE = 1e-2, 1e-3  # smaller torques are within the error of finite differences
 
 
@@ -38,11 +39,13 @@ def check_certificate(certificate: Any) -> None:
 def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption, str], *, is_recorded: bool) -> str:
     """The verdict. at: the exceeded bounds and the time. failed: the violated assumptions with their times.
 
-    is_recorded: whether the disturbance is recorded, so that it can be distinguished from a model error.
+    is_recorded: whether the disturbance is recorded, so that it can be distinguished from a model error; from readings
+    of encoders neither can be told from a false measurement.
     """
     said = {name: name + when for name, when in failed.items()}
     if not is_recorded and Assumption.MODEL in said and Assumption.DISTURBANCE in said:
-        said[Assumption.MODEL] = f"{Assumption.MODEL}, or {said.pop(Assumption.DISTURBANCE)}"
+        like = [said.pop(name) for name in (Assumption.MEASUREMENT, Assumption.DISTURBANCE) if name in said]
+        said[Assumption.MODEL] = ", or ".join([Assumption.MODEL, *like])
     named = "; ".join(said.values())
     if is_kept:
         return "promise kept" + (f", though assumptions failed: {named}" if named else "")
@@ -50,6 +53,11 @@ def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption,
         return f"promise broken{at}" + (f"; assumptions that failed: {named}" if named else "")
     why = f"for which the failed assumptions do not account ({named})" if named else "though no assumption failed"
     return f"promise broken{at}, {why}: {WRONG}"
+
+
+def looks_like(suspects: Sequence[str]) -> str:
+    """The end of a verdict that names simple faults, each of which would explain the torques."""
+    return f"; this looks like {' or '.join(suspects)}" if suspects else ""
 
 
 def listed(excesses: Sequence[str]) -> str:
@@ -83,7 +91,7 @@ class Promise(NamedTuple):
         self, values: Float[np.ndarray, "rows quantities"], bounds: Float[np.ndarray, "rows quantities"]
     ) -> Bool[np.ndarray, "rows quantities"]:
         """Where a bound is exceeded by more than rounding errors, or a value is no number."""
-        return np.asarray(~(values <= bounds * (1.0 + ROUNDING) + _EPS * (1.0 + self.initial)))
+        return np.asarray(~(values <= bounds * (1.0 + ROUNDING) + EPS * (1.0 + self.initial)))
 
     def accounted(
         self,
@@ -131,7 +139,7 @@ def not_finite(
     return rows, f"{named[which][0]} of {joint_names[joint]}, which is not finite"
 
 
-def noticeable(certificate: Certificate, step: Float[np.ndarray, "*periods"]) -> Float[np.ndarray, "*periods"]:
+def noticeable(certificate: Certificate, step: Float[np.ndarray, "*periods"] | float) -> Float[np.ndarray, "*periods"]:
     """Share of the bound of V that holding the torque may supply over periods [s] before it is reported.
 
     A held torque lags by a share h(ω + ν) of the fastest decay of z2, which at a sound period is no fault of the loop.
@@ -261,3 +269,11 @@ def jumps(controller: LyapunovLaw, at: LoopSamples) -> dict[Assumption, Bool[np.
     for rest, allowed in unexplained_steps(at.t, at.q_ref, at.v_ref, at.a_ref):
         broken = broken | (rest > allowed).any(axis=-1)
     return {Assumption.WRAP: np.asarray(wrapped), Assumption.REFERENCE: np.asarray(broken)}
+
+
+def stops(certificate: Certificate, at: LoopSamples) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
+    """When a joint is at a position limit, or beyond it."""
+    robot = certificate.robot
+    q = at.q[1:]
+    reached = np.zeros(q.shape, dtype=bool) if robot is None else (q <= robot.lower) | (q >= robot.upper)
+    return {Assumption.STOPS: np.asarray(reached.any(axis=-1))}

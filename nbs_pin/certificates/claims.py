@@ -14,6 +14,7 @@ class Assumption(StrEnum):
 
     MODEL = "the model is exact"
     FRICTION = "joint friction is as stated"
+    MEASUREMENT = "position and velocity are measured as stated"
     DISTURBANCE = "the disturbance is within its bound"
     REFERENCE = "the reference is twice differentiable"
     STOPS = "no joint reaches its stop"

@@ -19,15 +19,20 @@ from nbs_pin.certificates.assumptions import (
     is_cut,
     jumps,
     listed,
+    looks_like,
     not_finite,
     noticeable,
     quantities,
     sentence,
+    stops,
     summed,
 )
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
+from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, storage_of
+from nbs_pin.certificates.glance import Glance, labels
+from nbs_pin.certificates.window_watch import UNEXPLAINED, WindowWatch
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +66,8 @@ class Monitored:
     """Whether the run records a disturbance; without one, MODEL and DISTURBANCE cannot be distinguished."""
     is_wrong: bool
     """Whether a bound was exceeded by more than the failed assumptions account for."""
+    suspects: tuple[str, ...] = ()
+    """From encoders: simple faults each of which would explain the torques of the last window with any."""
 
     @cached_property
     def exceeded(self) -> Bool[np.ndarray, " rows"]:
@@ -82,21 +89,26 @@ class Monitored:
         """One sentence: whether the bounds were kept, and which assumptions failed."""
         failed = {name: f" (t = {self.t[:-1][when][0]:.4g} s)" for name, when in self.failures.items()}
         at = "" if self.is_kept else f" at t = {self.t[self.exceeded][0]:.4g} s by {listed(tuple(self.excesses))}"
-        return sentence(at, self.is_kept, self.is_wrong, failed, is_recorded=self.is_recorded)
+        said = sentence(at, self.is_kept, self.is_wrong, failed, is_recorded=self.is_recorded)
+        return said + looks_like(self.suspects)
 
 
-def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
+def monitor(run: Run, certificate: Certificate, *, start: int = 0, encoders: Encoders | None = None) -> Monitored:
     """Check a run, simulated or logged, against a certificate of its controller.
 
-    The torque that the model does not explain is found from differences of v, so noise in a log counts as disturbance.
-    The certificate is called wrong (`is_wrong`) if V or an error exceeds its bound by more than the energy supplied by
-    inadmissible torques, whatever their cause, accounts for. The hold of the torque is reported if it has supplied more
-    than 1 % of the bound of V, or if a bound is exceeded. A number that is not finite breaks the promise.
+    The torque that the model does not explain is found from differences of v, so noise counts as disturbance unless
+    `encoders` states it. The certificate is called wrong (`is_wrong`) if V or an error exceeds its bound by more than
+    the energy supplied by inadmissible torques, whatever their cause, accounts for. The hold of the torque is reported
+    if it has supplied a noticeable share of the bound of V, or if a bound is exceeded. A number that is not finite
+    breaks the promise.
 
     Args:
         run: A run of the certified controller.
         certificate: From `certify`.
         start: Which start of a batched run.
+        encoders: How the positions in the run were measured; None for exact states, as `simulate` records them. The run
+            is then checked as by a `Watch` with these encoders, by means over a window, whose errors follow from the
+            encoder step (docs/certificates.md §12), and the recorded disturbance is not used.
 
     Raises:
         ArgumentError: If the run is of another arm or has less than two rows, or an argument has the wrong type.
@@ -112,8 +124,21 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
     """
     check_certificate(certificate)
     _check_run(run, certificate, start)
-    controller = certificate.controller
     at, recorded, lost, what = _without_gaps(run, start, certificate.joint_names)
+    if encoders is not None:
+        return _read(certificate, encoders, at, lost, what)
+    return _exact(certificate, at, recorded, lost, what)
+
+
+def _exact(
+    certificate: Certificate,
+    at: LoopSamples,
+    recorded: Float[np.ndarray, "rows n"],
+    lost: Bool[np.ndarray, " rows"],
+    what: str,
+) -> Monitored:
+    """The check of exact states; `lost` are the rows with `what`, a number that is not finite."""
+    controller = certificate.controller
     storage, z1 = storage_of(controller, at), controller.dynamics.difference(at.q, at.q_ref)
     flow = balance(controller, at.rows(slice(-1)), at.rows(slice(1, None)), np.diff(storage))
     promise, values = Promise(certificate, float(storage[0])), quantities(storage, z1)
@@ -121,10 +146,10 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
     over = promise.exceeded(values, bounds) & ~lost[:, None]
     setting, steps, decay = Setting.of(certificate, flow, at), np.diff(at.t), certificate.level.c
     held = summed(flow.held, steps, decay)[1:] > noticeable(certificate, steps) * bounds[1:, 0]
-    failed = _outside(failures(flow, setting, jumps(controller, at), held, bool(over.any()), recorded), lost)
+    jumped = jumps(controller, at) | stops(certificate, at)
+    failed = _outside(failures(flow, setting, jumped, held, bool(over.any()), recorded), lost)
     power, ratio = excess_of(flow, setting)
-    so_far = np.maximum.accumulate(np.concatenate([[1.0], ratio]))
-    accounted = promise.accounted(bounds, summed(power, steps, decay), so_far)
+    accounted = promise.accounted(bounds, summed(power, steps, decay), np.maximum.accumulate(np.append(1.0, ratio)))
     known = ~np.maximum.accumulate(lost)[:, None]  # a gap hides torques
     is_wrong = not any(name in failed for name in JUMPS) and bool((over & known & (values > accounted)).any())
     if over.any() and not failed and not is_wrong and not lost.any():
@@ -144,6 +169,48 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0) -> Monitored:
         failures=failed,
         is_recorded=bool(recorded.any()),
         is_wrong=is_wrong,
+    )
+
+
+def _read(
+    certificate: Certificate, encoders: Encoders, at: LoopSamples, lost: Bool[np.ndarray, " rows"], what: str
+) -> Monitored:
+    """The check of a run that was read from encoders; `lost` are the rows with `what`, a number that is not finite."""
+    way, samples, memory = WindowWatch(certificate, encoders), np.stack(at[1:], axis=1), None
+    rows, names, nothing = len(at.t), labels(certificate), np.full(certificate.controller.nv + 1, np.nan)
+    seen: list[Glance] = []
+    for k in range(rows):
+        if lost[k]:
+            memory = None if memory is None else way.lost(memory)
+            seen.append(Glance(np.nan, np.nan, nothing, nothing, (what,), False))
+            continue
+        glance, memory = (
+            way.begin(float(at.t[k]), samples[k]) if memory is None else way.step(memory, float(at.t[k]), samples[k])
+        )
+        seen.append(glance)
+    flow = balance(certificate.controller, at.rows(slice(-1)), at.rows(slice(1, None)), np.zeros(rows - 1))
+    failed = {name: np.array([name in x.failed for x in seen[1:]]) for name in Assumption}
+    excesses = {name: np.array([name in x.excesses for x in seen]) for name in (*names, *([what] if what else []))}
+    if any(x.excesses for x in seen) and not what and not any(when.any() for when in failed.values()):
+        failed |= {name: np.array([bool(x.excesses) for x in seen[1:]]) for name in UNEXPLAINED}
+    suspects = [x.suspects for x in seen if x.suspects]
+    errors, bounds = (np.array([getattr(x, name) for x in seen]) for name in ("errors", "bounds"))
+    return Monitored(
+        t=at.t,
+        storage=np.array([x.storage for x in seen]),
+        promise=np.array([x.promise for x in seen]),
+        error=errors[:, 0],
+        error_bound=bounds[:, 0],
+        joint_errors=errors[:, 1:],
+        joint_bounds=bounds[:, 1:],
+        joint_names=certificate.joint_names,
+        balance=flow,
+        saturated=is_cut(flow),
+        excesses={name: when for name, when in excesses.items() if when.any()},
+        failures={name: when for name, when in failed.items() if when.any()},
+        is_recorded=False,
+        is_wrong=any(x.is_wrong for x in seen),
+        suspects=suspects[-1] if suspects else (),
     )
 
 

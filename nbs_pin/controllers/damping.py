@@ -1,4 +1,4 @@
-"""The damping matrix D(z2): positive definite for every parameter value."""
+"""The damping matrix D(z2): between two constant matrices for every parameter value."""
 
 import math
 from collections.abc import Mapping
@@ -13,8 +13,9 @@ from torch import nn
 
 from nbs_pin.base.arrays import Array, Matrices, Vectors, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.intervals import OUTWARD, Interval
+from nbs_pin.base.intervals import OUTWARD, Interval, Numbers
 from nbs_pin.base.known_code import defines, known_code
+from nbs_pin.base.rounding import least_eigenvalue, up
 from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.base.tensors import positive_definite, positive_scale
 from nbs_pin.controllers.gain import Gain
@@ -22,19 +23,23 @@ from nbs_pin.kernels.layout import Packed, pack_damping
 
 DAMPINGS = ("bounded", "paper")
 _CELLS = 400  # subintervals of [−radius, radius]
+_FAR = 1e100  # radii beyond it count as unbounded
 
 
 def _stored(t: Tensors) -> Mapping[str, Any]:
     sizes = {"nv": len(t["scale"]), "scale": t["scale"], "widths": t.widths("diagonal.w")}
     if "floor.nominal" not in t:
         return sizes
-    return sizes | {"floor": t["floor.nominal"], "least_share": float(t["floor.least_share"])}
+    ceiling = float(t["ceiling"]) if "ceiling" in t else None
+    return sizes | {"floor": t["floor.nominal"], "least_share": float(t["floor.least_share"]), "ceiling": ceiling}
 
 
 @known_code
 @storable(("form", "m"), arrays=_stored)
 class Damping(nn.Module):
     """D(z) = D₀ + R T(Rz)ᵀT(Rz) R [N·m·s/rad], with T lower triangular from two tanh networks (docs/theory.md §4).
+
+    With a ceiling b the networks give T', and T = T'/√(1 + ‖T'‖_F²/b): then D₀ ⪯ D(z) ≺ D₀ + bR² for all their weights.
 
     Args:
         nv: Number of joints.
@@ -44,15 +49,17 @@ class Damping(nn.Module):
         m: Smallest diagonal entry of T, for "paper" only.
         widths: Hidden layer sizes of both networks.
         scale: Diagonal of R, (n,); None is 1.
+        ceiling: b, for "bounded" only; None leaves T as the networks give it, bounded by nothing but their weights.
         gain: Initial weights are drawn from U(−gain, gain).
         least_share: Training keeps D₀ at or above this share of its initial value (`Gain`).
 
     Raises:
-        ArgumentError: For an unknown form, a number out of range, or a floor that is missing or superfluous.
+        ArgumentError: For an unknown form, a number out of range, or a floor or ceiling that is missing or superfluous.
     """
 
     floor: Gain | None
     scale: torch.Tensor
+    ceiling: torch.Tensor | None
 
     def __init__(
         self,
@@ -63,6 +70,7 @@ class Damping(nn.Module):
         m: float = 0.001,
         widths: tuple[int, ...] = (32, 32),
         scale: Float[Array, " n"] | None = None,
+        ceiling: float | None = None,
         gain: float = 0.2,
         least_share: float = 0.5,
         seed: int = 0,
@@ -74,10 +82,15 @@ class Damping(nn.Module):
             raise ArgumentError(f"damping '{form}' was given floor {floor}; 'bounded' needs one, 'paper' has none.")
         if not m > 0.0:
             raise ArgumentError(f"m is {m}; give a positive number, the smallest diagonal entry of T.")
+        if ceiling is not None and (form == "paper" or not 0.0 < ceiling < math.inf):
+            raise ArgumentError(
+                f"damping '{form}' was given ceiling {ceiling}; give 'bounded' a positive number or None."
+            )
         self.form, self.m = form, m
         d0 = None if floor is None else positive_definite("the floor D₀", floor)
         self.floor = None if d0 is None else Gain(d0, least_share=least_share, name="the floor D₀")
         self.register_buffer("scale", positive_scale("the scale R", scale, nv))
+        self.register_buffer("ceiling", None if ceiling is None else torch.tensor(ceiling, dtype=torch.float64))
         self._diagonal_index = np.arange(nv)
         self._lower_index = np.tril_indices(nv, -1)
         with torch.random.fork_rng(devices=[]):
@@ -99,7 +112,10 @@ class Damping(nn.Module):
         t = xp.zeros((*x.shape, self.nv), dtype=x.dtype, device=device(x))
         t[..., self._diagonal_index, self._diagonal_index] = diagonal
         t[..., *self._lower_index] = self.lower.output(x)
-        return t
+        if self.ceiling is None:
+            return t
+        ceiling = self.ceiling if is_torch_array(x) else float(self.ceiling)
+        return t / xp.sqrt(1.0 + xp.sum(t * t, axis=(-2, -1), keepdims=True) / ceiling)
 
     def matrix(self, z: Vectors) -> Matrices:
         """D(z)."""
@@ -115,6 +131,15 @@ class Damping(nn.Module):
         return matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
 
     @property
+    def stretch(self) -> float:
+        """r with R² ⪯ rD₀, rounded up: the largest eigenvalue of D₀^−½R²D₀^−½; inf if there is no D₀."""
+        if self.floor is None:
+            return math.inf
+        d0, r = self._constants(numpy=True)
+        least = least_eigenvalue(d0 / r / r[:, None])
+        return up(1.0 / least) if least > 0.0 else math.inf
+
+    @property
     def is_packable(self) -> bool:
         """Whether the kernels implement all parts; False for a subclass."""
         return defines(self, "packed") and all(defines(network, "layers") for network in (self.diagonal, self.lower))
@@ -123,7 +148,7 @@ class Damping(nn.Module):
         """Weights for the kernel of `force` (`kernels/damping.py`), as an array or a differentiable tensor."""
         networks = self.diagonal.layers(numpy=numpy), self.lower.layers(numpy=numpy)
         d0, r = self._constants(numpy=numpy)
-        return pack_damping(networks, self.form, self.m, r, d0)
+        return pack_damping(networks, self.form, self.m, r, d0, None if self.ceiling is None else float(self.ceiling))
 
     def excess(self, radius: float) -> Interval:
         """Bounds of T(z)² for |z| ≤ radius [rad/s], for one joint [N·m·s/rad], by interval arithmetic."""
@@ -133,7 +158,29 @@ class Damping(nn.Module):
         for i, (weight, bias) in enumerate(layers):
             x = x.through(weight) + bias[:, None]
             x = Interval(np.tanh(x.low), np.tanh(x.high)) if i < len(layers) - 1 else x
-        return x.squared().hull().times(scale * scale).widened(OUTWARD)
+        square = x.squared().hull()
+        limited = Interval(self._limited(square.low), self._limited(square.high))
+        return limited.times(scale * scale).widened(OUTWARD)
+
+    def share(self, radius: float) -> float:
+        """n with D(z) ⪯ (1 + n) D₀ while zᵀD₀z ≤ radius² [W], for the present weights; inf if there is no D₀.
+
+        With r of `stretch`: D − D₀ ⪯ ‖T‖_F² R² ⪯ r‖T‖_F² D₀, and ‖Rz‖ ≤ √r radius (docs/theory.md §4).
+        """
+        stretch = self.stretch
+        if math.isinf(stretch):
+            return math.inf
+        reached = up(radius * math.sqrt(stretch))
+        square = self.diagonal.largest_square(reached) + self.lower.largest_square(reached)
+        return up(float(self._limited(np.float64(up(square)))) * stretch)
+
+    def _limited(self, square: Numbers) -> Numbers:
+        """‖T‖_F² from that of the networks' T', which it does not exceed, and increases with."""
+        if self.ceiling is None:
+            return square
+        ceiling, finite = float(self.ceiling), np.isfinite(square)
+        kept = np.where(finite, square, 0.0)
+        return np.where(finite, kept / (1.0 + kept / ceiling), ceiling)[()]
 
     def slope(self) -> float:
         """ℓ with xᵀ(D(z) − D₀)x ≤ ℓ² (zᵀD₀z)(xᵀD₀x): inf where T(0) ≠ 0 or there is no D₀.
@@ -181,3 +228,28 @@ class _FCNN(nn.Module):
             x = x @ weight.T + bias
             x = xp.tanh(x) if i < self.depth - 1 else x
         return x
+
+    def largest_square(self, radius: float) -> float:
+        """An upper bound of ‖output(x)‖² over ‖x‖ ≤ radius, for the present weights; inf if none is known.
+
+        Layer by layer it bounds what x changes of the outputs at x = 0, each output's change and the norm of all:
+        |Δ(Wh)_j| ≤ Σ_k |w_jk||Δh_k| and ≤ ‖w_j‖‖Δh‖, ‖Δ(Wh)‖ ≤ ‖W‖‖Δh‖, |Δtanh a| ≤ |Δa| and ≤ 1 + |tanh a|. Rounding
+        errors of the outputs at 0 count as changes.
+        """
+        eps, layers, norm = float(np.finfo(float).eps), self.layers(numpy=True), radius if radius < _FAR else math.inf
+        value, change = np.zeros(layers[0][0].shape[1]), np.full(layers[0][0].shape[1], norm)
+        for i, (weight, bias) in enumerate(layers):
+            rounding = (len(value) + 2) * eps * (np.abs(weight) @ np.abs(value) + np.abs(bias))
+            if math.isinf(norm):
+                change = np.full(len(bias), norm)
+            else:
+                change = np.minimum(np.abs(weight) @ change, np.linalg.norm(weight, axis=1) * norm) + rounding
+                norm *= float(np.linalg.svd(weight, compute_uv=False).max(initial=0.0))
+                norm = min(norm + float(np.linalg.norm(rounding)), float(np.linalg.norm(change)))
+            value = weight @ value + bias
+            if i < self.depth - 1:
+                value = np.tanh(value)
+                change = np.minimum(change, 1.0 + np.abs(value)) + 4.0 * eps
+                norm = min(norm + 4.0 * eps * math.sqrt(len(value)), float(np.linalg.norm(change)))
+        square = min(float(((np.abs(value) + change) ** 2).sum()), (float(np.linalg.norm(value)) + norm) ** 2)
+        return square if square < math.inf else math.inf

@@ -83,8 +83,8 @@ def falsify_potential(phi: Potential, s: Float[np.ndarray, "n n"], *, exact: boo
         refuse("∇²Φ dz of the potential is not the derivative of ∇Φ", "correct `terms`")
 
 
-def falsify_damping(damping: Damping, floor: Float[np.ndarray, "n n"]) -> float:
-    """λ_min(D) over sampled z2; raises CertificateRefused if D ⪰ D₀ fails or the force differs from D z2."""
+def falsify_damping(damping: Damping, floor: Float[np.ndarray, "n n"], share: float = np.inf) -> float:
+    """λ_min(D) over sampled z2; raises CertificateRefused if D₀ ⪯ D ⪯ (1 + share)D₀ fails or the force is not D z2."""
     rng = np.random.default_rng(1)
     z = np.concatenate([size * rng.normal(size=(_STATES, damping.nv)) for size in _SIZES])
     d, force = damping.matrix(z), damping.force(z)
@@ -94,6 +94,11 @@ def falsify_damping(damping: Damping, floor: Float[np.ndarray, "n n"]) -> float:
     least = np.linalg.eigvalsh(d - floor)[:, 0]
     off = np.abs(matvec(d, z) - force).max(axis=-1) > 1e-9 * size * np.abs(z).sum(axis=-1)
     bad = (least < -1e-10 * size) | off | (np.abs(d - d.mT).max(axis=(-2, -1)) > 1e-10 * size)
+    if np.isfinite(share):
+        high = np.linalg.eigvalsh(d - (1.0 + share) * floor)[:, -1] > 1e-10 * size
+        if high.any():
+            at = np.round(z[int(high.argmax())], 3).tolist()
+            refuse(f"D exceeds {1.0 + share:.3g} D₀, which its ceiling states, at z2 = {at}", "correct `factor`")
     if bad.any():
         at = np.round(z[int(bad.argmax())], 3).tolist()
         refuse(f"D is not symmetric with D ⪰ D₀, or its force is not D z2, at z2 = {at}", "correct `matrix` or `force`")

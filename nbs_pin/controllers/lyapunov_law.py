@@ -134,6 +134,10 @@ class LyapunovLaw(ModelLaw):
         """For one joint: bounds of D − D₀ [N·m·s/rad] for |z2| ≤ radius [rad/s]; [0, ∞) unless overridden."""
         return Interval(np.float64(0.0), np.float64(np.inf))
 
+    def damping_share(self, radius: float) -> float:
+        """n with D(z2) ⪯ (1 + n) D₀ while z2ᵀD₀z2 ≤ radius² [W], D₀ that of `lyapunov`; inf unless overridden."""
+        return np.inf
+
     def _errors(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Errors:
         rate, z1 = self.rate_like(q), self.dynamics.difference(q, q_ref)
         value, gradient, gradient_rate = self.potential_terms(z1, v - v_ref)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, as_vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
-from nbs_pin.base.known_code import known_code
+from nbs_pin.base.known_code import first_foreign, known_code
 from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.base.tensors import positive_scale
 from nbs_pin.controllers.damping import Damping
@@ -95,6 +95,7 @@ class NeuralBackstepping(LyapunovLaw):
         damping: str = "inertial",
         friction: JointFriction | None = None,
         gains: Gains | None = None,
+        damping_ceiling: float | None = 1.0,
         least_share: float = 0.5,
         seed: int = 0,
     ) -> "NeuralBackstepping":
@@ -109,6 +110,7 @@ class NeuralBackstepping(LyapunovLaw):
             damping: "inertial" (ωM + D₀ + TᵀT), "bounded" (D₀ + TᵀT) or "paper" (TᵀT).
             friction: Joint friction to feed forward, or None.
             gains: K, Λ and D₀; None computes them (`gains_for_robot`).
+            damping_ceiling: b, with TᵀT ≺ bD₀ for all weights of T and the initial D₀; None is without, as is "paper".
             least_share: Training keeps S, Λ and D₀ at or above this share of their initial values (`Gain`).
             seed: Seed of the initial network weights.
 
@@ -131,8 +133,14 @@ class NeuralBackstepping(LyapunovLaw):
         if damping == "paper":
             d = Damping(robot.nv, form="paper", m=1.0, scale=np.sqrt(chosen.damping), seed=seed + 1)
         else:
-            floor, scale = np.diag(chosen.damping), np.sqrt(chosen.damping)
-            d = Damping(robot.nv, floor=floor, scale=scale, least_share=least_share, seed=seed + 1)
+            d = Damping(
+                robot.nv,
+                floor=np.diag(chosen.damping),
+                scale=np.sqrt(chosen.damping),
+                ceiling=damping_ceiling,
+                least_share=least_share,
+                seed=seed + 1,
+            )
         omega = chosen.bandwidth if damping == "inertial" else 0.0
         return cls(dynamics, phi, d, rate=chosen.rate, inertial_rate=omega, friction=friction, least_share=least_share)
 
@@ -146,7 +154,7 @@ class NeuralBackstepping(LyapunovLaw):
             >>> import nbs_pin as nbs
             >>> law, zero = nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link")), [0.0, 0.0]
             >>> law.torque(zero, zero, [0.1, 0.1], zero, zero).round(1)
-            array([141.9,  79.6])
+            array([141.8,  79.6])
         """
         q, v, q_ref, v_ref, a_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref, a_ref=a_ref)
         e = self._errors(q, v, q_ref, v_ref, a_ref)
@@ -191,6 +199,12 @@ class NeuralBackstepping(LyapunovLaw):
     def extra_damping(self, radius: float) -> Interval:
         """Bounds of T² for one joint [N·m·s/rad]."""
         return super().extra_damping(radius) if self.damping.floor is None else self.damping.excess(radius)
+
+    def damping_share(self, radius: float) -> float:
+        """`Damping.share`, below the ceiling if it has one; inf if D has no floor, or its code is not known."""
+        d = self.damping
+        foreign = first_foreign((d, d.diagonal, d.lower, d.floor))
+        return super().damping_share(radius) if foreign else d.share(radius)
 
     def lyapunov(self) -> Lyapunov:
         """S, Λ, D₀ and ω, with claims for ψ, Φ, D, Λ, ω and the friction feed-forward."""

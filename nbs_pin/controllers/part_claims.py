@@ -12,7 +12,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import Array, JointArray, is_torch_array
 from nbs_pin.base.claims import Claim, Known, Label, known, refuse
 from nbs_pin.base.known_code import first_foreign, foreign_code
-from nbs_pin.base.rounding import least_eigenvalue
+from nbs_pin.base.rounding import least_eigenvalue, up
 from nbs_pin.controllers.activations import Activation
 from nbs_pin.controllers.damping import DAMPINGS, Damping
 from nbs_pin.controllers.falsification import SAMPLES, falsify_activation, falsify_damping, falsify_potential
@@ -22,6 +22,10 @@ from nbs_pin.dynamics.friction import JointFriction
 
 DAMPING = "D ⪰ D₀, least eigenvalue"
 """Name of the claim whose value is the largest known d with D ⪰ dI."""
+
+
+CEILING = "D ⪯ (1 + n)D₀, n"
+"""Name of the claim of a damping with a ceiling."""
 
 
 def potential_claims(phi: Potential, rate: Gain) -> tuple[Claim, ...]:
@@ -47,7 +51,7 @@ def potential_claims(phi: Potential, rate: Gain) -> tuple[Claim, ...]:
 
 
 def damping_claims(damping: Damping) -> tuple[Claim, ...]:
-    """Claims: D ⪰ D₀, or lower bounds on D = TᵀT without a floor."""
+    """Claims: D ⪰ D₀ and, with a ceiling, D ⪯ (1 + n)D₀; or lower bounds on D = TᵀT without a floor."""
     if damping.form not in DAMPINGS:
         refuse(f"the damping has the form {damping.form!r}", f"choose one of {', '.join(DAMPINGS)}")
     _scale("D", damping.scale.numpy(force=True))
@@ -55,9 +59,14 @@ def damping_claims(damping: Damping) -> tuple[Claim, ...]:
     n, why = damping.nv, foreign_code(damping) or first_foreign(networks)
     if damping.floor is not None:
         floor, odd = positive_gain("the floor D₀", damping.floor, n, 2)
-        falsify_damping(damping, floor)
+        share = _ceiling(damping)
+        falsify_damping(damping, floor, share)
         least = least_eigenvalue(floor)
-        return (Claim(DAMPING, least, "N·m·s/rad", *known(why or odd, "D = D₀ + TᵀT ⪰ D₀ for every weight of T")),)
+        claims = [Claim(DAMPING, least, "N·m·s/rad", *known(why or odd, "D = D₀ + TᵀT ⪰ D₀ for every weight of T"))]
+        if damping.ceiling is not None:
+            said = f"D = D₀ + R TᵀT R with ‖T‖_F² < {float(damping.ceiling):g} for every weight of T"
+            claims.append(Claim(CEILING, share, "", *known(why or odd, said)))
+        return tuple(claims)
     if damping.form != "paper" or not 0.0 < damping.m < np.inf:
         refuse(f"D = TᵀT has no floor D₀, and m is {damping.m}", "it may be singular: take damping 'bounded'")
     measured = falsify_damping(damping, np.zeros((n, n)))
@@ -125,6 +134,15 @@ def positive_gain(name: str, gain: Gain, n: int, axes: int) -> tuple[Float[np.nd
     if not least > 0.0:
         refuse(f"{name} has the eigenvalue {least:.3g} or less", "it must be positive definite")
     return value, foreign_code(gain)
+
+
+def _ceiling(damping: Damping) -> float:
+    """n with D ⪯ (1 + n)D₀ by the ceiling, inf without one; raises CertificateRefused if it is out of range."""
+    if damping.ceiling is None:
+        return np.inf
+    if damping.ceiling.shape != () or not 0.0 < float(damping.ceiling) < np.inf:
+        refuse(f"the ceiling of D is {damping.ceiling.tolist()}", "it must be a positive number")
+    return up(float(damping.ceiling) * damping.stretch)
 
 
 def _scale(name: str, scale: JointArray) -> None:

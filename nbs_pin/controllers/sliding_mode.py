@@ -10,6 +10,7 @@ from nbs_pin.base.arrays import Array, Matrices, Vectors, array_namespace, as_ve
 from nbs_pin.base.claims import Claim, known, refuse
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import foreign_code, known_code
+from nbs_pin.base.rounding import up
 from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, effective_inertia, positive_gains, stored_gains
 from nbs_pin.controllers.lyapunov_law import Lyapunov
@@ -107,6 +108,11 @@ class SlidingMode(SlotineLi):
     def extra_damping(self, radius: float) -> Interval:
         """Bounds of η tanh(z2/ε)/z2 for one joint; the largest value is η/ε, at 0."""
         return Interval(np.float64(0.0), np.float64(self.switching.numpy("switching")[0] / self.boundary[0]))
+
+    def damping_share(self, radius: float) -> float:
+        """The largest η/(εK): η tanh(x/ε)/x ≤ η/ε, with equality at 0, whatever the radius."""
+        gain = np.asarray(self.gains.named("gain").numpy())
+        return up(float((self.switching.numpy("switching") / (self.boundary * gain)).max()))
 
     def lyapunov(self) -> Lyapunov:
         """Constants and claims of `SlotineLi`, with a claim for the switching term."""

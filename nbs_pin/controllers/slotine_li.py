@@ -131,6 +131,10 @@ class SlotineLi(LyapunovLaw):
         """0: D is constant."""
         return Interval.of(np.float64(0.0))
 
+    def damping_share(self, radius: float) -> float:
+        """0: D is constant, D₀ = K."""
+        return 0.0
+
     def lyapunov(self) -> Lyapunov:
         """S = λK, Λ = ½K⁻¹, D₀ = K, with claims for both gains and the friction feed-forward."""
         check_parts(self.nv, {name: len(self.gains.named(name).nominal) for name in ("rate", "gain")}, self.friction)

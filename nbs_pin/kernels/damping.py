@@ -1,7 +1,8 @@
 """The damping force of one velocity error: two tanh networks and the products with T; and its adjoint.
 
-What s = f̄ᵀD(z)z gains, with x = Rz and y = Rf̄:  s = f̄ᵀD₀z + (Ty)ᵀ(Tx), so T̄ = (Ty)xᵀ + (Tx)yᵀ on and below the
-diagonal, x̄ = Tᵀ(Ty) and ȳ = Tᵀ(Tx) for T held still; T̄ then goes back through the two tanh networks.
+What s = f̄ᵀD(z)z gains, with x = Rz, y = Rf̄, and c = 1/(1 + ‖T‖_F²/b) for a ceiling b, 1 without:
+s = f̄ᵀD₀z + c(Ty)ᵀ(Tx), so x̄ = cTᵀ(Ty) and ȳ = cTᵀ(Tx) for T held still, and T̄ = c((Ty)xᵀ + (Tx)yᵀ) − 2(c²/b)(Ty)ᵀ(Tx)T
+on and below the diagonal; T̄ then goes back through the two tanh networks.
 """
 
 import math
@@ -71,7 +72,7 @@ def diagonal_of(code: int, m: float, x: float) -> tuple[float, float]:
 
 @kernel
 def damping_force(z: Vec, part: Packed, work: Vec, force: Vec) -> None:
-    """D(z) z = D₀z + R TᵀT Rz [N·m] → force."""
+    """D(z) z = D₀z + cR TᵀT Rz [N·m] → force."""
     d = damping_of(part)
     n = d.n
     x, diagonal, work = take2(work, n)
@@ -82,18 +83,21 @@ def damping_force(z: Vec, part: Packed, work: Vec, force: Vec) -> None:
     for i in range(n):
         diagonal[i], _ = diagonal_of(d.code, d.m[0], out[i])
     tanh_network(d.depth, part, x, False, h, out)
-    force[:], at = 0.0, 0
+    force[:], at, square = 0.0, 0, 0.0
     for i in range(n):  # Tᵀ(T x), with row i of T below the diagonal in out[at : at + i]
         tx = diagonal[i] * x[i]
+        square += diagonal[i] * diagonal[i]
         for j in range(i):
             tx += out[at + j] * x[j]
+            square += out[at + j] * out[at + j]
         force[i] += diagonal[i] * tx
         for j in range(i):
             force[j] += out[at + j] * tx
         at += i
+    share = 1.0 / (1.0 + square * d.inverse_ceiling[0])
     times(d.floor, z, x)
     for i in range(n):
-        force[i] = x[i] + d.scale[i] * force[i]
+        force[i] = x[i] + d.scale[i] * (share * force[i])
 
 
 @kernel
@@ -125,28 +129,47 @@ def tanh_reverse(first: int, part: Packed, tape: Vec, out_bar: Vec, h_bar: Vec, 
 
 
 @kernel
-def factor_adjoint(x: Vec, y: Vec, diagonal: Vec, lower: Vec, x_bar: Vec, y_bar: Vec) -> None:
-    """Tᵀ(Ty) → x_bar, Tᵀ(Tx) → y_bar, and T̄ in place of T: its diagonal, and its rows below it end to end."""
+def limit_of(x: Vec, y: Vec, diagonal: Vec, lower: Vec, inverse_ceiling: float) -> tuple[float, float]:
+    """c = 1/(1 + ‖T‖_F²/b), and 2(c²/b)(Ty)ᵀ(Tx); T is its diagonal, and its rows below it end to end."""
+    at, square, product = 0, 0.0, 0.0
+    for i in range(len(x)):
+        tx, ty = diagonal[i] * x[i], diagonal[i] * y[i]
+        square += diagonal[i] * diagonal[i]
+        for j in range(i):
+            tx += lower[at + j] * x[j]
+            ty += lower[at + j] * y[j]
+            square += lower[at + j] * lower[at + j]
+        product += tx * ty
+        at += i
+    share = 1.0 / (1.0 + square * inverse_ceiling)
+    return share, 2.0 * share * share * inverse_ceiling * product
+
+
+@kernel
+def factor_adjoint(x: Vec, y: Vec, diagonal: Vec, lower: Vec, inverse_ceiling: float, x_bar: Vec, y_bar: Vec) -> None:
+    """cTᵀ(Ty) → x_bar, cTᵀ(Tx) → y_bar, and T̄ in place of T: its diagonal, and its rows below it end to end."""
     n, at = len(x), 0
+    share, drag = limit_of(x, y, diagonal, lower, inverse_ceiling)
     x_bar[:], y_bar[:] = 0.0, 0.0
     for i in range(n):
         tx, ty = diagonal[i] * x[i], diagonal[i] * y[i]
         for j in range(i):
             tx += lower[at + j] * x[j]
             ty += lower[at + j] * y[j]
+        tx, ty = share * tx, share * ty
         x_bar[i] += diagonal[i] * ty
         y_bar[i] += diagonal[i] * tx
-        diagonal[i] = ty * x[i] + tx * y[i]
+        diagonal[i] = ty * x[i] + tx * y[i] - drag * diagonal[i]
         for j in range(i):
             x_bar[j] += lower[at + j] * ty
             y_bar[j] += lower[at + j] * tx
-            lower[at + j] = ty * x[j] + tx * y[j]
+            lower[at + j] = ty * x[j] + tx * y[j] - drag * lower[at + j]
         at += i
 
 
 @kernel
 def damping_adjoint(z: Vec, force_bar: Vec, part: Packed, work: Vec, z_bar: Vec, weights_bar: Vec) -> None:
-    """Add the gradient of force_barᵀD(z)z by z and by the weights of the damping; m gets none."""
+    """Add the gradient of force_barᵀD(z)z by z and by the weights of the damping; m and the ceiling get none."""
     part_bar = Packed(part.layout, weights_bar)
     d, d_bar = damping_of(part), damping_of(part_bar)
     n = d.n
@@ -159,7 +182,7 @@ def damping_adjoint(z: Vec, force_bar: Vec, part: Packed, work: Vec, z_bar: Vec,
     used += tanh_network(d.depth, part, x, True, tapes[used:], lower)
     for i in range(n):
         diagonal[i], upper[i] = diagonal_of(d.code, d.m[0], upper[i])
-    factor_adjoint(x, y, diagonal, lower, x_bar, y_bar)
+    factor_adjoint(x, y, diagonal, lower, d.inverse_ceiling[0], x_bar, y_bar)
     for i in range(n):
         upper[i] *= diagonal[i]
     used = tanh_reverse(d.depth, part, tapes[:used], lower, h_bar, part_bar)

@@ -11,7 +11,7 @@ a multiple of 8 numbers:
     potential weights    activation parameter, f(0), R (n), ∇f(0) (n), 2S (n, n), layers
     damping layout       n, depth, form, widest row or column, then per layer of the diagonal network and then of the
                          lower one: size, row length, offset
-    damping weights      m, R (n), D₀ (n, n), layers
+    damping weights      m, 1/ceiling, R (n), D₀ (n, n), layers
     law layout           law, n, 1 with friction, start of the potential in the layout and in the weights, the same of
                          the damping, numbers of scratch space
     law weights          continuous (n), first gain (n), second gain (n), viscous (n), coulomb (n), transition, ω,
@@ -112,8 +112,10 @@ def pack_potential(
     return assembled([len(scale), len(layers), code], head, matrices)
 
 
-def pack_damping(networks: tuple[Layers, Layers], form: int | str, m: float, scale: Array, floor: Array) -> Packed:
-    """D(z) = D₀ + R TᵀT R, all in the kind of R.
+def pack_damping(
+    networks: tuple[Layers, Layers], form: int | str, m: float, scale: Array, floor: Array, ceiling: float | None = None
+) -> Packed:
+    """D(z) = D₀ + R TᵀT R / (1 + ‖T‖_F²/ceiling), all in the kind of R.
 
     Args:
         networks: layers (W, b) of T's diagonal and of its rows below the diagonal, input to output; as many in both.
@@ -121,13 +123,14 @@ def pack_damping(networks: tuple[Layers, Layers], form: int | str, m: float, sca
         m: smallest diagonal entry of T in the paper's form.
         scale: the diagonal R, (n,).
         floor: D₀, (n, n) [N·m·s/rad].
+        ceiling: what TᵀT / (1 + ‖T‖_F²/ceiling) stays below, positive; None divides by 1.
 
     Raises:
         ArgumentError: for a form that no kernel knows.
     """
     code = known(form, DampingCode, "form of a damping")
     matrices = [padded(weight, bias) for network in networks for weight, bias in network]
-    head = [_vector(scale, m), scale, floor.ravel()]
+    head = [_vector(scale, m, 0.0 if ceiling is None else 1.0 / ceiling), scale, floor.ravel()]
     return assembled([len(scale), len(networks[0]), code], head, matrices)
 
 

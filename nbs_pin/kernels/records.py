@@ -22,8 +22,8 @@ Memory = namedtuple("Memory", "integral derivative")
 """What a PID remembers: integral torque [N·m] and filtered ż1 [rad/s]; or the cotangents of that."""
 Potential = namedtuple("Potential", "n depth code widest parameter value scale tangent stiffness")
 """A packed potential before its layers: integers, σ's parameter and f(0) (1,), R, ∇f(0), and the rows of 2S."""
-Damping = namedtuple("Damping", "n depth code widest m scale floor")
-"""A packed damping before its layers: integers, m (1,), R, and the rows of D₀."""
+Damping = namedtuple("Damping", "n depth code widest m inverse_ceiling scale floor")
+"""A packed damping before its layers: integers, m and 1/ceiling (1,), R, and the rows of D₀."""
 Motion = namedtuple("Motion", "q v w a")
 """What the torque M(q) a + C(q, v) w + G(q) of a tree depends on; or the cotangents of that."""
 PID = namedtuple("PID", "kp ki kd limit filter_time wraps")

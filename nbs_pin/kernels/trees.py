@@ -97,7 +97,7 @@ def tree_torque_adjoint(motion: Motion, mu: Vec, tree: Packed, work: Vec, motion
 
 
 @kernel
-def _mass(tree: Packed, work: Vec, mass: Mat) -> None:
+def tree_mass(tree: Packed, work: Vec, mass: Mat) -> None:
     """The lower triangle of M(q) from R and p in work, by composite bodies: column i is the load of a unit a_i."""
     n = tree.layout[TREE_SIZE]
     for i in range(n):
@@ -165,7 +165,7 @@ def tree_acceleration(state: State, tau: Vec, tree: Packed, work: Vec, factor: M
     gather(a, tree, work, a)
     for i in range(len(a)):
         a[i] = tau[i] - a[i]
-    _mass(tree, work, factor)
+    tree_mass(tree, work, factor)
     _factorise(factor)
     _solve(factor, a)
 

@@ -82,7 +82,8 @@ def damping_of(packed: Packed) -> Damping:
     """The damping, or with cotangents for weights those of its weights."""
     layout, w, n = packed.layout, packed.weights, packed.layout[at.SIZE]
     head = n, layout[at.DEPTH], layout[at.CODE], layout[at.WIDEST]
-    return Damping(*head, w[:1], w[1 : 1 + n], w[1 + n : 1 + n + n * n])
+    scale, rest = take(w[2:], n)
+    return Damping(*head, w[:1], w[1:2], scale, rest[: n * n])
 
 
 @inlined

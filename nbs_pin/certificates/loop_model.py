@@ -1,0 +1,149 @@
+"""Law and model as a monitor evaluates them at readings of encoders: as machine code where there are kernels."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.certificates.energy_balance import LoopSamples, balance
+from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.dynamics.equations import inverse_dynamics
+from nbs_pin.kernels import periods, watching as at
+from nbs_pin.kernels.laws import pack_tree_law
+from nbs_pin.kernels.layout import LAW, LawCode
+from nbs_pin.kernels.periods import compile_periods
+from nbs_pin.kernels.watching import compile_watching
+
+
+class LoopModel(ABC):
+    """The signals of three samples, and V at the means of a window (`kernels/watching.py`)."""
+
+    @staticmethod
+    def of(controller: LyapunovLaw) -> "LoopModel":
+        """Machine code if the law and its model have kernels, else the law itself."""
+        tree = controller.dynamics.packed_tree()
+        if tree is None or not controller.packable:
+            return PlainModel(controller)
+        law = controller.packed_law()
+        return CompiledModel(controller) if law.layout[LAW] == LawCode.BACKSTEPPING else PlainModel(controller)
+
+    @abstractmethod
+    def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
+        """V [J]."""
+
+    @abstractmethod
+    def period(
+        self, before: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float, last: float
+    ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
+        """The energy balance between two samples h [s] apart (`periods.period_terms`); last: V of the first [J]."""
+
+    @abstractmethod
+    def observe(self, samples: Float[np.ndarray, "3 7 n"], period: float) -> Float[np.ndarray, "8 n"]:
+        """The signals of the middle sample; they are `period` [s] apart."""
+
+    @abstractmethod
+    def centre(
+        self, mean: Float[np.ndarray, "8 n"], q: JointArray, resolution: JointArray, width: float
+    ) -> tuple[Float[np.ndarray, "4"], JointArray]:
+        """Φ, its error, ½z̄2ᵀM z̄2, ½δᵀ|M|δ [J], and |M|r [kg·m²·rad].
+
+        q: the reading at the centre of the window [rad]; width: half its length [s].
+        """
+
+
+class CompiledModel(LoopModel):
+    """A backstepping law on a rigid tree."""
+
+    def __init__(self, controller: LyapunovLaw) -> None:
+        compile_watching()
+        compile_periods()
+        law, tree = controller.packed_law(), controller.dynamics.packed_tree()
+        assert tree is not None
+        self._packed = (*pack_tree_law(law, tree), np.empty(at.watch_workspace(law, tree)))
+        self._n = controller.nv
+
+    def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
+        """As in `LoopModel`."""
+        return float(periods.storage(sample, *self._packed))
+
+    def period(
+        self, before: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float, last: float
+    ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
+        """As in `LoopModel`."""
+        terms, vectors = np.empty(periods.TERMS), np.empty((periods.VECTORS, self._n))
+        periods.period_terms(before, after, h, last, *self._packed, terms, vectors)
+        return terms, vectors
+
+    def observe(self, samples: Float[np.ndarray, "3 7 n"], period: float) -> Float[np.ndarray, "8 n"]:
+        """As in `LoopModel`."""
+        out = np.empty((at.SIGNALS, self._n))
+        at.observe(samples, period, *self._packed, out)
+        return out
+
+    def centre(
+        self, mean: Float[np.ndarray, "8 n"], q: JointArray, resolution: JointArray, width: float
+    ) -> tuple[Float[np.ndarray, "4"], JointArray]:
+        """As in `LoopModel`."""
+        out, share = np.empty(at.CENTRE), np.empty(self._n)
+        at.centre(mean, q, resolution, width, *self._packed, out, share)
+        return out, share
+
+
+class PlainModel(LoopModel):
+    """Any law with any model, as it is written."""
+
+    def __init__(self, controller: LyapunovLaw) -> None:
+        self._law = controller
+        compiled = controller.compile()
+        self._quick = compiled if isinstance(compiled, MemorylessController) else controller
+        self._torque = self._quick.torque
+
+    def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
+        """As in `LoopModel`."""
+        return float(self._law.storage(*sample[at.Q : at.V_REF + 1]))
+
+    def period(
+        self, before: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float, last: float
+    ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
+        """As in `LoopModel`."""
+        value, t = self.storage(after), np.array([0.0, h])
+        first, second = (LoopSamples(t[k : k + 1], *x[:, None]) for k, x in enumerate((before, after)))
+        flow = balance(self._law, first, second, np.array([value - last]), self._quick)
+        numbers = (x[0] for x in flow[:6])
+        return np.array([value, *numbers, *flow.state_norms[0]]), np.concatenate(flow[6:10])
+
+    def observe(self, samples: Float[np.ndarray, "3 7 n"], period: float) -> Float[np.ndarray, "8 n"]:
+        """As in `LoopModel`."""
+        law, now = self._law, samples[1]
+        ahead = law.dynamics.difference(samples[2, at.Q], now[at.Q])
+        behind = law.dynamics.difference(now[at.Q], samples[0, at.Q])
+        v, a = 0.5 * (ahead + behind) / period, (ahead - behind) / period**2
+        torque = 0.5 * (samples[0, at.TAU] + now[at.TAU])
+        asked = self._torque(now[at.Q], now[at.V], now[at.Q_REF], now[at.V_REF], now[at.A_REF])
+        lag = now[at.COMMAND] - np.clip(
+            now[at.COMMAND], *np.sort([asked, self._ahead(now, samples[2], period)], axis=0)
+        )
+        e = law.errors(now[at.Q], v, now[at.Q_REF], now[at.V_REF], now[at.A_REF])
+        unexplained = inverse_dynamics(law.dynamics, now[at.Q], v, a) - torque
+        return np.array([unexplained, torque, lag, asked, e.z1, e.z2, v, now[at.Q]])
+
+    def _ahead(self, now: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float) -> JointArray:
+        """The law a period ahead, at the state predicted with the reference's acceleration [N·m]."""
+        q, v, q_ref, v_ref, a = now[at.Q : at.A_REF + 1]
+        ahead = (x + h * (rate + 0.5 * h * a) for x, rate in ((q, v), (q_ref, v_ref)))
+        q, q_ref = ahead
+        return np.asarray(self._torque(q, v + h * a, q_ref, v_ref + h * a, after[at.A_REF]))
+
+    def centre(
+        self, mean: Float[np.ndarray, "8 n"], q: JointArray, resolution: JointArray, width: float
+    ) -> tuple[Float[np.ndarray, "4"], JointArray]:
+        """As in `LoopModel`."""
+        value, gradient, bend = self._law.potential_terms(mean[at.Z1], 0.5 * resolution)
+        error = resolution / width + self._law.rate_like(q) * np.abs(bend)
+        out, share = np.empty(at.CENTRE), np.empty(len(q))
+        mass = np.ascontiguousarray(self._law.dynamics.mass_matrix(q))
+        at.settle(mean[at.Z2], mass, np.ascontiguousarray(gradient), error, resolution, out, share)
+        out[at.PHI] = value
+        return out, share

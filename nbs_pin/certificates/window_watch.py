@@ -1,0 +1,211 @@
+"""Check of a closed loop whose state is read from encoders, one control instant after the other.
+
+Torques are compared as means over a window: an admissible disturbance keeps its mean in the box whatever it does, and
+readings tell the mean to within a bound that follows from the encoder step (docs/certificates.md §12).
+"""
+
+import math
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.certificates.assumptions import ROUNDING
+from nbs_pin.certificates.certificate import Certificate
+from nbs_pin.certificates.claims import Assumption
+from nbs_pin.certificates.encoders import Encoders, Limits
+from nbs_pin.certificates.glance import BITS, Glance, bound, labels
+from nbs_pin.certificates.loop_model import LoopModel
+from nbs_pin.kernels import verdicts, watching as at
+
+UNEXPLAINED = (Assumption.MODEL, Assumption.MEASUREMENT, Assumption.DISTURBANCE)
+"""What a torque that the readings do not explain can come from."""
+_UNEVEN = 1e-3  # share of a period by which instants may be off their raster
+
+
+class WindowMemory(NamedTuple):
+    """Memory of a `Watch` of encoder readings between instants."""
+
+    began: float
+    """Time of the first instant [s]."""
+    t: float
+    """Time of the last instant [s]."""
+    initial: float
+    """Upper bound of V at the first instant [J]."""
+    bounds: Float[np.ndarray, " errors"]
+    """Bounds of ‖z1‖ and each |z1_i| at the first instant [rad]."""
+    samples: Float[np.ndarray, "last 7 n"]
+    """The last samples, three at most."""
+    period: float = math.nan
+    """Time between instants [s]; NaN before the second one."""
+    half: int = 0
+    """Half the length of the window [periods]."""
+    history: Float[np.ndarray, "rows 8 n"] = np.empty((0, at.SIGNALS, 0))
+    """Signals of the instants in the window and shortly before."""
+    filled: int = 0
+    """How many of them there are."""
+    ratio: float = 1.0
+    """Largest ratio of torque to bound so far."""
+    broken: tuple[Assumption, ...] = ()
+    """Assumptions that have failed so far."""
+    has_gap: bool = False
+    """Whether an instant was not finite or missing, so that what torques did then is not known."""
+
+
+class WindowWatch:
+    """The check, for one certificate and one kind of encoder."""
+
+    def __init__(self, certificate: Certificate, encoders: Encoders) -> None:
+        verdicts.compile_verdicts()
+        self.certificate, self.encoders = certificate, encoders
+        self.resolution = encoders.resolution(certificate)
+        self.limits = Limits.of(certificate, self.resolution)
+        self._names = certificate.joint_names
+        self._labels = labels(certificate)
+        self._reach = 0.5 * np.array([np.linalg.norm(self.resolution), *self.resolution])
+
+    @cached_property
+    def model(self) -> LoopModel:
+        """Law and model."""
+        return LoopModel.of(self.certificate.controller)
+
+    def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WindowMemory]:
+        """What the first instant shows, and the memory after it."""
+        memory = WindowMemory(t, t, 0.0, np.zeros(0), sample[None])
+        memory = self._promising(memory, sample, 0.0 * self.resolution)
+        return self._first(memory), memory
+
+    def step(self, memory: WindowMemory, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WindowMemory]:
+        """What this instant shows, and the memory for the next one."""
+        period = t - memory.t
+        if not period > 0.0:
+            raise ArgumentError(f"the instant t = {t} s is not after the last one, {memory.t} s; give them in order.")
+        if not len(memory.samples):
+            memory = memory._replace(t=t, samples=sample[None])
+            return self._first(memory), memory
+        z1 = np.empty(len(self.resolution))
+        bits = verdicts.instant(memory.samples[-1], sample, z1, period, self.limits.rows)
+        failed = tuple(name for bit, name in BITS.items() if bits & bit)
+        memory, told = self._in_time(memory, period), None
+        memory = memory._replace(t=t, samples=np.concatenate([memory.samples[-2:], sample[None]]))
+        if len(memory.samples) == 3:
+            memory = memory._replace(**self._with(memory, self.model.observe(memory.samples, memory.period)))
+            if memory.filled == len(memory.history):
+                told = self._window(memory)
+                memory = memory._replace(ratio=max(memory.ratio, told.ratio))
+        glance = self._glance(memory, z1, told, failed)
+        if any(name not in memory.broken for name in glance.failed):
+            broken = tuple(name for name in Assumption if name in memory.broken or name in glance.failed)
+            memory = memory._replace(broken=broken)
+        return glance, memory
+
+    def _first(self, memory: WindowMemory) -> Glance:
+        """What an instant shows that none precedes."""
+        dynamics, sample = self.certificate.controller.dynamics, memory.samples[-1]
+        return self._glance(memory, np.asarray(dynamics.difference(sample[at.Q], sample[at.Q_REF])), None, ())
+
+    def lost(self, memory: WindowMemory) -> WindowMemory:
+        """The memory after an instant that is not finite: the window begins anew."""
+        return memory._replace(samples=memory.samples[:0], filled=0, has_gap=True)
+
+    def _promising(self, memory: WindowMemory, sample: Float[np.ndarray, "7 n"], error: JointArray) -> WindowMemory:
+        """The memory with the bounds from the state of a sample, whose z2 is known to within `error` [rad/s]."""
+        law, q = self.certificate.controller, sample[at.Q]
+        e, mass = law.errors(q, *sample[at.V : at.A_REF + 1]), law.dynamics.mass_matrix(q)
+        value = float(e.value) + 0.5 * float(np.abs(e.gradient) @ self.resolution)
+        kinetic, slack = float(e.z2 @ mass @ e.z2), float(error @ np.abs(mass) @ error)
+        initial = value + 0.5 * (math.sqrt(kinetic) + math.sqrt(slack)) ** 2
+        size, joints = self.certificate.from_start(initial)
+        return memory._replace(initial=initial, bounds=np.array([size, *joints]))
+
+    def _in_time(self, memory: WindowMemory, period: float) -> WindowMemory:
+        """The memory with a window for this period [s]; it begins anew where instants are not evenly spaced."""
+        if abs(period - memory.period) <= _UNEVEN * memory.period:
+            return memory
+        if math.isnan(memory.period):
+            memory = self._promising(memory, memory.samples[-1], self.resolution / period)
+        else:
+            memory = memory._replace(has_gap=True)
+        half = self.encoders.half_width(self.certificate, period)
+        history = np.zeros((2 * half - 1 + at.LAGS, at.SIGNALS, len(self.resolution)))
+        return memory._replace(samples=memory.samples[-1:], period=period, half=half, history=history, filled=0)
+
+    @staticmethod
+    def _with(memory: WindowMemory, signals: Float[np.ndarray, "8 n"]) -> dict[str, Any]:
+        history = np.empty_like(memory.history)
+        history[:-1], history[-1] = memory.history[1:], signals
+        return {"history": history, "filled": min(memory.filled + 1, len(history))}
+
+    def _window(self, memory: WindowMemory) -> "_Told":
+        """What the window up to the last instant says."""
+        history, half, h, n = memory.history, memory.half, memory.period, len(self.resolution)
+        mean, more, found = np.empty((at.SIGNALS, n)), np.empty((at.MORE, n)), np.empty(verdicts.WINDOW)
+        at.average(history, half, mean, more)
+        q = history[at.LAGS + half - 1, at.READING]
+        (phi, phi_slack, kinetic, slack), share = self.model.centre(mean, q, self.resolution, half * h)
+        verdicts.judge_window(mean, history, more, share, h, half, q, *self.limits, found)
+        speed = float(np.abs(mean[at.SPEED]).sum())
+        least = max(math.sqrt(kinetic) - math.sqrt(slack), 0.0) ** 2 / (1.0 + 2.0 * half * h * speed)
+        failed = UNEXPLAINED if found[verdicts.EXCEEDS] else ()
+        if found[verdicts.DELAY] or found[verdicts.LATE]:
+            failed = (*failed, Assumption.TIME)
+        if found[verdicts.RUBS]:
+            failed = (*failed, Assumption.FRICTION)
+        moved = mean[at.SPEED] - mean[at.Z2]
+        suspects = self._suspects(mean, more, found, 2.0 * half * h * moved) if failed else ()
+        storage = float(phi + kinetic)
+        return _Told(storage, max(float(phi - phi_slack), 0.0) + least, float(found[verdicts.RATIO]), failed, suspects)
+
+    def _suspects(self, mean: np.ndarray, more: np.ndarray, found: np.ndarray, moved: JointArray) -> tuple[str, ...]:
+        """Simple faults each of which would explain the mean torque; moved: what v_r asks for in the window [rad]."""
+        rest, room = more[at.SPREAD], self.limits.rows[verdicts.BOX]
+        room = np.minimum(room, self.limits.numbers[verdicts.RADIUS]) + more[at.VARIED]
+        still = more[at.FROZEN].astype(bool) & (np.abs(moved) > 4.0 * self.resolution)
+        names = [f"readings of {self._names[i]} that do not change" for i in np.flatnonzero(still)]
+        if found[verdicts.DELAY]:
+            names.append(f"a torque that acts {found[verdicts.DELAY]:.0f} periods late")
+        if found[verdicts.LATE]:
+            names.append("commands that are not the law's of their instant")
+        if found[verdicts.EXCEEDS] and np.count_nonzero(rest) == 1:
+            i = int(np.flatnonzero(rest)[0])
+            u, torque, is_clear = mean[at.U, i], mean[at.TORQUE, i], abs(mean[at.TORQUE, i]) > 2.0 * room[i]
+            if is_clear and abs(u + 2.0 * torque) <= room[i]:
+                names.append(f"a torque of {self._names[i]} with the wrong sign")
+            if is_clear and abs(u + torque) <= room[i]:
+                names.append(f"a torque of {self._names[i]} that does not act")
+        return tuple(names)
+
+    def _glance(
+        self, memory: WindowMemory, z1: JointArray, told: "_Told | None", failed: tuple[Assumption, ...]
+    ) -> Glance:
+        certificate, t, first = self.certificate, memory.t - memory.began, max(memory.initial, self.certificate.storage)
+        fallen = math.sqrt(bound(certificate, memory.initial, t) / first) if first > 0.0 else 1.0
+        errors, bounds = np.array([math.sqrt(z1 @ z1), *np.abs(z1)]), fallen * memory.bounds
+        over = (errors - self._reach > bounds * (1.0 + ROUNDING)).nonzero()[0].tolist()
+        excesses = [self._labels[k + 1] for k in over]
+        promise = bound(certificate, memory.initial, t - (0.0 if told is None else 2.0 * memory.half * memory.period))
+        if told is not None and not told.least <= promise * (1.0 + ROUNDING):
+            excesses.insert(0, "V")
+        failed = failed if told is None else (*failed, *told.failed)
+        is_wrong = False
+        if excesses and told is not None and not (memory.has_gap or memory.broken or failed):
+            largest = memory.initial * math.exp(-certificate.level.c * t) + memory.ratio**2 * certificate.storage
+            is_wrong = told.least > max(largest, promise) or bool((errors - self._reach > memory.ratio * bounds).any())
+        suspects = () if told is None else told.suspects
+        storage = math.nan if told is None else told.storage
+        return Glance(storage, promise, errors, bounds, tuple(excesses), is_wrong, UNEXPLAINED, failed, suspects)
+
+
+class _Told(NamedTuple):
+    """What a window says."""
+
+    storage: float
+    """V at the means [J]."""
+    least: float
+    """What V was at least at some instant of the window [J]."""
+    ratio: float
+    failed: tuple[Assumption, ...]
+    suspects: tuple[str, ...]
