@@ -33,7 +33,7 @@ HOMES = {
     "meshcat": {"reports.replay"},
     "yourdfpy": {"robots.visuals"},
     "trimesh": {"robots.meshes", "robots.visuals", "reports.replay"},
-    "scipy": {"motions", "inertia", "accuracy", "identification"},
+    "scipy": {"motions", "inertia", "accuracy", "identification", "certificates"},
     "clarabel": {"inertia.multipliers"},
     "flint": {"verification.balls"},
     "jsonschema": {"verification.document"},

@@ -17,6 +17,7 @@ from nbs_pin.certificates.comparison_system import ComparisonSystem, Level
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.error_bounds import radians
 from nbs_pin.certificates.friction_error import FrictionError
+from nbs_pin.certificates.held_torque import HeldTorque
 from nbs_pin.certificates.margins import units
 from nbs_pin.certificates.model_error import ModelError
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
@@ -79,7 +80,7 @@ class Certificate:
     """The model error that the bounds include."""
     start: Start | None = None
     """The start from which the overshoot is bounded."""
-    held: "HeldTorque | None" = None
+    held: HeldTorque | None = None
     """What is proved of the loop with held torques; None without a period."""
 
     @property
@@ -176,7 +177,9 @@ class Certificate:
         if initial <= 0.0:
             return self.error, self.joint_errors
         within = self.held is not None and self.start is not None and initial <= self.start.storage
-        reached = self.held.potential_from_start if self.held is not None and within and self.held.is_proved else initial
+        reached = (
+            self.held.potential_from_start if self.held is not None and within and self.held.is_proved else initial
+        )
         return radians(self.stiffness, max(reached, self.potential))
 
     def summary(self) -> dict[str, Any]:

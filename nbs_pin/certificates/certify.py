@@ -78,8 +78,7 @@ def certify(
             loop as it runs wherever that can be proved; else the period is compared with the rules of sampled control.
         lookahead: How far ahead the law is evaluated [s], as in `simulate`; None takes half a period.
         robot: The true arm. None takes the model's.
-        friction: Joint friction of the arm. None takes the URDF's, or none where it states none; without an arm, that
-            which is fed forward.
+        friction: Joint friction of the arm. None takes the URDF's; without an arm, that which is fed forward.
 
     Raises:
         CertificateRefused: If law, model or reference do not admit a bound.
@@ -122,25 +121,26 @@ def certify(
         mismatch=mismatch,
         start=start,
     )
-    if period is not None:
-        certificate = _held(certificate, motion, period, lookahead)
-    return _with_conditions(certificate, reference, motion, period)
+    return _with_conditions(_held(certificate, motion, period, lookahead), reference, motion, period)
 
 
 def _held(
-    certificate: Certificate, motion: SampledMotion | None, period: float, lookahead: float | None
+    certificate: Certificate, motion: SampledMotion | None, period: float | None, lookahead: float | None
 ) -> Certificate:
     """The certificate with the bounds of the held torque in place of those in continuous time, if they are proved."""
+    if period is None:
+        return certificate
     law, constants = certificate.controller, certificate.constants
     inexact = certificate.mismatch is not None or bool(certificate.model_error.lines)
     other = "an inexact model is not part of the proof" if inexact else ""
     viscous = certificate.friction.gap.arm.viscous
     loop = law, certificate.robot, constants, certificate.comparison, viscous
-    held = held_torque(*loop, motion, certificate.storage, certificate.start, period, lookahead, other)
+    begin = 0.0 if certificate.start is None else certificate.start.storage
+    held = held_torque(*loop, motion, certificate.storage, begin, period, lookahead, other)
     if not held.is_proved:
         return replace(certificate, held=held)
     size, joints = radians(constants.stiffness, held.potential)
-    source = f"Φ ≥ z1ᵀSz1, with every torque held for {1e3 * period:g} ms, docs/certificates.md §12"
+    source = f"Φ ≥ z1ᵀSz1, with every torque held for {1e3 * period:g} ms, docs/certificates.md §13"
     return replace(certificate, held=held, potential=held.potential, error=size, joint_errors=joints, source=source)
 
 

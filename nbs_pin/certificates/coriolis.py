@@ -84,11 +84,16 @@ class CoriolisBounds:
 
 
 class _Key:
-    """A robot by its identity, for the cache."""
+    """A robot by the numbers of its model, for the cache."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self._state = (robot.sha256, str(robot.options), robot.model.armature.tobytes(), robot.model.gravity.vector.tobytes())
+        self._state = (
+            robot.sha256,
+            str(robot.options),
+            robot.model.armature.tobytes(),
+            robot.model.gravity.vector.tobytes(),
+        )
 
     def __hash__(self) -> int:
         return hash(self._state)

@@ -3,16 +3,14 @@
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label
-from nbs_pin.certificates.certificate import Start
 from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.comparison_system import ComparisonSystem
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.coriolis import MOST_JOINTS, CoriolisBounds
-from nbs_pin.certificates.sampled_loop import SampledLaw, kept_level
+from nbs_pin.certificates.hold import SampledLaw
+from nbs_pin.certificates.sampled_loop import kept_level
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.analytic import AnalyticDynamics
@@ -20,7 +18,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.robots.robot import Robot
 
 _HALVINGS, _BISECTIONS = 7, 4
-_HERE = "docs/certificates.md §12"
+_HERE = "docs/certificates.md §13"
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +58,8 @@ class HeldTorque:
         if self.is_proved:
             because = f"{_HERE}, torque held for {1e3 * self.period:g} ms"
             return Claim("V' that no hold leaves", self.level, "J", Label.PROVED, because, Group.BOUNDS)
-        because = f"not provable at {1e3 * self.period:g} ms: " + (self.why_not or "the longest found that is")
+        found = "the longest found" if self.longest > 0.0 else "nor at any shorter one that was tried"
+        because = f"not provable at {1e3 * self.period:g} ms: {self.why_not or found}"
         return Claim("period with a proof for held torques", self.longest, "s", Label.PROVED, because, Group.CONSTANTS)
 
 
@@ -72,14 +71,15 @@ def held_torque(
     viscous: JointArray,
     motion: SampledMotion | None,
     least: float,
-    start: Start | None,
+    begin: float,
     period: float,
     lookahead: float | None,
     other: str = "",
 ) -> HeldTorque:
     """The bounds for a period, or the longest period that has them.
 
-    viscous: friction of the joints within D₀. least: V∞ in continuous time. other: what else the proof does not cover.
+    viscous: friction of the joints within D₀. least: V∞ in continuous time. begin: V(0) of the start, 0 without one.
+    other: what else of the loop the proof does not cover.
     """
     lead = 0.5 * period if lookahead is None else lookahead
     why_not = other or _why_not(law, robot, motion)
@@ -88,13 +88,12 @@ def held_torque(
         return nothing
     arm = CoriolisBounds.of(robot, constants)
     bounds = arm.motion(motion, constants.floor)
-    share = float(np.max(viscous * np.diag(constants.metric)))
-    numbers = constants, arm, bounds, comparison.t, comparison.alpha, share
+    numbers = constants, arm, bounds, comparison.t, comparison.alpha, viscous
 
     def kept(h: float, begin: float) -> tuple[float, float]:
         return kept_level(SampledLaw(law, *numbers, h, lead * h / period), begin)
 
-    begin = max(least, 0.0 if start is None else start.storage)
+    begin = max(least, begin)
     level, potential = kept(period, least)
     from_start = potential if begin == least else kept(period, begin)[1]
     if math.isfinite(from_start):

@@ -1,5 +1,6 @@
 """The error potential Φ: strongly convex for every parameter value, with its minimum at zero."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -165,7 +166,7 @@ class Potential(nn.Module):
         return self._widened(scale, known, unknown.sum(axis=1))  # |x|ᵀU|x| ≤ Σ (U1)_i x_i² for U ≥ 0
 
     def curvature_rate(self, radii: JointArray, weights: JointArray) -> float:
-        """L with |xᵀ(∇²ψ(z) − ∇²ψ(z'))y| ≤ L‖x‖‖y‖‖z − z'‖ in the ellipsoid of `curvature_range`, ‖x‖² = Σ weights_i x_i².
+        """L with |xᵀ(∇²ψ(z) − ∇²ψ(z'))y| ≤ L‖x‖‖y‖‖z − z'‖ where `curvature_range` holds, ‖x‖² = Σ weights_i x_i².
 
         From norms of the first three derivatives of every unit y = σ(a), Dy = σ'Da, D²y = σ''(Da)² + σ'D²a and
         D³y = σ'''(Da)³ + 3σ''Da D²a + σ'D³a, where weights ≥ 0 pass norms on.
@@ -176,6 +177,8 @@ class Potential(nn.Module):
             first = np.linalg.norm(np.maximum(-unit.da.low, unit.da.high) * scale / np.sqrt(weights), axis=1)
             second, third = unit.wy @ second, unit.wy @ third
             curvature, jerk = unit.curvature.high, activation.largest_third_derivative(unit.a)
+            if not np.isfinite(jerk).all():
+                return math.inf
             third = jerk * first**3 + 3.0 * curvature * first * second + unit.slope.high * third
             second = curvature * first**2 + unit.slope.high * second
         return float(third[0]) * OUTWARD
@@ -191,8 +194,8 @@ class Potential(nn.Module):
             off = np.linalg.norm(np.maximum(-da.low, da.high) * reach, axis=1)
             a = Interval(middle - off, middle + off).widened(OUTWARD)
             y = activation.derivatives(middle)[0]
-            slope = Interval(*(activation.derivatives(end)[1] for end in (a.low, a.high)))
-            dy = Interval(slope.low[:, None], slope.high[:, None]) * da
+            low, high = (activation.derivatives(end)[1] for end in (a.low, a.high))
+            dy, slope = Interval(low[:, None], high[:, None]) * da, Interval(low, high)
             tape.append(_Units(wy, a, da, slope, activation.curvature_range(a)))
         return tape
 

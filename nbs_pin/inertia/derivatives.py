@@ -1,4 +1,4 @@
-"""Bounds of ∂M/∂q_i relative to M in every pose, by an S-procedure with momenta (docs/certificates.md §11).
+"""Bounds of ∂M/∂q_i relative to M in every pose, by an S-procedure with momenta (docs/certificates.md §13).
 
 With rates x held fixed, the energy 2T = xᵀM(q)x changes with q_i as xᵀ∂_iM x = −2 z·(v×p + ω×l): (v, ω) is the twist of
 body i and (p, l) the momentum of all bodies that it carries, both in frame i. Twists satisfy the conditions of
@@ -106,9 +106,14 @@ def _momenta(tree: RigidTree, joint: int, carried: list[int]) -> tuple[Form, For
         momentum[1, tree.parents[k]] += np.abs(placed).T @ turned[1]
         seen = np.stack([placed @ twist[0, tree.parents[k]], np.abs(placed) @ twist[1, tree.parents[k]]])
         conditions += _rotated(_across(twist[:, k], momentum[:, k]), _across(seen, turned))
-    v, omega, p, l = (x for x in _across(twist[:, joint], momentum[:, joint]))
-    change = Form(-2.0 * (_cross(v[0], p[0]) + _cross(omega[0], l[0])), 2.0 * (_sums(v[1], p[1]) + _sums(omega[1], l[1])))
-    return Form(_wide(motions.energy.matrix, m), _wide(motions.energy.size, m)), change, conditions
+    v, omega, linear, angular = (x for x in _across(twist[:, joint], momentum[:, joint]))
+    change = _cross(v[0], linear[0]) + _cross(omega[0], angular[0])
+    sums = _sums(v[1], linear[1]) + _sums(omega[1], angular[1])
+    return (
+        Form(_wide(motions.energy.matrix, m), _wide(motions.energy.size, m)),
+        Form(-2.0 * change, 2.0 * sums),
+        conditions,
+    )
 
 
 def _rotated(new: list[np.ndarray], old: list[np.ndarray]) -> list[Form]:

@@ -111,7 +111,7 @@ def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> 
 
 
 def largest_multiple(form: Form, unit: Form, energy: Form, conditions: list[Form], terms: int) -> Extreme:
-    """The largest a found such that form − a·unit ≥ 0 on all motions that satisfy the conditions; −inf if none is found.
+    """The largest a found with form − a·unit ≥ 0 on all motions that satisfy the conditions; −inf without one.
 
     energy: 2T, for the scales of the motions. terms: length of the sums behind the entries, for their rounding errors.
     """
