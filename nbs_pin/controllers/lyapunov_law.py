@@ -114,6 +114,10 @@ class LyapunovLaw(ModelLaw):
         """For one joint: bounds of Φ'' − 2S [N·m/rad] for |z1| ≤ radius [rad]; [0, ∞) unless overridden."""
         return Interval(np.float64(0.0), np.float64(np.inf))
 
+    def stiffness_bound(self, radii: JointArray) -> Float[np.ndarray, "n n"]:
+        """A with ∇²Φ(z1) ⪯ A while Σ (z1_i/radii_i)² ≤ 1 [N·m/rad]; a diagonal of inf unless overridden."""
+        return np.diag(np.full(self.nv, np.inf))
+
     def extra_damping(self, radius: float) -> Interval:
         """For one joint: bounds of D − D₀ [N·m·s/rad] for |z2| ≤ radius [rad/s]; [0, ∞) unless overridden."""
         return Interval(np.float64(0.0), np.float64(np.inf))

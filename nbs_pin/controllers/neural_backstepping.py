@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, Matrices, Vectors, as_vectors
+from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, as_vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import known_code
@@ -172,6 +172,10 @@ class NeuralBackstepping(LyapunovLaw):
     def extra_stiffness(self, radius: float) -> Interval:
         """Bounds of ψ'' for one joint [N·m/rad]."""
         return self.potential.curvature(radius)
+
+    def stiffness_bound(self, radii: JointArray) -> Float[np.ndarray, "n n"]:
+        """2S and a bound of ∇²ψ."""
+        return 2.0 * self.potential.stiffness.numpy() + self.potential.curvature_bound(radii)
 
     def extra_damping(self, radius: float) -> Interval:
         """Bounds of T² for one joint [N·m·s/rad]."""

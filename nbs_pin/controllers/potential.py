@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, Scalars, Vectors, array_namespace, is_torch_array, matvec
+from nbs_pin.base.arrays import Array, JointArray, Scalars, Vectors, array_namespace, is_torch_array, matvec
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import OUTWARD, Interval
 from nbs_pin.base.known_code import defines, known_code
@@ -131,6 +131,38 @@ class Potential(nn.Module):
             y, slope = Interval(ends[0][0], ends[1][0]), Interval(ends[0][1], ends[1][1])
             dy, ddy = slope * da, activation.curvature_range(a) * da.squared() + slope * dda
         return ddy.hull().times(scale * scale).widened(OUTWARD)
+
+    def curvature_bound(self, radii: JointArray) -> Float[np.ndarray, "n n"]:
+        """A with ∇²ψ(z) ⪯ A while Σ (z_i/radii_i)² ≤ 1 [N·m/rad], by interval arithmetic.
+
+        ∇²f = Σ_u λ_u σ''(a_u) g_ug_uᵀ over all units u, with g_u = ∇a_u and λ_u = ∂f/∂y_u ≥ 0 by the reverse pass. With
+        g = c + d, |d| ≤ r, ggᵀ ⪯ (1 + η)ccᵀ + (1 + 1/η)ddᵀ, and xᵀddᵀx ≤ (|x|ᵀr)². Pre-activations differ from those at
+        0 by at most the largest |g_u| of the ellipsoid, in its norm.
+        """
+        scale, activation = np.abs(self.scale.numpy(force=True)), self.network.activation
+        layers, reach = self.network.layers(numpy=True), scale * radii
+        y, dy, tape = np.zeros(0), Interval.of(np.zeros((0, len(scale)))), []
+        for wy, wx, bias in layers:
+            wy = np.zeros((len(wx), 0)) if wy is None else wy
+            middle = wy @ y + (0.0 if bias is None else bias)
+            da = (dy.through(wy) + wx).widened(OUTWARD)
+            off = np.linalg.norm(np.maximum(-da.low, da.high) * reach, axis=1)
+            a = Interval(middle - off, middle + off).widened(OUTWARD)
+            y = activation.derivatives(middle)[0]
+            low, high = (activation.derivatives(end)[1] for end in (a.low, a.high))
+            dy = Interval(low[:, None], high[:, None]) * da
+            tape.append((high, activation.curvature_range(a).high, da))
+        known, unknown, lam = np.zeros((len(scale),) * 2), np.zeros((len(scale),) * 2), np.ones(1)
+        for (wy, _, _), (high, curvature, da) in zip(reversed(layers), reversed(tape), strict=True):
+            weight = (lam * curvature)[:, None]
+            known += da.middle.T @ (weight * da.middle)
+            unknown += da.half_width.T @ (weight * da.half_width)
+            lam = np.zeros(0) if wy is None else (lam * high) @ wy
+        rest = unknown.sum(axis=1)  # |x|ᵀU|x| ≤ Σ rest_i x_i² for U ≥ 0
+        eta = max(float(np.sqrt(rest.max() / max(np.linalg.norm(known, 2), 1e-300))), 1e-9)
+        bound = (1.0 + eta) * known + (1.0 + 1.0 / eta) * np.diag(rest)
+        allowance = (OUTWARD - 1.0) * float(np.linalg.norm(bound))
+        return np.asarray(scale[:, None] * (bound + allowance * np.eye(len(scale))) * scale)
 
     def _psi(self, x: Vectors, dx: Vectors) -> tuple[Scalars, Vectors, Vectors]:
         if self.form == "paper":

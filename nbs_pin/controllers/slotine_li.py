@@ -114,6 +114,10 @@ class SlotineLi(LyapunovLaw):
         """0: Φ is quadratic."""
         return Interval.of(np.float64(0.0))
 
+    def stiffness_bound(self, radii: JointArray) -> Float[np.ndarray, "n n"]:
+        """2λK: Φ is quadratic."""
+        return np.diag(2.0 * self.rate * self.gain)
+
     def extra_damping(self, radius: float) -> Interval:
         """0: D is constant."""
         return Interval.of(np.float64(0.0))
