@@ -43,6 +43,10 @@ class BodyBounds:
     joints that ΔM does not depend on [1/rad, 1/m]."""
     weight: JointArray
     """Largest |ΔG_i| [N·m]."""
+    model: tuple[float, float]
+    """e and f of M̂ itself."""
+    model_behind: tuple[JointArray, JointArray]
+    """e_k and f_k of M̂."""
 
     @classmethod
     def of(cls, robot: Robot, tree: RigidTree, errors: BodyErrors, constants: Constants) -> "BodyBounds":
@@ -60,7 +64,17 @@ class BodyBounds:
         metrics = floor, np.diag(1.0 / constants.rate)
         whole = tuple(_largest(energy, w) for w in metrics)
         damped, rated = (_behind(energy, w, most) for w, most in zip(metrics, whole, strict=True))
-        return cls(tree, energy, floor, (whole[0], whole[1]), damped, rated, degree, weight)
+        model = tuple(up(largest_by_multipliers(tree, w)) for w in metrics)
+        own = EnergyForms.on(tree, np.array([tree.spatial_inertia(i) for i in range(tree.nv)]), 0.0 * tree.armature)
+        parts = tuple(_behind(own, w, most) for w, most in zip(metrics, model, strict=True))
+        ends = (model[0], model[1]), (parts[0], parts[1])
+        return cls(tree, energy, floor, (whole[0], whole[1]), damped, rated, degree, weight, *ends)
+
+    @property
+    def model_degree(self) -> JointArray:
+        """g_k of M̂: 0 for joints that it does not depend on."""
+        travel = np.where(self.tree.prismatic, self.tree.upper - self.tree.lower, 4.0)
+        return np.where(self.tree.absent, 0.0, 8.0 / travel)
 
     @property
     def tilts(self) -> JointArray:

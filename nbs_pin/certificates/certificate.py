@@ -12,6 +12,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.body_error import BodyError
 from nbs_pin.certificates.claims import Assumed, Assumption, Condition, Role, assumed
 from nbs_pin.certificates.comparison_system import ComparisonSystem, Level
 from nbs_pin.certificates.constants import Constants
@@ -77,6 +78,8 @@ class Certificate:
     """The true arm; None if none is known."""
     mismatch: Mismatch | None = None
     """The model error that the bounds include."""
+    bodies: BodyError | None = None
+    """What errors of the bodies add, where these are known to a share."""
     start: Start | None = None
     """The start from which the overshoot is bounded."""
 
@@ -86,7 +89,8 @@ class Certificate:
         if self.void:
             return Label.EMPIRICAL
         sufficient = (condition.label for condition in self.conditions if condition.role is Role.SUFFICIENT)
-        lines = (line.label for line in (*self.model_error.lines, *self.friction.lines))
+        bodies = () if self.bodies is None else self.bodies.lines
+        lines = (line.label for line in (*self.model_error.lines, *self.friction.lines, *bodies))
         return weakest(self.constants.label, self.admissible.label, *lines, *sufficient)
 
     @property
@@ -109,6 +113,7 @@ class Certificate:
             *self.constants.lines,
             *self.model_error.lines,
             *self.friction.lines,
+            *(() if self.bodies is None else self.bodies.lines),
             *self.margins,
         )
 
@@ -166,12 +171,16 @@ class Certificate:
 
     def storage_bound(self, t: Float[np.ndarray, "*rows"], initial: float) -> Float[np.ndarray, "*rows"]:
         """Bound of V(t) from V(0) = `initial` [J]: the lesser of e^{−ct}V(0) + V∞ and max(V(0), V∞), t in [s]."""
+        if self.bodies is not None:
+            return np.full(t.shape, self.storage if initial <= self.bodies.start else np.inf)
         return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
 
     def from_start(self, initial: float) -> tuple[float, JointArray]:
         """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞)."""
-        if initial <= 0.0:
+        if initial <= (0.0 if self.bodies is None else self.bodies.start):
             return self.error, self.joint_errors
+        if self.bodies is not None:
+            return math.inf, np.full(len(self.joint_errors), np.inf)
         return radians(self.stiffness, max(initial, self.potential))
 
     def summary(self) -> dict[str, Any]:
@@ -231,6 +240,8 @@ def _texts(certificate: Certificate) -> dict[Assumption, str]:
             f"one, drawn alike, exceeds with a chance of at most {m.violation:.2g} at a confidence of 1 − {m.doubt:g}"
         )
         texts[Assumption.DISTURBANCE] = "the disturbance is drawn like those of these loops, within its bound"
+    if certificate.bodies is not None:
+        texts[Assumption.MODEL] = "the bodies are those of the law's model up to the errors stated"
     if friction.lines:
         texts[Assumption.FRICTION] = "joint friction is b v + c sign(v), with the coefficients stated"
     elif certificate.controller.friction is not None:

@@ -73,7 +73,9 @@ def gravity_error(
     positive("the gravity error", error, "m/s²")
     what = f"a gravity error of {error:g} m/s²"
     bodies = [(j, inertia.mass, inertia.lever) for j, inertia in enumerate(robot.model.inertias) if j > 0]
-    everywhere = error * sum((mass * longest_levers(robot, j, at) for j, mass, at in bodies), np.zeros(robot.nv)) * _OUTWARD
+    everywhere = (
+        error * sum((mass * longest_levers(robot, j, at) for j, mass, at in bodies), np.zeros(robot.nv)) * _OUTWARD
+    )
     if reference is None:
         return _load(what, everywhere, Label.PROVED, "‖Δg‖ × Σ mass × the longest lever arm, a sum of link lengths")
     desired, columns = SampledMotion.of(reference, robot.nv, duration).rows, []
@@ -103,9 +105,7 @@ def tool_frame(robot: Robot) -> str:
     return str(max(frames, key=lambda f: float(np.linalg.norm(f.placement.translation))).name)
 
 
-def place_of(
-    robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | None = None
-) -> tuple[int, np.ndarray]:
+def place_of(robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | None = None) -> tuple[int, np.ndarray]:
     """The joint that carries a point of a link, its origin by default, and the point in that joint's frame [m].
 
     Raises:

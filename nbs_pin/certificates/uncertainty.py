@@ -49,8 +49,8 @@ class Uncertainty:
     """
 
     inertia: float = 0.0
-    """p: of each body, the mass, each coordinate of the centre of mass and each entry of the inertia about the centre of
-    mass, in the frame of its link, are within ±p times the model's."""
+    """p: the mass of each body, each coordinate of its centre of mass and each entry of its inertia about that centre,
+    in the frame of its joint, are within ±p times the model's."""
     payload: Payload | None = None
     """A body on top of these."""
     viscous: float = 0.0
@@ -109,8 +109,8 @@ class BodyErrors:
 def _shares(body: pin.Inertia, p: float) -> Float[np.ndarray, "g 4 4"]:
     """The directions of a body, numbers within ±p (docs/certificates.md §11).
 
-    With c̃ = (c, 1) the pseudo-inertia is m c̃c̃ᵀ + J(I). The mass takes s_0, each coordinate of c its own s_k, which enters
-    linearly and squared; terms with s_0 s_k and s_0 s_j s_k are covered by the factor 1 + p.
+    With c̃ = (c, 1) the pseudo-inertia is m c̃c̃ᵀ + J(I). The mass takes s_0 and each coordinate of c its own s_k; the
+    terms with s_0 s_k and s_0 s_j s_k are covered by the factor 1 + p.
     """
     mass, centre, inertia = float(body.mass), np.array(body.lever), np.array(body.inertia)
     place, moved = np.append(centre, 1.0), np.zeros((3, 4))
@@ -134,7 +134,7 @@ def _pseudo_of_entry(inertia: Float[np.ndarray, "3 3"], j: int, k: int) -> Float
 
 
 def _loaded(payload: Payload, at: Float[np.ndarray, "3"]) -> Float[np.ndarray, "10 4 4"]:
-    """The directions of a payload in a ball about `at`: E over its mass of (at + ρ, 1)(at + ρ, 1)ᵀ with ‖ρ‖ ≤ radius."""
+    """The directions of a payload in a ball about `at`: the mean of (at + ρ, 1)(at + ρ, 1)ᵀ over it, ‖ρ‖ ≤ radius."""
     place, axes = np.append(at, 1.0), payload.radius * np.eye(4)[:3]
     found = [np.outer(place, place)]
     found += [np.outer(x, place) + np.outer(place, x) for x in axes]

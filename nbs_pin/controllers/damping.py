@@ -135,6 +135,23 @@ class Damping(nn.Module):
             x = Interval(np.tanh(x.low), np.tanh(x.high)) if i < len(layers) - 1 else x
         return x.squared().hull().times(scale * scale).widened(OUTWARD)
 
+    def slope(self) -> float:
+        """ℓ with xᵀ(D(z) − D₀)x ≤ ℓ² (zᵀD₀z)(xᵀD₀x): inf where T(0) ≠ 0 or there is no D₀.
+
+        ‖T(x)‖_F ≤ ‖x‖ √(Σ over the two networks of the squared product of the norms of their weights), as |tanh'| ≤ 1.
+        """
+        if self.floor is None:
+            return math.inf
+        d0, r = self._constants(numpy=True)
+        square = 0.0
+        for network in (self.diagonal, self.lower):
+            layers = network.layers(numpy=True)
+            if any(bias.any() for _, bias in layers):
+                return math.inf
+            square += math.prod(float(np.linalg.norm(weight, 2)) for weight, _ in layers) ** 2
+        inverse = np.linalg.inv(np.linalg.cholesky(d0))
+        return math.sqrt(square) * float(np.linalg.norm(inverse * r, 2)) ** 2 * OUTWARD
+
     def _constants(self, *, numpy: bool) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
         r = self.scale.numpy(force=True) if numpy else self.scale
         zero = array_namespace(r).zeros((self.nv, self.nv), dtype=r.dtype, device=device(r))

@@ -1,5 +1,6 @@
 """Laws with a Lyapunov function, in the form that certificates, monitors and attacks use."""
 
+import math
 from abc import abstractmethod
 from typing import NamedTuple
 
@@ -114,9 +115,13 @@ class LyapunovLaw(ModelLaw):
         """For one joint: bounds of Φ'' − 2S [N·m/rad] for |z1| ≤ radius [rad]; [0, ∞) unless overridden."""
         return Interval(np.float64(0.0), np.float64(np.inf))
 
-    def stiffness_bound(self, radii: JointArray) -> Float[np.ndarray, "n n"]:
-        """A with ∇²Φ(z1) ⪯ A while Σ (z1_i/radii_i)² ≤ 1 [N·m/rad]; a diagonal of inf unless overridden."""
-        return np.diag(np.full(self.nv, np.inf))
+    def stiffness_range(self, radii: JointArray) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+        """A and B with A ⪯ ∇²Φ(z1) ⪯ B while Σ (z1_i/radii_i)² ≤ 1 [N·m/rad]; B is inf unless overridden."""
+        return 2.0 * self.lyapunov().stiffness, np.diag(np.full(self.nv, np.inf))
+
+    def damping_slope(self) -> float:
+        """ℓ with xᵀ(D(z2) − D₀)x ≤ ℓ² (z2ᵀD₀z2)(xᵀD₀x) for all z2 and x [s/J]; inf unless overridden."""
+        return math.inf
 
     def extra_damping(self, radius: float) -> Interval:
         """For one joint: bounds of D − D₀ [N·m·s/rad] for |z2| ≤ radius [rad/s]; [0, ∞) unless overridden."""

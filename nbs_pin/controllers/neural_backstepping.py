@@ -1,5 +1,6 @@
 """The neural backstepping (NBS) law: tracking that is stable for every value of its network weights."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -173,9 +174,15 @@ class NeuralBackstepping(LyapunovLaw):
         """Bounds of ψ'' for one joint [N·m/rad]."""
         return self.potential.curvature(radius)
 
-    def stiffness_bound(self, radii: JointArray) -> Float[np.ndarray, "n n"]:
-        """2S and a bound of ∇²ψ."""
-        return 2.0 * self.potential.stiffness.numpy() + self.potential.curvature_bound(radii)
+    def stiffness_range(self, radii: JointArray) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+        """2S and bounds of ∇²ψ."""
+        low, high = self.potential.curvature_range(radii)
+        hessian = 2.0 * self.potential.stiffness.numpy()
+        return hessian + low, hessian + high
+
+    def damping_slope(self) -> float:
+        """From the Lipschitz constants of the networks of T, which are zero at 0 if they have no biases."""
+        return math.inf if self.damping.floor is None else self.damping.slope()
 
     def extra_damping(self, radius: float) -> Interval:
         """Bounds of T² for one joint [N·m·s/rad]."""

@@ -132,12 +132,12 @@ class Potential(nn.Module):
             dy, ddy = slope * da, activation.curvature_range(a) * da.squared() + slope * dda
         return ddy.hull().times(scale * scale).widened(OUTWARD)
 
-    def curvature_bound(self, radii: JointArray) -> Float[np.ndarray, "n n"]:
-        """A with ∇²ψ(z) ⪯ A while Σ (z_i/radii_i)² ≤ 1 [N·m/rad], by interval arithmetic.
+    def curvature_range(self, radii: JointArray) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+        """A and B with A ⪯ ∇²ψ(z) ⪯ B while Σ (z_i/radii_i)² ≤ 1 [N·m/rad], by interval arithmetic.
 
         ∇²f = Σ_u λ_u σ''(a_u) g_ug_uᵀ over all units u, with g_u = ∇a_u and λ_u = ∂f/∂y_u ≥ 0 by the reverse pass. With
-        g = c + d, |d| ≤ r, ggᵀ ⪯ (1 + η)ccᵀ + (1 + 1/η)ddᵀ, and xᵀddᵀx ≤ (|x|ᵀr)². Pre-activations differ from those at
-        0 by at most the largest |g_u| of the ellipsoid, in its norm.
+        g = c + d, |d| ≤ r, ggᵀ lies between (1 ∓ η)ccᵀ ± (1 ∓ 1/η)ddᵀ, and xᵀddᵀx ≤ (|x|ᵀr)². Pre-activations differ
+        from those at 0 by at most the largest |g_u| of the ellipsoid, in its norm.
         """
         scale, activation = np.abs(self.scale.numpy(force=True)), self.network.activation
         layers, reach = self.network.layers(numpy=True), scale * radii
@@ -149,20 +149,28 @@ class Potential(nn.Module):
             off = np.linalg.norm(np.maximum(-da.low, da.high) * reach, axis=1)
             a = Interval(middle - off, middle + off).widened(OUTWARD)
             y = activation.derivatives(middle)[0]
-            low, high = (activation.derivatives(end)[1] for end in (a.low, a.high))
-            dy = Interval(low[:, None], high[:, None]) * da
-            tape.append((high, activation.curvature_range(a).high, da))
-        known, unknown, lam = np.zeros((len(scale),) * 2), np.zeros((len(scale),) * 2), np.ones(1)
-        for (wy, _, _), (high, curvature, da) in zip(reversed(layers), reversed(tape), strict=True):
-            weight = (lam * curvature)[:, None]
-            known += da.middle.T @ (weight * da.middle)
-            unknown += da.half_width.T @ (weight * da.half_width)
-            lam = np.zeros(0) if wy is None else (lam * high) @ wy
-        rest = unknown.sum(axis=1)  # |x|ᵀU|x| ≤ Σ rest_i x_i² for U ≥ 0
-        eta = max(float(np.sqrt(rest.max() / max(np.linalg.norm(known, 2), 1e-300))), 1e-9)
-        bound = (1.0 + eta) * known + (1.0 + 1.0 / eta) * np.diag(rest)
-        allowance = (OUTWARD - 1.0) * float(np.linalg.norm(bound))
-        return np.asarray(scale[:, None] * (bound + allowance * np.eye(len(scale))) * scale)
+            slope = Interval(*(activation.derivatives(end)[1] for end in (a.low, a.high)))
+            dy = Interval(np.asarray(slope.low)[:, None], np.asarray(slope.high)[:, None]) * da
+            tape.append((slope, activation.curvature_range(a), da))
+        shape = (len(scale), len(scale))
+        known, unknown, lam = [np.zeros(shape), np.zeros(shape)], np.zeros(shape), Interval.of(np.ones(1))
+        for (wy, _, _), (slope, curvature, da) in zip(reversed(layers), reversed(tape), strict=True):
+            weight = lam * curvature
+            for k, w in enumerate((weight.low, weight.high)):
+                known[k] += da.middle.T @ (np.asarray(w)[:, None] * da.middle)
+            unknown += da.half_width.T @ (np.asarray(weight.high)[:, None] * da.half_width)
+            lam = Interval.of(np.zeros(0)) if wy is None else (lam * slope).through(wy.T)
+        return self._widened(scale, known, unknown.sum(axis=1))  # |x|ᵀU|x| ≤ Σ (U1)_i x_i² for U ≥ 0
+
+    @staticmethod
+    def _widened(
+        scale: JointArray, known: list[np.ndarray], rest: JointArray
+    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+        eta = float(np.clip(np.sqrt(rest.max() / max(np.linalg.norm(known[1], 2), 1e-300)), 1e-9, 1.0))
+        low = (1.0 - eta) * known[0] - (1.0 / eta - 1.0) * np.diag(rest)
+        high = (1.0 + eta) * known[1] + (1.0 + 1.0 / eta) * np.diag(rest)
+        allowance = (OUTWARD - 1.0) * float(np.linalg.norm(high)) * np.eye(len(scale))
+        return scale[:, None] * (low - allowance) * scale, scale[:, None] * (high + allowance) * scale
 
     def _psi(self, x: Vectors, dx: Vectors) -> tuple[Scalars, Vectors, Vectors]:
         if self.form == "paper":

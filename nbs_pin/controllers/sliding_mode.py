@@ -1,5 +1,6 @@
 """Slotine and Li's law with a switching term against disturbances, smoothed in a boundary layer."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -98,6 +99,10 @@ class SlidingMode(SlotineLi):
         ratio = xp.where(small, 1.0 + 0.0 * x, xp.tanh(x) / xp.where(small, 1.0 + 0.0 * x, x))
         extra = steepest / constant_like(z2, self.boundary) * ratio
         return super().damping_matrix(z2) + xp.eye(self.nv, dtype=z2.dtype) * extra[..., None]
+
+    def damping_slope(self) -> float:
+        """Not known: the switching term is as large at rest as elsewhere."""
+        return math.inf
 
     def extra_damping(self, radius: float) -> Interval:
         """Bounds of η tanh(z2/ε)/z2 for one joint; the largest value is η/ε, at 0."""

@@ -114,9 +114,14 @@ class SlotineLi(LyapunovLaw):
         """0: Φ is quadratic."""
         return Interval.of(np.float64(0.0))
 
-    def stiffness_bound(self, radii: JointArray) -> Float[np.ndarray, "n n"]:
-        """2λK: Φ is quadratic."""
-        return np.diag(2.0 * self.rate * self.gain)
+    def stiffness_range(self, radii: JointArray) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
+        """2λK twice: Φ is quadratic."""
+        hessian = np.diag(2.0 * self.rate * self.gain)
+        return hessian, hessian
+
+    def damping_slope(self) -> float:
+        """0: D is constant."""
+        return 0.0
 
     def extra_damping(self, radius: float) -> Interval:
         """0: D is constant."""
