@@ -205,7 +205,9 @@ class Certificate:
 
 def _bounds(certificate: Certificate) -> tuple[Claim, ...]:
     """A claim for each bound."""
-    label, here = certificate.label, "docs/certificates.md §2"
+    label, here, where = certificate.label, "docs/certificates.md §2", "docs/certificates.md §3"
+    if certificate.bodies is not None:
+        here = where = "docs/certificates.md §11"
     harmless = certificate.printed_error >= certificate.error * (1.0 - 1e-6)
     nothing, source = "disturbance", certificate.source
     if certificate.mismatch is not None:
@@ -213,14 +215,20 @@ def _bounds(certificate: Certificate) -> tuple[Claim, ...]:
         source = f"{source}, for loops drawn alike and up to t = {certificate.mismatch.duration:.4g} s"
     joints = zip(certificate.joint_names, certificate.joint_errors.tolist(), certificate.joint_units, strict=True)
     whole = "rad" if set(certificate.joint_units) == {"rad"} else "rad, m"
+    printed = Claim(
+        _PRINTED, certificate.printed_error, whole, Label.EMPIRICAL, _TRUE if harmless else _FALSE, Group.BOUNDS
+    )
+    dynamic = (
+        printed,
+        Claim(f"rate of decay without {nothing}", certificate.rate, "1/s", label, here, Group.BOUNDS),
+        Claim("c of V(t) ≤ e^{−ct}V(0) + V∞", certificate.level.c, "1/s", label, here, Group.BOUNDS),
+    )
     lines = [
         Claim("‖z1‖", certificate.error, whole, label, source, Group.BOUNDS),
         *(Claim(f"|z1| of {name}", x, unit, label, source, Group.BOUNDS) for name, x, unit in joints),
-        Claim(_PRINTED, certificate.printed_error, whole, Label.EMPIRICAL, _TRUE if harmless else _FALSE, Group.BOUNDS),
-        Claim(f"rate of decay without {nothing}", certificate.rate, "1/s", label, here, Group.BOUNDS),
-        Claim("c of V(t) ≤ e^{−ct}V(0) + V∞", certificate.level.c, "1/s", label, here, Group.BOUNDS),
+        *(dynamic if certificate.bodies is None else ()),
         Claim("V∞", certificate.storage, "J", label, here, Group.BOUNDS),
-        Claim("Φ∞", certificate.potential, "J", label, "docs/certificates.md §3", Group.BOUNDS),
+        Claim("Φ∞", certificate.potential, "J", label, where, Group.BOUNDS),
     ]
     if certificate.overshoot is not None and certificate.start is not None:
         because = "Φ never exceeds max(V(0), Φ∞), docs/certificates.md §3"

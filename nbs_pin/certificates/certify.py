@@ -65,7 +65,7 @@ def certify(
 ) -> Certificate:
     """Bound the tracking error of the closed loop under a bounded disturbance (docs/certificates.md).
 
-    Friction that the law does not feed forward is counted, with |v_d| from the reference or else the velocity limits.
+    Friction that the law does not feed forward counts, with |v_d| from the reference or else the velocity limits.
 
     Args:
         controller: A law with a storage function (`LyapunovLaw`).
@@ -80,9 +80,8 @@ def certify(
         robot: The true arm. None takes the model's.
         friction: Joint friction of the arm. None takes the URDF's, or none where it states none; without an arm, that
             which is fed forward.
-        uncertainty: How far bodies and friction of the true arm may differ from the law's model and from the friction
-            stated. The bounds then hold for every such arm; uncertain bodies need the reference (docs/certificates.md
-            §11).
+        uncertainty: How far bodies and friction of the arm may differ from the law's model and from the friction
+            stated; the bounds hold for every such arm (docs/certificates.md §11). Bodies need the reference.
 
     Raises:
         CertificateRefused: If law, model or reference do not admit a bound.
@@ -106,30 +105,16 @@ def certify(
     comparison = _comparison(constants, admissible, error, rest)
     if bodies is not None and reference is not None and motion is not None:
         found = bounds_for_all(law, bodies, constants, comparison, rest, reference, motion, start)
-        certificate = _for_all(found, law, admissible, constants, rest, arm, start)
-        return _with_conditions(certificate, reference, motion, period)
+        return _with_conditions(
+            _for_all(found, law, admissible, constants, rest, arm, start), reference, motion, period
+        )
     least = level(comparison)
     if not math.isfinite(least.storage):
         raise CertificateRefused(_why_not(comparison, mismatch is not None, bool(rest.lines)))
     potential = reach(comparison, least.storage)
     size, joints, source = errors(law, constants, comparison, least.storage, potential)
-    certificate = Certificate(
-        controller=law,
-        admissible=admissible,
-        constants=constants,
-        model_error=error,
-        friction=rest,
-        comparison=comparison,
-        rate=0.5 * decay(comparison),
-        level=least,
-        potential=potential,
-        error=size,
-        joint_errors=joints,
-        source=source,
-        robot=arm,
-        mismatch=mismatch,
-        start=start,
-    )
+    known = (law, admissible, constants, error, rest, comparison, 0.5 * decay(comparison), least, potential)
+    certificate = Certificate(*known, size, joints, source, robot=arm, mismatch=mismatch, start=start)
     return _with_conditions(certificate, reference, motion, period)
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.dynamics.rigid_tree import RigidTree, cross
 
-_RELATIVE = 1e-6
+_RELATIVE = 0.1
 """Share of the mean that is added to the metric of `dominating`, so that it is definite for every body."""
 _ROUNDING = 1e-12
 
