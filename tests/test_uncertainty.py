@@ -223,3 +223,7 @@ def test_what_cannot_be_bounded_is_refused_in_one_sentence():
         nbs.certify(
             law, [0.0, 0.0], reference=reference, uncertainty=nbs.Uncertainty(payload=nbs.Payload(1.0, link="moon"))
         )
+    run = nbs.simulate(nbs.DynamicsPlant(law.dynamics), law, reference, 0.1, 0.001)
+    found = nbs.certify(law, [0.0, 0.0], reference=reference, duration=1.0, uncertainty=nbs.Uncertainty(inertia=0.01))
+    with pytest.raises(nbs.ArgumentError, match="needs exact bodies"):
+        nbs.monitor(run, found)
