@@ -9,7 +9,9 @@ import pytest
 import nbs_pin as nbs
 from nbs_pin.certificates.attack import worst_of
 from nbs_pin.certificates.body_bounds import BodyBounds
+from nbs_pin.certificates.body_motion import hessian_at_zero
 from nbs_pin.certificates.body_regressor import BodyRegressor
+from nbs_pin.certificates.body_response import Response, instants
 from nbs_pin.certificates.constants import constants_of
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
 from nbs_pin.dynamics.rigid_tree import RigidTree
@@ -157,6 +159,37 @@ def test_extra_damping_is_within_its_slope():
         z, x = rng.standard_normal((2, 7)) * rng.uniform(0.01, 3.0)
         extra = x @ (law.damping_matrix(z) - floor) @ x
         assert 0.0 <= extra <= slope**2 * (z @ floor @ z) * (x @ floor @ x)
+
+
+def test_the_response_is_the_error_of_an_arm_of_other_masses_up_to_second_order():
+    """z1 − ξ and V' of simulated arms, against z1 itself and the bound of V'."""
+    robot, rng, share = nbs.load_robot("ur5"), np.random.default_rng(7), 0.05
+    law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    known = nbs.Uncertainty(inertia=share)
+    errors, c, t = known.errors(robot, robot.model), constants_of(law), instants(1.0)
+    q, v, a = (np.asarray(x) for x in reference(t))
+    torque = np.array([BodyRegressor(robot, robot.model, errors).at(*row)[0] for row in zip(q, v, a, strict=True)])
+    mass = law.dynamics.mass_matrix(q)
+    own, hessian = c.omega * mass + c.floor + law.dynamics.coriolis_matrix(q, v), hessian_at_zero(law)
+    response = Response.of(t, mass, own, torque, hessian, c)
+    bound = nbs.certify(law, np.zeros(6), reference=reference, duration=1.0, uncertainty=known).bodies.storage
+    for _ in range(3):
+        s, model = np.zeros(len(errors.body)), robot.model.copy()
+        for i in range(6):
+            sign, body = rng.choice([-1.0, 1.0]), model.inertias[i + 1]
+            s[np.flatnonzero(errors.body == i)[0]] = sign  # the model less the true mass
+            model.inertias[i + 1] = pin.Inertia(body.mass * (1.0 - share * sign), body.lever, body.inertia)
+        arm = nbs.PinocchioDynamics(replace(robot, model=model))
+        run = nbs.simulate(nbs.DynamicsPlant(arm), law, reference, 1.0, 0.0005)
+        f, eta = (np.array([np.interp(run.t, t, x) for x in (y @ s).T]).T for y in (response.f, response.eta))
+        now, xi = law.errors(run.q, run.v, run.q_ref, run.v_ref, run.a_ref), np.linalg.solve(hessian, f.T).T
+        for _ in range(4):
+            xi = xi - np.linalg.solve(hessian, (law.potential_terms(xi, xi)[1] - f).T).T
+        e1, e2 = now.z1 - xi, now.z2 - eta
+        kinetic = 0.5 * np.einsum("ti,tij,tj->t", e2, arm.mass_matrix(run.q), e2)
+        storage = now.value - law.potential_terms(xi, xi)[0] - (f * e1).sum(axis=1) + kinetic
+        assert np.abs(e1).max() < 0.02 * np.abs(now.z1).max()
+        assert storage.max() <= bound
 
 
 @pytest.mark.parametrize(("name", "torque"), [("two_link", 0.0), ("ur5", 0.0), ("ur5", 0.2)])
