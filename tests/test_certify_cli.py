@@ -84,6 +84,18 @@ def test_the_summary_is_what_certify_says(certified):
     assert figures["certificate"]["joints"] == ["joint1", "joint2"]
 
 
+def test_every_arm_within_a_share_of_the_model_is_certified(tmp_path):
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert run(tmp_path / "two_link", "two_link", "--inertia-within", "5%") == 0
+    found = summary(tmp_path / "two_link")["figures"]["certificate"]
+    robot = nbs.load_robot("two_link")
+    known = {"reference": nbs.Sinusoid.for_robot(robot), "uncertainty": nbs.Uncertainty(inertia=0.05)}
+    expected = certify(nbs.NeuralBackstepping.for_robot(robot), [0.0, 0.0], period=0.001, **known)
+    assert found["label"] == "PROVED"
+    assert found["joint_errors_rad"] == expected.summary()["joint_errors_rad"]
+    assert "errors of the bodies" in printed.getvalue()
+
+
 def test_the_worst_motion_is_written_and_below_the_bound(certified):
     folder, found = certified[0], summary(certified[0])["figures"]["attack"]
     motion = Run.load(folder / "run.npz")
@@ -256,6 +268,8 @@ def test_results_of_another_certificate_are_kept(certified, capsys):
         ("two_link --disturbance 5 --margin 2", "--margin needs one of --payload, --gravity"),
         ("two_link --disturbance 5 --trajectories 9", "--trajectories applies to a model that is not exact"),
         ("two_link --payload 0", "--payload is '0'"),
+        ("two_link --inertia-within 5", "give a percentage above 0 % and below 100 %"),
+        ("two_link --inertia-within 5% --wanted 0.1", "--inertia-within is for the law's own model"),
         ("two_link --payload 1 --link moon", "no moving link 'moon'"),
         ("two_link --friction urdf", "--friction is 'urdf'"),
         ("two_link --friction 1", "--friction is '1'"),

@@ -32,6 +32,7 @@ class Group(StrEnum):
     SAMPLED = "sampled control"
     LOADS = "disturbance"
     FRICTION = "friction"
+    BODIES = "errors of the bodies"
 
 
 def weakest(*labels: Label) -> Label:

@@ -20,6 +20,7 @@ from nbs_pin.certificates.loads import MARGIN, gravity_error, payload, total
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.certificates.monitor import Monitored, monitor
 from nbs_pin.certificates.propose import PERIODS, Proposal, propose
+from nbs_pin.certificates.uncertainty import Uncertainty
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -77,6 +78,8 @@ class Task:
     """The true arm, if it is not the model's."""
     trajectories: int = TRAJECTORIES
     """Closed-loop trajectories from which the error of an inexact model is bounded."""
+    uncertainty: Uncertainty | None = None
+    """How far the true arm may differ from the law's model."""
     seed: int = 0
 
     def loads(self, robot: Robot) -> tuple[Admissible, ...]:
@@ -108,7 +111,7 @@ def assess(
     robot = arm_of(controller, task)
     admissible = disturbance_of(robot, task)
     error, start = None, None
-    if not is_exact(controller.dynamics, robot):
+    if task.uncertainty is None and not is_exact(controller.dynamics, robot):
         error = model_error(controller, robot, task, admissible, progress)
     if task.start_error:
         start = task.reference(np.zeros(1)).q[0] + task.start_error * (-1.0) ** np.arange(robot.nv)
@@ -123,6 +126,7 @@ def assess(
             period=task.period,
             robot=robot,
             friction=task.friction,
+            uncertainty=task.uncertainty,
         )
     watched = None if run is None else monitor(run, certificate)
     found, diverged = _attacked(certificate, task, thorough, progress)
@@ -160,6 +164,8 @@ def disturbance_of(robot: Robot, task: Task) -> Admissible:
     """The total disturbance of the task; raises ArgumentError if it has none."""
     loads = task.loads(robot)
     given = [] if task.disturbance is None else [task.disturbance]
+    if not (given or loads) and task.uncertainty is not None:
+        return Admissible.of(np.zeros(robot.nv), robot.nv)
     if not (given or loads):
         raise ArgumentError("no disturbance was given; give --disturbance, --payload or --gravity-error.")
     return total(*given, *loads)

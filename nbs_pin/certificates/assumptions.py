@@ -34,6 +34,10 @@ def check_certificate(certificate: Any) -> None:
     """Raises ArgumentError unless it is a `Certificate`."""
     if not isinstance(certificate, Certificate):
         raise ArgumentError(f"certificate is a {type(certificate).__name__}; give the certificate that certify made.")
+    if certificate.bodies is not None:
+        raise ArgumentError(
+            "a run is checked by its balance of power, which needs exact bodies; give one without uncertainty."
+        )
 
 
 def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption, str], *, is_recorded: bool) -> str:

@@ -12,6 +12,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.body_error import BodyError
 from nbs_pin.certificates.claims import Assumed, Assumption, Condition, Role, assumed
 from nbs_pin.certificates.comparison_system import ComparisonSystem, Level
 from nbs_pin.certificates.constants import Constants
@@ -78,6 +79,8 @@ class Certificate:
     """The true arm; None if none is known."""
     mismatch: Mismatch | None = None
     """The model error that the bounds include."""
+    bodies: BodyError | None = None
+    """What errors of the bodies add, where these are known to a share."""
     start: Start | None = None
     """The start from which the overshoot is bounded."""
     held: HeldTorque | None = None
@@ -89,7 +92,8 @@ class Certificate:
         if self.void:
             return Label.EMPIRICAL
         sufficient = (condition.label for condition in self.conditions if condition.role is Role.SUFFICIENT)
-        lines = (line.label for line in (*self.model_error.lines, *self.friction.lines))
+        bodies = () if self.bodies is None else self.bodies.lines
+        lines = (line.label for line in (*self.model_error.lines, *self.friction.lines, *bodies))
         return weakest(self.constants.label, self.admissible.label, *lines, *sufficient)
 
     @property
@@ -113,6 +117,7 @@ class Certificate:
             *self.constants.lines,
             *self.model_error.lines,
             *self.friction.lines,
+            *(() if self.bodies is None else self.bodies.lines),
             *self.margins,
         )
 
@@ -170,17 +175,20 @@ class Certificate:
 
     def storage_bound(self, t: Float[np.ndarray, "*rows"], initial: float) -> Float[np.ndarray, "*rows"]:
         """Bound of V(t) from V(0) = `initial` [J]: the lesser of e^{−ct}V(0) + V∞ and max(V(0), V∞), t in [s]."""
+        if self.bodies is not None:
+            return np.full(t.shape, self.storage if initial <= self.bodies.start else np.inf)
         return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
 
     def from_start(self, initial: float) -> tuple[float, JointArray]:
         """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞)."""
-        if initial <= 0.0:
+        if initial <= (0.0 if self.bodies is None else self.bodies.start):
             return self.error, self.joint_errors
-        within = self.held is not None and self.start is not None and initial <= self.start.storage
-        reached = (
-            self.held.potential_from_start if self.held is not None and within and self.held.is_proved else initial
-        )
-        return radians(self.stiffness, max(reached, self.potential))
+        if self.bodies is not None:
+            return math.inf, np.full(len(self.joint_errors), np.inf)
+        held, start = self.held, self.start
+        if held is not None and held.is_proved and start is not None and initial <= start.storage:
+            initial = max(initial, held.potential_from_start)
+        return radians(self.stiffness, max(initial, self.potential))
 
     def summary(self) -> dict[str, Any]:
         """The certificate as JSON can store it."""
@@ -204,7 +212,9 @@ class Certificate:
 
 def _bounds(certificate: Certificate) -> tuple[Claim, ...]:
     """A claim for each bound."""
-    label, here = certificate.label, "docs/certificates.md §2"
+    label, here, where = certificate.label, "docs/certificates.md §2", "docs/certificates.md §3"
+    if certificate.bodies is not None:
+        here = where = "docs/certificates.md §14"
     harmless = certificate.printed_error >= certificate.error * (1.0 - 1e-6)
     nothing, source = "disturbance", certificate.source
     if certificate.mismatch is not None:
@@ -212,14 +222,20 @@ def _bounds(certificate: Certificate) -> tuple[Claim, ...]:
         source = f"{source}, for loops drawn alike and up to t = {certificate.mismatch.duration:.4g} s"
     joints = zip(certificate.joint_names, certificate.joint_errors.tolist(), certificate.joint_units, strict=True)
     whole = "rad" if set(certificate.joint_units) == {"rad"} else "rad, m"
+    printed = Claim(
+        _PRINTED, certificate.printed_error, whole, Label.EMPIRICAL, _TRUE if harmless else _FALSE, Group.BOUNDS
+    )
+    dynamic = (
+        printed,
+        Claim(f"rate of decay without {nothing}", certificate.rate, "1/s", label, here, Group.BOUNDS),
+        Claim("c of V(t) ≤ e^{−ct}V(0) + V∞", certificate.level.c, "1/s", label, here, Group.BOUNDS),
+    )
     lines = [
         Claim("‖z1‖", certificate.error, whole, label, source, Group.BOUNDS),
         *(Claim(f"|z1| of {name}", x, unit, label, source, Group.BOUNDS) for name, x, unit in joints),
-        Claim(_PRINTED, certificate.printed_error, whole, Label.EMPIRICAL, _TRUE if harmless else _FALSE, Group.BOUNDS),
-        Claim(f"rate of decay without {nothing}", certificate.rate, "1/s", label, here, Group.BOUNDS),
-        Claim("c of V(t) ≤ e^{−ct}V(0) + V∞", certificate.level.c, "1/s", label, here, Group.BOUNDS),
+        *(dynamic if certificate.bodies is None else ()),
         Claim("V∞", certificate.storage, "J", label, here, Group.BOUNDS),
-        Claim("Φ∞", certificate.potential, "J", label, "docs/certificates.md §3", Group.BOUNDS),
+        Claim("Φ∞", certificate.potential, "J", label, where, Group.BOUNDS),
     ]
     if certificate.overshoot is not None and certificate.start is not None:
         because = "Φ never exceeds max(V(0), Φ∞), docs/certificates.md §3"
@@ -239,6 +255,8 @@ def _texts(certificate: Certificate) -> dict[Assumption, str]:
             f"one, drawn alike, exceeds with a chance of at most {m.violation:.2g} at a confidence of 1 − {m.doubt:g}"
         )
         texts[Assumption.DISTURBANCE] = "the disturbance is drawn like those of these loops, within its bound"
+    if certificate.bodies is not None:
+        texts[Assumption.MODEL] = "the bodies are those of the law's model up to the errors stated"
     if friction.lines:
         texts[Assumption.FRICTION] = "joint friction is b v + c sign(v), with the coefficients stated"
     elif certificate.controller.friction is not None:

@@ -13,6 +13,8 @@ from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.certificates.bodies import bounds_for_all
+from nbs_pin.certificates.body_error import BodyError
 from nbs_pin.certificates.certificate import Certificate, Start
 from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.comparison_system import ComparisonSystem, decay, level, reach
@@ -33,6 +35,7 @@ from nbs_pin.certificates.model_error import ModelError, coverage, model_error
 from nbs_pin.certificates.model_structure import EXACT, is_exact, torque_difference
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.certificates.structure import lyapunov_law
+from nbs_pin.certificates.uncertainty import Uncertainty
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.analytic import AnalyticDynamics
@@ -60,10 +63,11 @@ def certify(
     lookahead: float | None = None,
     robot: Robot | None = None,
     friction: JointFriction | None = None,
+    uncertainty: Uncertainty | None = None,
 ) -> Certificate:
     """Bound the tracking error of the closed loop under a bounded disturbance (docs/certificates.md).
 
-    Friction that the law does not feed forward is counted, with |v_d| from the reference or else the velocity limits.
+    Friction that the law does not feed forward counts, with |v_d| from the reference or else the velocity limits.
 
     Args:
         controller: A law with a storage function (`LyapunovLaw`).
@@ -79,6 +83,8 @@ def certify(
         lookahead: How far ahead the law is evaluated [s], as in `simulate`; None takes half a period.
         robot: The true arm. None takes the model's.
         friction: Joint friction of the arm. None takes the URDF's; without an arm, that which is fed forward.
+        uncertainty: How far bodies and friction of the arm may differ from the law's model and from the friction
+            stated; the bounds hold for every such arm (docs/certificates.md §14). Bodies need the reference.
 
     Raises:
         CertificateRefused: If law, model or reference do not admit a bound.
@@ -93,34 +99,25 @@ def certify(
     law = lyapunov_law(controller)
     arm = law.dynamics.robot if robot is None else robot
     start = _check_arguments(law, arm, reference, duration, q0, v0, mismatch, period)
-    gap = _friction(law, arm, friction)
-    constants, admissible = constants_of(law, gap.arm.viscous), Admissible.of(disturbance, law.nv)
+    bodies = _uncertain_bodies(uncertainty, reference, mismatch)
+    gap = _friction(law, arm, friction, uncertainty)
+    constants, admissible = constants_of(law, gap.damping), Admissible.of(disturbance, law.nv)
     motion = _sampled(law.nv, reference, duration)
-    error = _model_error(law, arm, constants, mismatch, motion)
+    error = _NO_ERROR if bodies is not None else _model_error(law, arm, constants, mismatch, motion)
     rest = _friction_error(gap, constants, arm, motion)
     comparison = _comparison(constants, admissible, error, rest)
+    if bodies is not None and reference is not None and motion is not None:
+        found = bounds_for_all(law, bodies, constants, comparison, rest, reference, motion, start)
+        return _with_conditions(
+            _for_all(found, law, admissible, constants, rest, arm, start), reference, motion, period
+        )
     least = level(comparison)
     if not math.isfinite(least.storage):
         raise CertificateRefused(_why_not(comparison, mismatch is not None, bool(rest.lines)))
     potential = reach(comparison, least.storage)
     size, joints, source = errors(law, constants, comparison, least.storage, potential)
-    certificate = Certificate(
-        controller=law,
-        admissible=admissible,
-        constants=constants,
-        model_error=error,
-        friction=rest,
-        comparison=comparison,
-        rate=0.5 * decay(comparison),
-        level=least,
-        potential=potential,
-        error=size,
-        joint_errors=joints,
-        source=source,
-        robot=arm,
-        mismatch=mismatch,
-        start=start,
-    )
+    known = (law, admissible, constants, error, rest, comparison, 0.5 * decay(comparison), least, potential)
+    certificate = Certificate(*known, size, joints, source, robot=arm, mismatch=mismatch, start=start)
     return _with_conditions(_held(certificate, motion, period, lookahead), reference, motion, period)
 
 
@@ -133,8 +130,7 @@ def _held(
     law, constants = certificate.controller, certificate.constants
     inexact = certificate.mismatch is not None or bool(certificate.model_error.lines)
     other = "an inexact model is not part of the proof" if inexact else ""
-    viscous = certificate.friction.gap.arm.viscous
-    loop = law, certificate.robot, constants, certificate.comparison, viscous
+    loop = law, certificate.robot, constants, certificate.comparison, certificate.friction.gap.damping
     begin = 0.0 if certificate.start is None else certificate.start.storage
     held = held_torque(*loop, motion, certificate.storage, begin, period, lookahead, other)
     if not held.is_proved:
@@ -177,13 +173,58 @@ def _check_arguments(
     return Start(*start, begin, float(law.storage(*start, begin.q, begin.v)))
 
 
-def _friction(law: LyapunovLaw, robot: Robot | None, friction: JointFriction | None) -> FrictionGap:
+def _uncertain_bodies(
+    uncertainty: Uncertainty | None, reference: DesiredMotion | None, mismatch: Mismatch | None
+) -> Uncertainty | None:
+    """The uncertainty if it is one of bodies; raises ArgumentError if it does not fit the other arguments."""
+    if uncertainty is None or not uncertainty.of_bodies:
+        return None
+    if reference is None:
+        raise ArgumentError("uncertain bodies are bounded along a motion; give the reference too.")
+    if mismatch is not None:
+        raise ArgumentError("uncertainty and mismatch both state the error of the model; give one of them.")
+    return uncertainty
+
+
+def _for_all(
+    found: BodyError,
+    law: LyapunovLaw,
+    admissible: Admissible,
+    constants: Constants,
+    friction: FrictionError,
+    robot: Robot | None,
+    start: Start | None,
+) -> Certificate:
+    """The certificate of a loop with uncertain bodies."""
+    return Certificate(
+        controller=law,
+        admissible=admissible,
+        constants=constants,
+        model_error=_NO_ERROR,
+        friction=friction,
+        comparison=found.comparison,
+        rate=0.5 * found.level.c,
+        level=found.level,
+        potential=found.potential,
+        error=found.error,
+        joint_errors=found.joint_errors,
+        source="response to every error of the bodies, and V' for the rest, docs/certificates.md §14",
+        bodies=found,
+        robot=robot,
+        start=start,
+    )
+
+
+def _friction(
+    law: LyapunovLaw, robot: Robot | None, friction: JointFriction | None, uncertainty: Uncertainty | None
+) -> FrictionGap:
     """The gap between the arm's friction and that which is fed forward."""
     if friction is None:
         friction = law.friction if robot is None else JointFriction.of(robot)
     if friction is not None and friction.viscous.size != law.nv:
         raise ArgumentError(f"friction is for {friction.viscous.size} joints and the law has {law.nv}; give its own.")
-    return FrictionGap.of(law.nv, friction, law.friction)
+    shares = (0.0, 0.0) if uncertainty is None else (uncertainty.viscous, uncertainty.coulomb)
+    return FrictionGap.of(law.nv, friction, law.friction, shares)
 
 
 def _sampled(nv: int, reference: DesiredMotion | None, duration: float | None) -> SampledMotion | None:
@@ -210,9 +251,12 @@ def _friction_error(
     return friction_error(gap, constants, speed, "at most the velocity limit")
 
 
-def _exactness(law: LyapunovLaw, robot: Robot | None, mismatch: Mismatch | None) -> tuple[Condition, ...]:
+def _exactness(certificate: Certificate) -> tuple[Condition, ...]:
     """Whether a model that should be exact is that of the URDF, edits of its numbers included."""
-    if robot is None or mismatch is not None or type(law.dynamics) not in (PinocchioDynamics, AnalyticDynamics):
+    law, robot = certificate.controller, certificate.robot
+    if robot is None or certificate.mismatch is not None or certificate.bodies is not None:
+        return ()
+    if type(law.dynamics) not in (PinocchioDynamics, AnalyticDynamics):
         return ()
     name = f"{EXACT:g} > difference of the model's torques from the URDF's, over these"
     because = "at generic states: both are linear in the parameters of the bodies"
@@ -270,7 +314,7 @@ def _with_conditions(
         *certificate.model_error.conditions,
         *_dissipation(certificate),
         *certificate.friction.conditions,
-        *_exactness(law, robot, certificate.mismatch),
+        *_exactness(certificate),
         *found,
         *_no_wrap(robot, joints),
     ]
@@ -278,7 +322,8 @@ def _with_conditions(
         conditions += smoothness(motion)
     if motion is not None and period is not None and not is_held:
         metric = certificate.constants.metric
-        conditions += hold_margin(law, metric, motion, period, certificate.admissible.energy(metric))
+        bodies = 0.0 if certificate.bodies is None else certificate.bodies.torque
+        conditions += hold_margin(law, metric, motion, period, certificate.admissible.energy(metric) + bodies**2)
     if motion is not None and reference is not None and certificate.mismatch is not None:
         errors = np.zeros(law.nv) if start is None else np.abs(law.dynamics.difference(start.q, start.begin.q))
         speeds = np.zeros(law.nv) if start is None else np.abs(start.v - start.begin.v)
@@ -296,7 +341,8 @@ def _with_conditions(
 
 def _dissipation(certificate: Certificate) -> tuple[Condition, ...]:
     """The condition of Theorem 4, with what model error and friction add, if there are any."""
-    lines = (*certificate.model_error.lines, *certificate.friction.lines)
+    bodies = () if certificate.bodies is None else certificate.bodies.lines
+    lines = (*certificate.model_error.lines, *certificate.friction.lines, *bodies)
     if not lines:
         return ()
     k, label = certificate.comparison, weakest(*(line.label for line in lines))

@@ -30,24 +30,38 @@ class FrictionGap(NamedTuple):
     """Friction of the arm, and of it that which is not fed forward."""
 
     viscous: JointArray
-    """Δb [N·m·s/rad], (n,)."""
+    """Δb, or its largest size where b is known to a share [N·m·s/rad], (n,)."""
     coulomb: JointArray
-    """Δc [N·m], (n,)."""
+    """Δc, or its largest size [N·m], (n,)."""
     arm: JointFriction
-    """Friction of the arm."""
+    """Friction of the arm as stated."""
+    damping: JointArray
+    """The least b [N·m·s/rad], (n,)."""
     width: float
     """ε, the larger one of f̂ and f [rad/s]."""
     power: float
     """P = max_x x(1 − tanh x) Σ ĉ_i ε [W]."""
 
     @classmethod
-    def of(cls, nv: int, friction: JointFriction | None, fed: JointFriction | None) -> "FrictionGap":
-        """The gap between the arm's friction and that fed forward, None for none."""
+    def of(
+        cls,
+        nv: int,
+        friction: JointFriction | None,
+        fed: JointFriction | None,
+        shares: tuple[float, float] = (0.0, 0.0),
+    ) -> "FrictionGap":
+        """The gap between the arm's friction and that fed forward, None for none.
+
+        shares: by which the arm's viscous and Coulomb friction may differ from that stated.
+        """
         none = JointFriction(np.zeros(nv), np.zeros(nv))
         arm, law = friction or none, fed or none
         widest = max(arm.transition, law.transition)
-        power = _WORST * widest * law.coulomb.sum()
-        return cls(arm.viscous - law.viscous, arm.coulomb - law.coulomb, arm, widest, power)
+        gaps = [arm.viscous - law.viscous, arm.coulomb - law.coulomb]
+        for k, (share, stated) in enumerate(zip(shares, (arm.viscous, arm.coulomb), strict=True)):
+            gaps[k] = np.abs(gaps[k]) + share * stated if share else gaps[k]
+        least = (1.0 - shares[0]) * arm.viscous
+        return cls(gaps[0], gaps[1], arm, least, widest, _WORST * widest * law.coulomb.sum())
 
     def torque(self, v: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows n"]:
         """Bound of each torque that is not fed forward [N·m]."""

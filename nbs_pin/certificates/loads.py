@@ -45,7 +45,7 @@ def payload(
         ArgumentError: If a number is out of range or the link does not exist.
     """
     positive("the payload", mass, "kg")
-    joint, at = _place(robot, frame, position)
+    joint, at = place_of(robot, frame, position)
     loaded = robot.model.copy()
     loaded.appendBodyToJoint(joint, pin.Inertia(mass, at, np.zeros((3, 3))), pin.SE3.Identity())
     desired = SampledMotion.of(reference, robot.nv, duration).rows
@@ -73,7 +73,9 @@ def gravity_error(
     positive("the gravity error", error, "m/s²")
     what = f"a gravity error of {error:g} m/s²"
     bodies = [(j, inertia.mass, inertia.lever) for j, inertia in enumerate(robot.model.inertias) if j > 0]
-    everywhere = error * sum((mass * _levers(robot, j, at) for j, mass, at in bodies), np.zeros(robot.nv)) * _OUTWARD
+    everywhere = (
+        error * sum((mass * longest_levers(robot, j, at) for j, mass, at in bodies), np.zeros(robot.nv)) * _OUTWARD
+    )
     if reference is None:
         return _load(what, everywhere, Label.PROVED, "‖Δg‖ × Σ mass × the longest lever arm, a sum of link lengths")
     desired, columns = SampledMotion.of(reference, robot.nv, duration).rows, []
@@ -103,8 +105,12 @@ def tool_frame(robot: Robot) -> str:
     return str(max(frames, key=lambda f: float(np.linalg.norm(f.placement.translation))).name)
 
 
-def _place(robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | None) -> tuple[int, np.ndarray]:
-    """The joint that carries the point, and the point in its frame [m]."""
+def place_of(robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | None = None) -> tuple[int, np.ndarray]:
+    """The joint that carries a point of a link, its origin by default, and the point in that joint's frame [m].
+
+    Raises:
+        ArgumentError: If the link does not exist or moves with no joint, or the position is not three numbers.
+    """
     name = tool_frame(robot) if frame is None else frame
     bodies = {f.name: f for f in robot.model.frames if f.type == pin.FrameType.BODY and f.parentJoint > 0}
     if name not in bodies:
@@ -115,7 +121,7 @@ def _place(robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | N
     return int(bodies[name].parentJoint), np.array(bodies[name].placement.act(at))
 
 
-def _levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> JointArray:
+def longest_levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> JointArray:
     """Per joint, the largest |torque| that a unit force at a point of body `joint` can cause for any q [m].
 
     Revolute joint: the distance of the point from the axis, at most the sum of the link lengths between them. Prismatic

@@ -8,7 +8,17 @@ from typing import Annotated
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from nbs_pin.cli.values import OptionError, choice, default, integer, number, plain_numbers, positive_list, text
+from nbs_pin.cli.values import (
+    OptionError,
+    choice,
+    default,
+    integer,
+    number,
+    percentage,
+    plain_numbers,
+    positive_list,
+    text,
+)
 from nbs_pin.controllers.registry import LAWS
 
 
@@ -67,6 +77,10 @@ class Certify:
     """Mass that the model does not include [kg], as a disturbance along the reference."""
     link: Annotated[str | None, tyro.conf.arg(metavar="LINK"), default("the arm's end")] = None
     """Link that carries the payload."""
+    inertia_within: Annotated[float | None, percentage("--inertia-within", below=100.0), default("the model's own")] = (
+        None
+    )
+    """Certify for every arm with masses, centres of mass and inertias within this share of the model's, as in 5%."""
     friction: Annotated[str | None, friction_text(), default("the URDF's")] = None
     """Joint friction of the arm, viscous and Coulomb [N·m·s/rad, N·m]; what the law does not feed forward counts."""
     feed_friction: bool = False

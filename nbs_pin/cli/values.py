@@ -38,6 +38,18 @@ def number(
     return _spec("NUMBER", parse, "{:g}".format)
 
 
+def percentage(flag: str, *, below: float) -> PrimitiveConstructorSpec[float]:
+    """A tyro parser of a share in percent, as in 5%, in (0, below); raises OptionError for any other text."""
+
+    def parse(words: list[str]) -> float:
+        value = plain_number(words[0].removesuffix("%"))
+        if value is None or not words[0].endswith("%") or not 0.0 < value < below:
+            raise OptionError(f"{flag} is '{words[0]}'; give a percentage above 0 % and below {below:g} %: {flag} 5%.")
+        return 0.01 * value
+
+    return _spec("PERCENT", parse, lambda share: f"{100.0 * share:g}%")
+
+
 def configuration(flag: str) -> PrimitiveConstructorSpec[str]:
     """A tyro parser of comma-separated numbers, kept as text for `plain_numbers`; raises OptionError for any other."""
 

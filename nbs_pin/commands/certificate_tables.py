@@ -9,7 +9,17 @@ from rich.text import Text
 
 _ERRORS = ("rad", "m", "rad, m")
 """Units of the error bounds, which have a table of their own."""
-_ORDER = ("disturbance", "friction", "bounds", "sampled control", "model error", "inertia", "constants", "structure")
+_ORDER = (
+    "disturbance",
+    "friction",
+    "errors of the bodies",
+    "bounds",
+    "sampled control",
+    "model error",
+    "inertia",
+    "constants",
+    "structure",
+)
 """Groups of claims, in the order in which they are printed."""
 
 _GAINS = (

@@ -15,6 +15,7 @@ from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, a
 from nbs_pin.certificates.certificate_file import write_certificate
 from nbs_pin.certificates.loads import MARGIN
 from nbs_pin.certificates.model_structure import is_exact
+from nbs_pin.certificates.uncertainty import Uncertainty
 from nbs_pin.cli import NO_PROMISE
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
@@ -113,6 +114,7 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
         gravity_error=options.gravity_error,
         margin=MARGIN if options.margin is None else options.margin,
         start_error=options.start_error,
+        uncertainty=None if options.inertia_within is None else Uncertainty(inertia=options.inertia_within),
         trajectories=options.trajectories or TRAJECTORIES,
         seed=options.seed,
     )
@@ -121,6 +123,8 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
 def _check_options(options: Certify) -> None:
     """Raises OptionError for options that need others which were not given."""
     loads = {"--payload": options.payload, "--gravity-error": options.gravity_error}
+    if options.inertia_within is not None and (options.wanted is not None or options.against is not None):
+        raise OptionError("--inertia-within is for the law's own model; omit --wanted and --against.")
     if options.norm and options.disturbance is None:
         raise OptionError("--norm needs --disturbance; give both.")
     if options.link is not None and options.payload is None:

@@ -55,6 +55,11 @@ class PinocchioDynamics(DynamicsProvider):
         self._zero = np.zeros(robot.nv)
 
     @property
+    def model(self) -> pin.Model:
+        """The Pinocchio model that it computes with."""
+        return self._model
+
+    @property
     def nv(self) -> int:
         """Number of joints."""
         return self._robot.nv

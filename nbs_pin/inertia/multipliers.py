@@ -103,6 +103,11 @@ def largest_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) ->
     return Extreme(-found.value, found.multipliers) if found.value < 0.0 else Extreme(np.inf)
 
 
+def signed_least_by_multipliers(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> float:
+    """Lower bound, of either sign, of min_q λ_min(W^-½ M(q) W^-½), for energies that may be negative; −inf if none."""
+    return _extreme(tree, weight, 1.0).value
+
+
 def _extreme(tree: RigidTree, weight: Float[np.ndarray, "n n"], sign: float) -> Extreme:
     """The largest a found with sign·2T ≥ a q̇ᵀWq̇ for all motions; −inf if none is found."""
     motions = Motions.of(tree)
