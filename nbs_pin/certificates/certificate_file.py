@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 
 from nbs_pin.base.claims import Claim, Group
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.plain import plain
 from nbs_pin.base.rounding import down
 from nbs_pin.base.versions import versions
 from nbs_pin.certificates.certificate import Certificate
-from nbs_pin.certificates.comparison_system import polygon
+from nbs_pin.certificates.comparison_system import polygon, reach
 from nbs_pin.certificates.constants import rigid_arm
 from nbs_pin.certificates.error_bounds import radians
+from nbs_pin.certificates.held_torque import HeldTorque
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.rigid_tree import RigidTree
@@ -61,7 +63,12 @@ def seal(document: dict[str, Any]) -> str:
 def certificate_document(certificate: Certificate) -> dict[str, Any]:
     """The content of the file without its SHA-256: JSON values, floats that round-trip, None for infinity."""
     k, friction, constants = certificate.comparison, certificate.friction, certificate.constants
-    size, joints = radians(certificate.stiffness, certificate.potential)
+    if certificate.bodies is not None:
+        raise ArgumentError("a certificate for uncertain bodies has no file format; give one without `uncertainty`.")
+    # Held torques have bounds of their own; those of continuous time stand beside them.
+    held = certificate.held if certificate.held is not None and certificate.held.is_proved else None
+    potential = certificate.potential if held is None else reach(k, certificate.storage)
+    size, joints = radians(certificate.stiffness, potential)
     closer = certificate.error < size
     start, overshoot, none = certificate.start, certificate.overshoot, np.zeros(certificate.controller.nv)
     fed = certificate.controller.friction or JointFriction(none, none)
@@ -106,18 +113,29 @@ def certificate_document(certificate: Certificate) -> dict[str, Any]:
         "inertia": _inertia(certificate),
         "level": {"c": certificate.level.c, "storage": certificate.storage, "rate": down(certificate.rate)},
         "polygon": None if cut is None else cut._asdict(),
-        "bounds": {"potential": certificate.potential, "error": size, "joint_errors": joints},
+        "bounds": {"potential": potential, "error": size, "joint_errors": joints},
         "linear": {"error": certificate.error, "joint_errors": certificate.joint_errors} if closer else None,
+        "held": None if held is None else _held(certificate, held),
         "start": None,
         "conditions": [condition.plain() for condition in certificate.conditions],
         "claims": [line.plain() for line in certificate.lines if line.group in _PREMISES],
         "assumptions": [{"assumption": text, "checked": checked} for text, checked in certificate.assumptions],
     }
     if start is not None and overshoot is not None:
-        reached = radians(certificate.stiffness, max(start.storage, certificate.potential))
+        reached = radians(certificate.stiffness, max(start.storage, potential))
         document["start"] = {"storage": start.storage, "error": reached[0], "joint_errors": reached[1]}
     plained: dict[str, Any] = plain(document)
     return plained
+
+
+def _held(certificate: Certificate, held: HeldTorque) -> dict[str, Any]:
+    return {
+        "period": held.period,
+        "lookahead": held.lookahead,
+        "level": held.level,
+        "error": certificate.error,
+        "joint_errors": certificate.joint_errors,
+    }
 
 
 def _arm(certificate: Certificate) -> dict[str, Any] | None:

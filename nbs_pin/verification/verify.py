@@ -265,6 +265,9 @@ def _errors(document: dict[str, Any]) -> Iterator[Check]:
         yield _decided("errors from the start", bounded(start, max(level, start["storage"])), "Φ ≤ max(V(0), Φ∞), §3")
     if document["linear"] is not None:
         yield Check("‖z1‖ of one joint", OPEN, f"{document['linear']['error']:.6g} rad by linear theory, §4")
+    if document["held"] is not None:
+        held = document["held"]
+        yield Check("‖z1‖ with held torques", OPEN, f"{held['error']:.6g} rad at {1e3 * held['period']:g} ms, §13")
     for i, joint in enumerate(document["arm"]["joints"] if document["arm"] else []):
         if joint["continuous"]:
             largest = max(sizes["joint_errors"][i] for sizes in (document["bounds"], start) if sizes)
