@@ -103,10 +103,15 @@ class _Key:
 
 
 @lru_cache(maxsize=8)
+def _relative(key: _Key) -> JointArray:
+    return inertia_derivatives(key.robot)
+
+
+@lru_cache(maxsize=8)
 def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> CoriolisBounds:
     floor, rate = np.frombuffer(floor_bytes).reshape(n, n), np.frombuffer(rate_bytes)
     tree, inverse = RigidTree.of(key.robot), np.abs(np.linalg.inv(floor))
-    relative = inertia_derivatives(tree)
+    relative = _relative(key)
     heaviest = largest_inertia_bound(tree, floor).value
     by_floor = np.minimum(inertia_derivatives(tree, floor), relative * heaviest)
 
