@@ -100,7 +100,7 @@ class Certify:
     period: Annotated[
         float | None, number("--period", least=1e-5, most=0.1, unit="s"), default("0.001; the longest for --wanted")
     ] = None
-    """Control period [s]."""
+    """Control period, for which every torque is held [s]."""
     bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
     """Rate ω of a law built for an arm [rad/s]."""
     wanted: Annotated[str | None, positive_list("--wanted", most=10.0, unit="rad"), default("no design")] = None
