@@ -122,7 +122,7 @@ class OneHold:
 def test_every_quantity_of_a_hold_and_the_change_of_storage_are_within_their_bounds(name, h, share, settings):
     """The inequality of docs/certificates.md §13, term by term, on holds from random states of the level."""
     loop, certificate, reference = loop_of(name, h, share * h, **settings)
-    level, _ = kept_level(loop, certificate.storage)
+    level = kept_level(loop, certificate.storage).level
     assert level < 3.0 * certificate.storage
     hold = next(x for x in (hold_of(loop, level, more * level) for more in _ENLARGED) if x is not None)
     rows = rows_in_g(hold)
@@ -155,7 +155,7 @@ def test_the_worst_motions_of_a_held_loop_stay_below_its_bound():
 
 def test_the_shorter_the_period_the_nearer_is_the_bound_of_continuous_time():
     loop, certificate, _ = loop_of("two_link", 1e-3, 5e-4)
-    levels = [kept_level(replace(loop, h=h, lead=0.5 * h), certificate.storage)[0] for h in (1e-3, 3e-4, 1e-4, 1e-6)]
+    levels = [kept_level(replace(loop, h=h, lead=0.5 * h), certificate.storage).level for h in (1e-3, 3e-4, 1e-4, 1e-6)]
     assert levels == sorted(levels, reverse=True)
     assert levels[-1] <= 1.01 * certificate.storage
 

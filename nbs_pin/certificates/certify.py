@@ -29,6 +29,7 @@ from nbs_pin.certificates.margins import (
     sampled_control,
     smoothness,
     start_margin,
+    unsaturated,
     velocity_margin,
 )
 from nbs_pin.certificates.model_error import ModelError, coverage, model_error
@@ -332,6 +333,8 @@ def _with_conditions(
     if motion is not None and robot is not None:
         frictions = (law.friction, certificate.friction.gap.arm)
         conditions += effort_margin(robot, law.dynamics, certificate.admissible, motion, frictions)
+        if certificate.held is not None:
+            conditions += unsaturated(robot, law.dynamics, law.friction, motion, certificate.held.room)
         conditions += velocity_margin(robot, motion, 0.0 if start is None else start.v)
         conditions += position_margin(robot, joints, motion)
     if start is not None and robot is not None:

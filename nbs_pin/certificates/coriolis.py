@@ -41,6 +41,19 @@ class MotionBounds(NamedTuple):
     """|ȧ_d|."""
 
 
+class Sizes(NamedTuple):
+    """Bounds of a velocity."""
+
+    turn: float
+    """Σ γ_i|v_i| [1/s]."""
+    turn_d: float
+    """Σ γ'_i|v_i|."""
+    energy: float
+    """|v|_M."""
+    speed: float
+    """|v|."""
+
+
 @dataclass(frozen=True, eq=False)
 class CoriolisBounds:
     """Constants of an arm and of D₀."""
@@ -61,6 +74,12 @@ class CoriolisBounds:
     """Σ γ_i|v_i| ≤ spread·|v|."""
     spread_d: float
     """Σ γ'_i|v_i| ≤ spread_d·|v|."""
+    diagonal: JointArray
+    """max M_ii [kg·m²]."""
+    single: JointArray
+    """|v_i| ≤ single_i·|v|_M."""
+    weight: JointArray
+    """Bound of |G_i| and of |∂G_i/∂q_j| [N·m]."""
     gravity: float
     """|G(q + u) − G(q)|_* ≤ gravity·Σ|u_i|."""
     loss_m: float
@@ -73,6 +92,11 @@ class CoriolisBounds:
         """The bounds for an arm; inf where a joint that slides or a failed search leaves none."""
         floor, rate = constants.floor, constants.rate
         return _bounds(_Key(robot), floor.tobytes(), rate.tobytes(), len(rate))
+
+    def sizes(self, energy: float, speed: float) -> Sizes:
+        """Of a velocity with |v|_M ≤ energy and |v| ≤ speed."""
+        turn, turn_d = min(self.turn * energy, self.spread * speed), min(self.turn_d * energy, self.spread_d * speed)
+        return Sizes(turn, turn_d, energy, speed)
 
     def motion(self, motion: SampledMotion, floor: Float[np.ndarray, "n n"]) -> MotionBounds:
         """The bounds of a reference."""
@@ -118,7 +142,8 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
     def largest(weights: JointArray) -> float:
         return math.sqrt(weights @ inverse @ weights)
 
-    weight = np.linalg.norm(key.robot.model.gravity.linear) * np.sqrt(_carried(tree) * largest_diagonal(tree))
+    diagonal = largest_diagonal(tree)
+    weight = np.linalg.norm(key.robot.model.gravity.linear) * np.sqrt(_carried(tree) * diagonal)
     above, below = np.diag(1.0 / rate), np.diag(1.0 / rate)
     return CoriolisBounds(
         relative=relative,
@@ -129,6 +154,9 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
         sum=largest(np.ones(n)),
         spread=largest(relative),
         spread_d=largest(by_floor),
+        diagonal=diagonal,
+        single=np.array([rate_bound(tree, unit) for unit in np.eye(n)]),
+        weight=weight,
         gravity=largest(weight),
         loss_m=math.sqrt(largest_inertia_bound(tree, above).value),
         loss_inverse=1.0 / math.sqrt(max(least_inertia_bound(tree, below).value, 1e-300)),

@@ -3,14 +3,17 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label
 from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.comparison_system import ComparisonSystem
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.coriolis import MOST_JOINTS, CoriolisBounds
-from nbs_pin.certificates.hold import SampledLaw
-from nbs_pin.certificates.sampled_loop import kept_level
+from nbs_pin.certificates.effort_bound import Asked, torque_bound
+from nbs_pin.certificates.hold import Curvature, SampledLaw
+from nbs_pin.certificates.sampled_loop import Kept, kept_level
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.analytic import AnalyticDynamics
@@ -35,6 +38,8 @@ class HeldTorque:
     """Largest Φ from a start on the reference, and in the limit [J]."""
     potential_from_start: float
     """Largest Φ from the given start [J]."""
+    room: JointArray
+    """How far each torque can be from that of the reference at its samples [N·m]; inf if unknown."""
     longest: float
     """Longest period found with a proof [s], 0 if there is none; `period` if that has one."""
     why_not: str
@@ -83,28 +88,36 @@ def held_torque(
     """
     lead = 0.5 * period if lookahead is None else lookahead
     why_not = other or _why_not(law, robot, motion)
-    nothing = HeldTorque(period, lead, math.inf, math.inf, math.inf, 0.0, why_not)
+    unknown = np.full(law.nv, np.inf)
+    nothing = HeldTorque(period, lead, math.inf, math.inf, math.inf, unknown, 0.0, why_not)
     if why_not or robot is None or motion is None:
         return nothing
     arm = CoriolisBounds.of(robot, constants)
     bounds = arm.motion(motion, constants.floor)
     numbers = constants, arm, bounds, comparison.t, comparison.alpha, viscous
 
-    def kept(h: float, begin: float) -> tuple[float, float]:
+    def kept(h: float, begin: float) -> Kept:
         return kept_level(SampledLaw(law, *numbers, h, lead * h / period), begin)
 
+    def room(level: float) -> JointArray:
+        loop = SampledLaw(law, *numbers, period, lead)
+        if not math.isfinite(level):
+            return unknown
+        asked = Asked(law, constants, *Curvature.with_diagonal(loop, level), level)
+        return torque_bound(asked, arm, bounds, motion.half)
+
     begin = max(least, begin)
-    level, potential = kept(period, least)
-    from_start = potential if begin == least else kept(period, begin)[1]
-    if math.isfinite(from_start):
-        return HeldTorque(period, lead, level, potential, from_start, period, "")
+    near, far = kept(period, least), kept(period, begin)
+    if math.isfinite(far.potential):
+        found = near.level, near.potential, far.potential, room(max(near.seen, far.seen))
+        return HeldTorque(period, lead, *found, period, "")
     shorter = (period * 0.5**k for k in range(1, _HALVINGS + 1))
-    longest = next((h for h in shorter if math.isfinite(kept(h, begin)[1])), 0.0)
+    longest = next((h for h in shorter if math.isfinite(kept(h, begin).potential)), 0.0)
     low, high = longest, 2.0 * longest
     for _ in range(_BISECTIONS if longest > 0.0 else 0):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if math.isfinite(kept(middle, begin)[1]) else (low, middle)
-    return HeldTorque(period, lead, math.inf, math.inf, math.inf, low, "")
+        low, high = (middle, high) if math.isfinite(kept(middle, begin).potential) else (low, middle)
+    return HeldTorque(period, lead, math.inf, math.inf, math.inf, room(begin), low, "")
 
 
 def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None) -> str:

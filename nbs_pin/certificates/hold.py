@@ -79,17 +79,22 @@ class Curvature(NamedTuple):
     @classmethod
     def of(cls, loop: SampledLaw, potential: float) -> "Curvature":
         """The bounds where z1ᵀSz1 ≤ potential."""
+        return cls.with_diagonal(loop, potential)[0]
+
+    @classmethod
+    def with_diagonal(cls, loop: SampledLaw, potential: float) -> "tuple[Curvature, JointArray]":
+        """The bounds where z1ᵀSz1 ≤ potential, and that of the diagonal of ∇²Φ [N·m/rad]."""
         k, root, rate = loop.constants, loop.root, np.sqrt(loop.constants.rate)
         radii = np.sqrt(potential / np.diag(k.stiffness))
         low, high = loop.law.stiffness_range(radii)
         if not np.isfinite(high).all():
-            return cls(*np.full(7, np.inf))
+            return cls(*np.full(7, np.inf)), np.diag(high)
         losses = least_eigenvalue(rate[:, None] * low * rate), largest_eigenvalue(rate[:, None] * high * rate)
         centre, shape = 0.5 * (losses[0] + losses[1]), np.linalg.inv(np.linalg.cholesky(k.stiffness))
         middle = centre * np.diag(1.0 / k.rate)
         above, below = largest_eigenvalue(root @ (high - middle) @ root), least_eigenvalue(root @ (low - middle) @ root)
         scaled = k.floor / np.sqrt(np.diag(k.floor)) / np.sqrt(np.diag(k.floor))[:, None]
-        return cls(
+        found = cls(
             centre=centre,
             steepest=largest_eigenvalue(root @ high @ root),
             growth=largest_eigenvalue(shape @ high @ shape.T),
@@ -98,6 +103,7 @@ class Curvature(NamedTuple):
             rest_loss=0.5 * (losses[1] - losses[0]),
             change=loop.law.stiffness_rate(radii, np.diag(k.floor) * least_eigenvalue(scaled)),
         )
+        return found, np.asarray(np.diag(high))
 
 
 class Suprema(NamedTuple):

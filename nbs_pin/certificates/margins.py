@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -108,6 +109,23 @@ def effort_margin(
     bound = admissible.largest(robot.nv)
     because = f"reference over {motion.t[-1]:g} s; necessary, not sufficient: feedback comes on top"
     return (_least_room(robot, "effort", needed + bound, "torque of reference and disturbance", because),)
+
+
+def unsaturated(
+    robot: Robot, dynamics: DynamicsProvider, fed: JointFriction | None, motion: SampledMotion, room: JointArray
+) -> tuple[Condition, ...]:
+    """Whether every effort limit exceeds the torque of the reference and how far the law's torque may be from it [N·m].
+
+    If so, no torque is ever cut off, which proves the assumption; if not, it stays one, and the condition is a
+    comparison that names the joint.
+    """
+    if not (np.isfinite(robot.effort_limit).any() and np.isfinite(room).all()):
+        return ()
+    torque = inverse_dynamics(dynamics, *motion.rows)
+    torque = torque if fed is None else torque + fed.torque(motion.v)
+    because = f"reference over {motion.t[-1]:g} s, and every state of the bounds: docs/certificates.md §15"
+    found = _least_room(robot, "effort", np.abs(torque).max(axis=0) + room, "largest torque of the law", because)
+    return (replace(found, role=Role.SUFFICIENT if found.holds else Role.COMPARISON),)
 
 
 def start_margin(

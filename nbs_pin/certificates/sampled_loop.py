@@ -10,6 +10,7 @@ rows that are linear in g (`hold.py`); b and Q are made of them (`_excess`) and 
 
 import math
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -38,36 +39,57 @@ _MOST = 30.0
 """Largest level that is tried, relative to that in continuous time."""
 
 
-def kept_level(loop: SampledLaw, least: float) -> tuple[float, float]:
-    """The least level of V' found that holds do not leave, and the largest Φ during them [J]; inf if none is found.
+class Kept(NamedTuple):
+    """A level of V' that no hold leaves, and what else then holds; inf where none is found."""
+
+    level: float
+    """[J]."""
+    potential: float
+    """Largest Φ, also during the holds [J]."""
+    seen: float
+    """Largest Φ + ½z2ᵀM z2 of the states that the law is evaluated at [J]."""
+
+
+_NOTHING = Kept(math.inf, math.inf, math.inf)
+
+
+def kept_level(loop: SampledLaw, least: float) -> Kept:
+    """The least level found that V' tends to and that holds do not leave.
 
     least: V∞ of the loop in continuous time, or V of the start if that is larger.
     """
-    level = 1.02 * least
-    found = _after(loop, level)
-    while not found[0] <= level:
-        level = 1.02 * found[0]
-        if not level <= _MOST * least:
-            return math.inf, math.inf
-        found = _after(loop, level)
+    kept = _after(loop, 1.02 * least)
+    while not kept[1] <= kept[0].level:
+        larger = 1.02 * kept[1]
+        if not larger <= _MOST * least:
+            return _NOTHING
+        kept = _after(loop, larger)
     for _ in range(8):
-        smaller = max(1.0005 * found[0], least)
-        again = _after(loop, smaller)
-        if not again[0] <= smaller < level:
+        again = _after(loop, max(1.0005 * kept[1], least))
+        if not again[1] <= again[0].level < kept[0].level:
             break
-        level, found = smaller, again
-    return level, found[1]
+        kept = again
+    return kept[0]
 
 
-def _after(loop: SampledLaw, level: float) -> tuple[float, float]:
-    """The level that V' tends to while it is within `level`, and the largest Φ; inf if nothing follows."""
+def _after(loop: SampledLaw, level: float) -> tuple[Kept, float]:
+    """What holds while V' is within `level`, and the level that V' then tends to; inf if nothing follows."""
     for enlarged in _ENLARGED:
         hold = hold_of(loop, level, enlarged * level)
         if hold is not None:
             rate, force, gradient = hold.sups.rate, hold.sups.force, hold.sups.gradient
             bend = hold.curve.steepest * rate**2 + gradient * (loop.constants.nu * force + hold.turning * rate)
-            return _limit(hold), (level + loop.h**2 / 8.0 * bend) * UP
-    return math.inf, math.inf
+            return Kept(level, (level + loop.h**2 / 8.0 * bend) * UP, _seen(hold)), _limit(hold)
+    return Kept(level, math.inf, math.inf), math.inf
+
+
+def _seen(b: Hold) -> float:
+    """Φ + W of the predicted state: √Φ and √W change by at most half their slopes times the way to it."""
+    moved, late = b.loop.lead * b.sups.rate + b.late[0], predicted(b)
+    z2 = late[0] * b.sups.rate + late[1]
+    start = math.sqrt(b.level / (1.0 - 0.5 * b.loop.h * b.loop.constants.nu))
+    change = 0.5 * math.sqrt(b.curve.steepest * b.curve.growth) * moved
+    return ((start + b.isk * z2 / math.sqrt(2.0)) * b.stretch + change) ** 2 * UP
 
 
 class _Form:
