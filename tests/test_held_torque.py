@@ -212,3 +212,41 @@ def test_the_hessian_of_the_potential_changes_no_faster_than_its_bound(seed):
     change = (hessian[:, 0] - hessian[:, 1]) / np.sqrt(weights) / np.sqrt(weights)[:, None]
     distance = np.sqrt((weights * (z[:, 0] - z[:, 1]) ** 2).sum(axis=1))
     assert (np.abs(np.linalg.eigvalsh(0.5 * (change + change.swapaxes(1, 2)))).max(axis=1) <= bound * distance).all()
+
+
+@pytest.mark.parametrize(("name", "torque"), [("two_link", 5.0), ("ur5", 1.0)])
+def test_no_state_of_the_bounds_asks_for_more_torque_than_is_proved(name, torque):
+    robot = nbs.load_robot(name)
+    law, reference = nbs.NeuralBackstepping.for_robot(robot, seed=1), nbs.Sinusoid.for_robot(robot)
+    certificate = nbs.certify(law, np.full(robot.nv, torque), reference=reference, period=2.5e-4)
+    assert dict(certificate.assumptions)[Assumption.EFFORT] == "checked"
+    rng, level, k = np.random.default_rng(0), certificate.held.level, certificate.constants
+    times = rng.uniform(0.0, 10.0, 2000)
+    now = Reference(*reference(times))
+    z1 = rng.standard_normal((2000, robot.nv)) @ np.linalg.inv(np.linalg.cholesky(k.stiffness))
+    z1 *= (
+        np.sqrt(rng.uniform(0.0, level, (2000, 1)))
+        / np.linalg.norm(z1 @ np.linalg.cholesky(k.stiffness), axis=1)[:, None]
+    )
+    kept = np.maximum(level - law.potential_terms(z1, z1)[0], 0.0)
+    q, mass = now.q + z1, law.dynamics.mass_matrix(now.q + z1)
+    direction = rng.standard_normal((2000, robot.nv))
+    direction[::2] = np.linalg.eigh(mass)[1][::2, :, 0]  # the lightest motion is the fastest
+    energy = np.einsum("ki,kij,kj->k", direction, mass, direction)
+    z2 = direction * np.sqrt(2.0 * kept / energy)[:, None]
+    v = z2 + law.errors(q, 0.0 * q, *now).v_r
+    asked = np.abs(law.torque(q, v, *now))
+    wanted = np.abs(law.dynamics.reference_torque(now.q, now.v, now.v, now.a))
+    assert (asked - wanted <= certificate.held.room).all()
+    assert (asked <= robot.effort_limit).all()
+
+
+def test_a_torque_that_may_be_cut_off_is_named_with_its_joint():
+    robot = nbs.load_robot("ur5")
+    law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    certificate = nbs.certify(law, np.full(6, 5.0), reference=reference, period=2.5e-4)
+    assert dict(certificate.assumptions)[Assumption.EFFORT] == "checked in part"
+    (named,) = (x for x in certificate.conditions if "largest torque of the law" in x.name)
+    assert "wrist" in named.name
+    assert named.right > named.left == 28.0
+    assert not named.voids

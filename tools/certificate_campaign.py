@@ -130,7 +130,7 @@ def runs(
     waves = random_disturbances(nbs.Admissible.of(box, robot.nv), steps, period, RUNS, np.random.default_rng(seed))
     start = {key: given[key] for key in ("q0", "v0") if key in given}
     for wave in waves:
-        plant = nbs.MujocoPlant(robot)
+        plant = nbs.MujocoPlant(robot, joint_friction="keep")
         try:
             yield nbs.simulate(
                 plant, law, given["reference"], steps * period, period, disturbance=_Held(wave, period), **start
