@@ -145,7 +145,9 @@ def test_the_table_says_everything_once(certified):
     for condition in certificate["conditions"]:
         row = row_of(found["conditions"], condition["name"])
         left, right = ("none" if condition[x] is None else f"{condition[x]:.3g}" for x in ("left", "right"))
-        assert row[1:] == [left, f"{right} {condition['unit']}".strip(), "yes", condition["label"]]
+        holds = "yes" if condition["holds"] else "NO"
+        assert condition["holds"] or condition["role"] == "comparison"
+        assert row[1:] == [left, f"{right} {condition['unit']}".strip(), holds, condition["label"]]
         assert [condition["because"]] in found["conditions"]
     bounds = [certificate["error_rad"], *certificate["joint_errors_rad"]]
     names = ["‖z1‖", *(f"|z1| of {joint}" for joint in certificate["joints"])]

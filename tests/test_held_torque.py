@@ -11,17 +11,24 @@ from nbs_pin.base.claims import Label
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.coriolis import CoriolisBounds
-from nbs_pin.certificates.hold import SampledLaw, hold_of, rows_in_g
-from nbs_pin.certificates.sampled_loop import _ENLARGED, _excess, kept_level
+from nbs_pin.certificates.hold import Curvature, SampledLaw, hold_of, rows_in_g
+from nbs_pin.certificates.sampled_loop import _ENLARGED, _excess, _limit, kept_level
 from nbs_pin.certificates.sampled_motion import SampledMotion
 
 SUBSTEPS = 30
 
 
-def loop_of(name, h, lead, *, bandwidth=8.0, torque=5.0, viscous=0.0):
+LAWS = {
+    "nbs": lambda robot, bandwidth: nbs.NeuralBackstepping.for_robot(robot, bandwidth=bandwidth, seed=3),
+    "bounded": lambda robot, _: nbs.NeuralBackstepping.for_robot(robot, damping="bounded", seed=3),
+    "slotine-li": lambda robot, bandwidth: nbs.SlotineLi.for_robot(robot, bandwidth=bandwidth),
+}
+
+
+def loop_of(name, h, lead, *, bandwidth=8.0, torque=5.0, viscous=0.0, law="nbs"):
     """A sampled loop, its certificate in continuous time and the law, for an arm with viscous friction."""
     robot = nbs.load_robot(name)
-    law = nbs.NeuralBackstepping.for_robot(robot, bandwidth=bandwidth, seed=3)
+    law = LAWS[law](robot, bandwidth)
     reference, friction = nbs.Sinusoid.for_robot(robot), nbs.JointFriction.of(robot)
     if viscous:
         friction = replace(friction, viscous=np.full(robot.nv, viscous))
@@ -29,7 +36,7 @@ def loop_of(name, h, lead, *, bandwidth=8.0, torque=5.0, viscous=0.0):
     certificate = nbs.certify(law, np.full(robot.nv, torque), **given)
     constants = certificate.constants
     arm = CoriolisBounds.of(robot, constants)
-    motion = arm.motion(SampledMotion.of(reference, robot.nv, 10.0), constants.floor)
+    motion = arm.motion(SampledMotion.of(reference, robot.nv, 10.0), constants.floor, reference.largest_jerk)
     numbers = certificate.comparison.t, certificate.comparison.alpha, certificate.friction.gap.arm.viscous
     return SampledLaw(law, constants, arm, motion, *numbers, h, lead), certificate, reference
 
@@ -117,6 +124,8 @@ class OneHold:
         ("two_link", 5e-4, 0.5, {"viscous": 0.3}),
         ("ur5", 2.5e-4, 0.5, {}),
         ("ur5", 5e-4, 0.5, {"torque": 1.0}),
+        ("two_link", 3e-4, 0.5, {"law": "slotine-li"}),
+        ("two_link", 3e-4, 1.0, {"law": "bounded"}),
     ],
 )
 def test_every_quantity_of_a_hold_and_the_change_of_storage_are_within_their_bounds(name, h, share, settings):
@@ -153,11 +162,14 @@ def test_the_worst_motions_of_a_held_loop_stay_below_its_bound():
         assert (found.joint_errors <= certificate.joint_errors).all()
 
 
-def test_the_shorter_the_period_the_nearer_is_the_bound_of_continuous_time():
-    loop, certificate, _ = loop_of("two_link", 1e-3, 5e-4)
+@pytest.mark.parametrize("law", LAWS)
+def test_the_shorter_the_period_the_nearer_is_the_bound_of_continuous_time(law):
+    loop, certificate, _ = loop_of("two_link", 1e-3, 5e-4, law=law)
     levels = [kept_level(replace(loop, h=h, lead=0.5 * h), certificate.storage).level for h in (1e-3, 3e-4, 1e-4, 1e-6)]
     assert levels == sorted(levels, reverse=True)
-    assert levels[-1] <= 1.01 * certificate.storage
+    assert certificate.storage <= levels[-1] <= 1.01 * certificate.storage
+    hold = hold_of(replace(loop, h=1e-6, lead=0.0), 1.02 * certificate.storage, 1.2 * certificate.storage)
+    assert _limit(hold) >= 0.999 * certificate.storage  # nothing is lost on the way, with and without ω
 
 
 def test_continuous_time_is_checked_where_the_held_torque_is_proved_and_in_part_where_not():
@@ -168,7 +180,7 @@ def test_continuous_time_is_checked_where_the_held_torque_is_proved_and_in_part_
         assert dict(certificate.assumptions)[Assumption.TIME] == checked
     held = certificate.held
     assert 1e-4 < held.longest < 1e-3
-    assert "not provable at 1 ms" in held.line.because
+    assert "nothing is proved at 1 ms" in held.line.because
     again = nbs.certify(law, np.full(6, 5.0), reference=reference, period=0.99 * held.longest)
     assert again.held.is_proved
     assert again.error > certificate.error
@@ -184,6 +196,55 @@ def test_a_start_far_away_is_in_the_level_that_is_proved_or_nothing_is():
     assert near.overshoot[0] >= near.error
     far = nbs.certify(law, np.full(2, 5.0), q0=begin + 1.5, **given)
     assert not far.held.is_proved
+
+
+def test_the_hessian_is_bounded_on_the_whole_ellipsoid_of_a_coupled_stiffness():
+    """Where S is not diagonal, Σ (z_i/radii_i)² ≤ 1 must contain z1ᵀSz1 ≤ Φ."""
+    loop, certificate, _ = loop_of("two_link", 1e-3, 5e-4)
+    stiffness = loop.constants.stiffness.copy()
+    stiffness[0, 1] = stiffness[1, 0] = 0.9 * np.sqrt(stiffness[0, 0] * stiffness[1, 1])
+    coupled = replace(loop, constants=replace(loop.constants, stiffness=stiffness))
+    radii = []
+    watched = replace(coupled, law=_Radii(loop.law, radii))
+    Curvature.of(watched, certificate.storage)
+    z1 = np.random.default_rng(0).standard_normal((2000, 2)) @ np.linalg.inv(np.linalg.cholesky(stiffness))
+    z1 *= np.sqrt(certificate.storage / np.einsum("ki,ij,kj->k", z1, stiffness, z1))[:, None]
+    assert (((z1 / radii[0]) ** 2).sum(axis=1) <= 1.0 + 1e-9).all()
+
+
+class _Radii:
+    """A law that notes the radii it is asked about."""
+
+    def __init__(self, law, radii):
+        self.law, self.radii = law, radii
+
+    def stiffness_range(self, radii):
+        self.radii.append(radii)
+        return self.law.stiffness_range(radii)
+
+    def stiffness_rate(self, radii, weights):
+        return self.law.stiffness_rate(radii, weights)
+
+
+def test_a_reference_without_a_bound_of_its_jerk_is_not_covered():
+    """The acceleration may jump between two samples, by which nothing would tell."""
+    robot = nbs.load_robot("two_link")
+    law, smooth = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    held = nbs.certify(law, np.full(2, 5.0), reference=lambda t: smooth(t), period=1e-3).held
+    assert not held.is_proved
+    assert "largest_jerk" in held.line.because
+    short = nbs.MinimumJerk([smooth(0.0).q, smooth(0.0).q + 0.1], [0.0, 1.0])
+    assert nbs.certify(law, np.full(2, 5.0), reference=short, period=1e-3).held.is_proved
+    longer = nbs.certify(law, np.full(2, 5.0), reference=short, duration=2.0, period=1e-3).held
+    assert "largest_jerk" in longer.why_not
+
+
+@pytest.mark.parametrize("lookahead", [-0.003, np.nan, np.inf, 0.002])
+def test_a_look_ahead_out_of_range_is_refused(lookahead):
+    robot = nbs.load_robot("two_link")
+    law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    with pytest.raises(nbs.ArgumentError, match="half a period is usual"):
+        nbs.certify(law, np.full(2, 5.0), reference=reference, period=0.001, lookahead=lookahead)
 
 
 def test_what_the_proof_does_not_cover_is_said():

@@ -352,3 +352,19 @@ def test_the_motion_made_for_an_arm_is_one_it_can_follow(name):
     reference = Sinusoid.for_robot(robot)
     check_reference(reference, robot, 7.0)
     assert (reference.amplitude > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        Sinusoid([0.5, 0.2], [3.0, 20.0], phase=0.3),
+        Hold([0.1, 0.2]),
+        MinimumJerk([[0.0, 1.0], [0.4, 0.0], [0.1, 0.3]], [0.0, 0.3, 1.0]),
+        Sampled(np.linspace(0.0, 1.0, 40), np.sin(np.linspace(0.0, 6.0, 80)).reshape(40, 2)),
+    ],
+)
+def test_accelerations_change_no_faster_than_a_motion_states(motion):
+    t = np.linspace(0.0, 1.0, 20001)
+    rates = np.abs(np.diff(motion(t).a, axis=0)) / np.diff(t)[:, None]
+    assert (rates <= motion.largest_jerk * (1.0 + 1e-6) + 1e-6).all()
+    assert (rates.max(axis=0) >= 0.98 * motion.largest_jerk - 1e-6).all()

@@ -38,6 +38,15 @@ def least_eigenvalue(matrix: Float[np.ndarray, "n n"]) -> float:
     return max(direct, inner * float(diagonal.min()) * (1.0 - 1e-12)) if inner > 0.0 else direct
 
 
+def diagonal_below(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
+    """The diagonal of a diagonal matrix ⪯ W for W ≻ 0: its own if W is diagonal, else times λ_min of W scaled to 1."""
+    diagonal = np.diag(matrix)
+    if np.array_equal(matrix, np.diag(diagonal)):
+        return np.asarray(diagonal)
+    root = np.sqrt(diagonal)
+    return np.asarray(diagonal * least_eigenvalue(matrix / root / root[:, None]))
+
+
 def largest_eigenvalue(matrix: Float[np.ndarray, "n n"]) -> float:
     """An upper bound on λ_max of a symmetric matrix."""
     return float(largest_eigenvalues(matrix))

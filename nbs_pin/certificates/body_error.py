@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray, Scalars
 from nbs_pin.base.claims import Claim, Group, Label, refuse
-from nbs_pin.base.rounding import largest_eigenvalue, least_eigenvalue, up
+from nbs_pin.base.rounding import diagonal_below, largest_eigenvalue, least_eigenvalue, up
 from nbs_pin.certificates.body_bounds import BodyBounds
 from nbs_pin.certificates.body_motion import AlongReference, hessian_at_zero
 from nbs_pin.certificates.body_rates import BodyRates
@@ -159,7 +159,7 @@ class Terms:
         return least, max(largest, least), spread
 
     def _radii(self, potential: float) -> JointArray:
-        return np.sqrt(potential / _below(self.constants.stiffness))
+        return np.sqrt(potential / diagonal_below(self.constants.stiffness))
 
     def best(self, base: ComparisonSystem, storage: float) -> tuple[ComparisonSystem, float, Scalars]:
         """The inequalities while V' ≤ `storage`, with the shares of ω and x² of the least V∞; V' from 0; t.
@@ -251,16 +251,6 @@ def _lines(terms: Terms, k: ComparisonSystem, shift: np.ndarray, t: Scalars) -> 
     return tuple(
         Claim(name, value, unit, Label.PROVED, f"{why}, {here}", Group.BODIES) for name, value, unit, why in rows
     )
-
-
-def _below(matrix: np.ndarray) -> np.ndarray:
-    """Diagonal of a matrix ⪯ S."""
-    diagonal = np.diag(matrix)
-    if np.array_equal(matrix, np.diag(diagonal)):
-        return diagonal
-    root = np.sqrt(diagonal)
-    least = float(np.linalg.eigvalsh(matrix / root / root[:, None])[0])
-    return diagonal * least * (1.0 - 1e-9)
 
 
 def _mean(instants: Scalars, x: Scalars) -> float:

@@ -215,6 +215,8 @@ def _bounds(certificate: Certificate) -> tuple[Claim, ...]:
     label, here, where = certificate.label, "docs/certificates.md §2", "docs/certificates.md §3"
     if certificate.bodies is not None:
         here = where = "docs/certificates.md §14"
+    if certificate.held is not None and certificate.held.is_proved:
+        here, where = f"{here}, in continuous time", "docs/certificates.md §13"
     harmless = certificate.printed_error >= certificate.error * (1.0 - 1e-6)
     nothing, source = "disturbance", certificate.source
     if certificate.mismatch is not None:
@@ -238,7 +240,7 @@ def _bounds(certificate: Certificate) -> tuple[Claim, ...]:
         Claim("Φ∞", certificate.potential, "J", label, where, Group.BOUNDS),
     ]
     if certificate.overshoot is not None and certificate.start is not None:
-        because = "Φ never exceeds max(V(0), Φ∞), docs/certificates.md §3"
+        because = f"Φ never exceeds max(V(0), Φ∞), {where}"
         lines.insert(1, Claim("‖z1‖ from the start", certificate.overshoot[0], whole, label, because, Group.BOUNDS))
         storage, because = certificate.start.storage, "storage function at the start"
         lines.append(Claim("V(0) of the start", storage, "J", label, because, Group.BOUNDS))

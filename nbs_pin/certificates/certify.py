@@ -119,11 +119,15 @@ def certify(
     size, joints, source = errors(law, constants, comparison, least.storage, potential)
     known = (law, admissible, constants, error, rest, comparison, 0.5 * decay(comparison), least, potential)
     certificate = Certificate(*known, size, joints, source, robot=arm, mismatch=mismatch, start=start)
-    return _with_conditions(_held(certificate, motion, period, lookahead), reference, motion, period)
+    return _with_conditions(_held(certificate, reference, motion, period, lookahead), reference, motion, period)
 
 
 def _held(
-    certificate: Certificate, motion: SampledMotion | None, period: float | None, lookahead: float | None
+    certificate: Certificate,
+    reference: DesiredMotion | None,
+    motion: SampledMotion | None,
+    period: float | None,
+    lookahead: float | None,
 ) -> Certificate:
     """The certificate with the bounds of the held torque in place of those in continuous time, if they are proved."""
     if period is None:
@@ -131,14 +135,24 @@ def _held(
     law, constants = certificate.controller, certificate.constants
     inexact = certificate.mismatch is not None or bool(certificate.model_error.lines)
     other = "an inexact model is not part of the proof" if inexact else ""
-    loop = law, certificate.robot, constants, certificate.comparison, certificate.friction.gap.damping
+    gap = certificate.friction.gap
+    # Of friction known to a share, the least is in D₀, and the most acts.
+    loop = law, certificate.robot, constants, certificate.comparison, 2.0 * gap.arm.viscous - gap.damping
     begin = 0.0 if certificate.start is None else certificate.start.storage
-    held = held_torque(*loop, motion, certificate.storage, begin, period, lookahead, other)
+    held = held_torque(*loop, motion, _jerk(reference, motion), certificate.storage, begin, period, lookahead, other)
     if not held.is_proved:
         return replace(certificate, held=held)
     size, joints = radians(constants.stiffness, held.potential)
-    source = f"Φ ≥ z1ᵀSz1, with every torque held for {1e3 * period:g} ms, docs/certificates.md §13"
+    source = f"Φ ≥ z1ᵀSz1, every torque held for {1e3 * period:g} ms along the reference, docs/certificates.md §13"
     return replace(certificate, held=held, potential=held.potential, error=size, joint_errors=joints, source=source)
+
+
+def _jerk(reference: DesiredMotion | None, motion: SampledMotion | None) -> JointArray | None:
+    """The bound of |ȧ_d| that a reference states for as long as it lasts; None without one."""
+    stated = getattr(reference, "largest_jerk", None)
+    if stated is None or motion is None or motion.t[-1] > getattr(reference, "duration", math.inf) * (1.0 + 1e-12):
+        return None
+    return np.broadcast_to(np.asarray(stated, dtype=float), motion.q.shape[1:])
 
 
 def _check_arguments(

@@ -98,13 +98,15 @@ class CoriolisBounds:
         turn, turn_d = min(self.turn * energy, self.spread * speed), min(self.turn_d * energy, self.spread_d * speed)
         return Sizes(turn, turn_d, energy, speed)
 
-    def motion(self, motion: SampledMotion, floor: Float[np.ndarray, "n n"]) -> MotionBounds:
-        """The bounds of a reference."""
-        jerk = np.diff(motion.a, axis=0) / np.diff(motion.t)[:, None]
-        largest = [float(np.sqrt(np.einsum("ti,ij,tj->t", x, floor, x).max())) for x in (motion.v, motion.a, jerk)]
-        speeds = [float(w @ motion.speed) for w in (self.relative, self.by_floor, np.ones(len(floor)))]
-        between = (motion.half * largest[1], motion.half * largest[2], 0.0)
-        return MotionBounds(*speeds, *(x + more for x, more in zip(largest, between, strict=True)))
+    def motion(self, motion: SampledMotion, floor: Float[np.ndarray, "n n"], jerk: JointArray) -> MotionBounds:
+        """The bounds of a reference with |ȧ_d,i| ≤ jerk_i, at and between its samples."""
+        largest = [float(np.sqrt(np.einsum("ti,ij,tj->t", x, floor, x).max())) for x in (motion.v, motion.a)]
+        largest.append(math.sqrt(jerk @ np.abs(floor) @ jerk))
+        largest[1] += motion.half * largest[2]
+        fastest = np.abs(motion.v).max(axis=0) + motion.half * (np.abs(motion.a).max(axis=0) + motion.half * jerk)
+        speeds = [float(w @ fastest) for w in (self.relative, self.by_floor, np.ones(len(floor)))]
+        largest[0] += motion.half * largest[1]
+        return MotionBounds(*speeds, *largest)
 
 
 class _Key:

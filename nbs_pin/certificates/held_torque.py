@@ -7,6 +7,7 @@ import numpy as np
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.comparison_system import ComparisonSystem
 from nbs_pin.certificates.constants import Constants
@@ -35,13 +36,13 @@ class HeldTorque:
     level: float
     """Level of V' that no hold leaves from a start on the reference [J]; inf if none is proved."""
     potential: float
-    """Largest Φ from a start on the reference, and in the limit [J]."""
+    """Largest Φ from a start on the reference [J]."""
     potential_from_start: float
     """Largest Φ from the given start [J]."""
     room: JointArray
     """How far each torque can be from that of the reference at its samples [N·m]; inf if unknown."""
     longest: float
-    """Longest period found with a proof [s], 0 if there is none; `period` if that has one."""
+    """Longest of the periods tried that has a proof [s], 0 if none has; `period` if that has one."""
     why_not: str
     """Why no proof was tried; empty if it was."""
 
@@ -63,9 +64,11 @@ class HeldTorque:
         if self.is_proved:
             because = f"{_HERE}, torque held for {1e3 * self.period:g} ms"
             return Claim("V' that no hold leaves", self.level, "J", Label.PROVED, because, Group.BOUNDS)
-        found = "the longest found" if self.longest > 0.0 else "nor at any shorter one that was tried"
-        because = f"not provable at {1e3 * self.period:g} ms: {self.why_not or found}"
-        return Claim("period with a proof for held torques", self.longest, "s", Label.PROVED, because, Group.CONSTANTS)
+        tried = "of the periods tried, the longest that has a proof; " if self.longest > 0.0 else ""
+        because = f"{tried}nothing is proved at {1e3 * self.period:g} ms" + (
+            f": {self.why_not}" if self.why_not else ""
+        )
+        return Claim("period with held torques proved", self.longest, "s", Label.PROVED, because, Group.CONSTANTS)
 
 
 def held_torque(
@@ -75,6 +78,7 @@ def held_torque(
     comparison: ComparisonSystem,
     viscous: JointArray,
     motion: SampledMotion | None,
+    jerk: JointArray | None,
     least: float,
     begin: float,
     period: float,
@@ -83,17 +87,19 @@ def held_torque(
 ) -> HeldTorque:
     """The bounds for a period, or the longest period that has them.
 
-    viscous: friction of the joints within D₀. least: V∞ in continuous time. begin: V(0) of the start, 0 without one.
-    other: what else of the loop the proof does not cover.
+    viscous: friction of the joints, at most. jerk: bound of |ȧ_d|. least: V∞ in continuous time. begin: V(0) of the
+    start, 0 without one. other: what else of the loop the proof does not cover.
     """
     lead = 0.5 * period if lookahead is None else lookahead
-    why_not = other or _why_not(law, robot, motion)
+    if not 0.0 <= lead <= period:
+        raise ArgumentError(f"lookahead is {lead} s, expected 0 to the period of {period} s; half a period is usual.")
+    why_not = other or _why_not(law, robot, motion, jerk)
     unknown = np.full(law.nv, np.inf)
     nothing = HeldTorque(period, lead, math.inf, math.inf, math.inf, unknown, 0.0, why_not)
-    if why_not or robot is None or motion is None:
+    if why_not or robot is None or motion is None or jerk is None:
         return nothing
     arm = CoriolisBounds.of(robot, constants)
-    bounds = arm.motion(motion, constants.floor)
+    bounds = arm.motion(motion, constants.floor, jerk)
     numbers = constants, arm, bounds, comparison.t, comparison.alpha, viscous
 
     def kept(h: float, begin: float) -> Kept:
@@ -120,9 +126,11 @@ def held_torque(
     return HeldTorque(period, lead, math.inf, math.inf, math.inf, room(begin), low, "")
 
 
-def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None) -> str:
+def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None, jerk: JointArray | None) -> str:
     if motion is None:
         return "give the reference"
+    if jerk is None:
+        return "the reference states no bound of its jerk, `largest_jerk`"
     if robot is None or type(law.dynamics) not in (PinocchioDynamics, AnalyticDynamics):
         return "only for the exact model of an arm"
     if law.nv > MOST_JOINTS:

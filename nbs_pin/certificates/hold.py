@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.rounding import largest_eigenvalue, least_eigenvalue
+from nbs_pin.base.rounding import diagonal_below, largest_eigenvalue, least_eigenvalue
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.coriolis import CoriolisBounds, MotionBounds
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
@@ -85,7 +85,7 @@ class Curvature(NamedTuple):
     def with_diagonal(cls, loop: SampledLaw, potential: float) -> "tuple[Curvature, JointArray]":
         """The bounds where z1ᵀSz1 ≤ potential, and that of the diagonal of ∇²Φ [N·m/rad]."""
         k, root, rate = loop.constants, loop.root, np.sqrt(loop.constants.rate)
-        radii = np.sqrt(potential / np.diag(k.stiffness))
+        radii = np.sqrt(potential / diagonal_below(k.stiffness))
         low, high = loop.law.stiffness_range(radii)
         if not np.isfinite(high).all():
             return cls(*np.full(7, np.inf)), np.diag(high)
@@ -93,7 +93,6 @@ class Curvature(NamedTuple):
         centre, shape = 0.5 * (losses[0] + losses[1]), np.linalg.inv(np.linalg.cholesky(k.stiffness))
         middle = centre * np.diag(1.0 / k.rate)
         above, below = largest_eigenvalue(root @ (high - middle) @ root), least_eigenvalue(root @ (low - middle) @ root)
-        scaled = k.floor / np.sqrt(np.diag(k.floor)) / np.sqrt(np.diag(k.floor))[:, None]
         found = cls(
             centre=centre,
             steepest=largest_eigenvalue(root @ high @ root),
@@ -101,7 +100,7 @@ class Curvature(NamedTuple):
             loss=losses[1],
             rest=max(above, -below),
             rest_loss=0.5 * (losses[1] - losses[0]),
-            change=loop.law.stiffness_rate(radii, np.diag(k.floor) * least_eigenvalue(scaled)),
+            change=loop.law.stiffness_rate(radii, diagonal_below(k.floor)),
         )
         return found, np.asarray(np.diag(high))
 
@@ -197,15 +196,17 @@ def _numbers(loop: SampledLaw, level: float, curve: Curvature, sups: Suprema) ->
     rest_f = min(isk * rest * k.nu, arm.loss_m * curve.rest_loss * arm.loss_inverse * snu)
     turning = curve.centre + rest
     turn = motion.turn + arm.turn * sups.rate_m
-    exponent = 2.0 * turn * (h + lead)
+    bend = 0.5 * lead**2 * motion.acceleration
+    exponent = 2.0 * (turn * (h + lead) + arm.spread * bend)
     if exponent > 1.0:
         return None
     stretch = math.exp(0.5 * exponent)
     moved = k.nu * sups.force + turning * sups.rate + motion.acceleration
     moved_m = snu * stretch * sups.force + curve.centre * sups.rate_m + rest_m * sups.rate + isk * motion.acceleration
-    bend = 0.5 * lead**2 * motion.acceleration
     speed, speed_m = motion.speed + sups.rate, isk * motion.speed + sups.rate_m
-    loss = sups.loss + math.sqrt(loop.loss_of_speed) * curve.steepest * (h + lead) * sups.rate
+    loss = sups.loss + math.sqrt(loop.loss_of_speed) * curve.steepest * (
+        (h + lead) * sups.rate + lead**3 / 6.0 * motion.jerk
+    )
     lag, late = turning * lead, turning * lead**3 / 6.0 * motion.jerk + lead**2 / 2.0 * motion.jerk
     share = loop.law.damping_share((sups.speed + lag * sups.rate + late) * UP)
     if not math.isfinite(share):
@@ -291,9 +292,11 @@ def _force(b: Hold) -> tuple[Float[np.ndarray, " 7"], float]:
     row = row + (by_speed + b.loop.viscous) * S + b.loop.alpha * L + swing * slow * h * (snu * F + turned)
     constant += swing * isk * motion.acceleration * (slow * (h + b.loop.lead) + by_speed_m * b.half)
     row = row + swing * by_speed_m * (
-        b.half * turned + 0.5 * h * h * (curve.centre * (snu * F + turned) + b.rest_f * F)
+        b.half * turned + 0.5 * h * h * (curve.centre * (snu * F + turned) + b.rest_f * F + b.rest_m * b.turning * R)
     )
     row = row + 2.0 * sum_1 * by_speed * math.sqrt(b.loop.loss_of_speed) * L
+    row = row + 2.0 * sum_1 * by_speed * b.turning * b.loop.lead * R
+    constant += swing * by_speed_m * (curve.centre * isk + b.rest_m) * b.late[0]
     return row, constant + 2.0 * sum_1 * by_speed * (motion.speed + b.turning * b.late[0])
 
 

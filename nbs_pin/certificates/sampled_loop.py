@@ -122,7 +122,7 @@ def _excess(
     changing = isk * bend_m + isk * swing * b.turn * phi_m + 2.0 * swing * by_speed_m * v_dot
     changing = changing + 2.0 * b.speed_1 * by_speed * (motion.speed * ONE + rate)
     changing = changing + arm.gravity * (motion.speed_1 * ONE + arm.sum * rate) + swing * b.turn * force
-    changing = changing + b.loop.viscous * k.nu * force
+    changing = changing + b.loop.viscous * (k.nu * force + b.turning * rate)
     drift, drift_m = k.nu * h * h / 12.0 * changing, snu * h * h / 12.0 * changing
     ripple, ripple_m = 0.5 * h * k.nu * force, 0.5 * h * snu * force
     q = _Form()
@@ -140,7 +140,7 @@ def _excess(
     q.add((1.0 - k.coupling) / math.sqrt(k.delta) + b.loop.alpha, Y, X)
     q.add(b.loop.viscous, Y, drift)
     _add_held(b, sup, q, turned, v_dot, seen)
-    spread = h / math.sqrt(12.0) * (k.nu * (sup.gradient + by_speed * Y) + k.omega * Y)
+    spread = h / math.sqrt(12.0) * (k.nu * (sup.gradient + (by_speed + b.loop.viscous) * Y) + k.omega * Y)
     ends = _Form()
     ends.add(h * h / 12.0 * curve.steepest, rate, rate)
     ends.add(h * h / 12.0, sup.gradient, k.nu * force + b.turning * rate)
@@ -201,9 +201,9 @@ def _limit(b: Hold) -> float:
     k, t = b.loop.constants, b.loop.t
     excess, spread, ends = _excess(b, rows)
 
-    def level(choice: Float[np.ndarray, " 3"]) -> float:
+    def level(choice: Float[np.ndarray, " k"]) -> float:
         """From t√(y² + b²) ≤ s(y² + b²) + t²/4s, a rate c of V', and the share of y² in W."""
-        s, c, share = choice.tolist()
+        s, c, share = choice.tolist() if k.omega > 0.0 else (*choice.tolist(), 1.0)
         if not (0.0 < s <= 1.0 and 0.0 < c < 2.0 / b.loop.h and 0.0 <= share <= 1.0):
             return math.inf
         form = np.diag([1.0 - c / (2.0 * k.rho), 1.0 - s - c * share / (2.0 * k.kappa), 1.0, 1.0, 0.0])
@@ -215,9 +215,10 @@ def _limit(b: Hold) -> float:
         return float((t * t / (4.0 * s) - form[4, 4] + free @ np.linalg.solve(form[:4, :4], free)) / c)
 
     fastest = 2.0 * min(k.rho, k.omega + k.kappa)
-    shares = (0.0, 0.3) if k.omega > 0.0 else (1.0,)
-    tried = [np.array(x) for x in product(np.linspace(0.2, 1.0, 9), fastest * np.linspace(0.1, 1.0, 13), shares)]
-    best = min(tried, key=level)
+    rates = fastest * np.linspace(0.04, 1.0, 25)
+    # Without ω only y² bounds W, so its share is 1.
+    share = [0.0] if k.omega > 0.0 else []
+    best = min((np.array([*x, *share]) for x in product(np.linspace(0.1, 1.0, 19), rates)), key=level)
     if not math.isfinite(level(best)):
         return math.inf
     found = minimize(lambda x: min(level(x), 1e300), best, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8})

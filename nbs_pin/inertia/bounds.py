@@ -9,7 +9,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Label
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.rounding import down, largest_eigenvalue, least_eigenvalue, up
+from nbs_pin.base.rounding import diagonal_below, down, largest_eigenvalue, up
 from nbs_pin.dynamics.rigid_tree import Arm, RigidTree
 from nbs_pin.inertia.lever_arms import lever_arms
 from nbs_pin.inertia.multipliers import largest_by_multipliers, least_by_multipliers
@@ -81,7 +81,7 @@ def least_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None
 def trace_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> float:
     """Upper bound of max_q trace(W⁻¹M(q)); a W that is not diagonal is replaced by a diagonal matrix ⪯ W."""
     tree = RigidTree.of(arm)
-    return up(float(np.sum(_body_traces(tree, 1.0 / _diagonal_below(weight)))))
+    return up(float(np.sum(_body_traces(tree, 1.0 / diagonal_below(weight)))))
 
 
 def trigonometric_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int = POSES) -> float:
@@ -90,7 +90,7 @@ def trigonometric_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int =
     if len(tree.endless) or not tree.physical:
         return np.inf
     # Bounds the condition number of W scaled to a unit diagonal, for the rounding of its Cholesky factor.
-    spread = tree.nv * float(np.max(np.diag(weight) / _diagonal_below(weight)))
+    spread = tree.nv * float(np.max(np.diag(weight) / diagonal_below(weight)))
     return up(pose_grid_bound(tree, weight, poses)) * (1.0 + 64.0 * tree.nv * np.finfo(float).eps * spread)
 
 
@@ -172,17 +172,8 @@ def _apart(tree: RigidTree, i: int) -> float:
     return float(np.linalg.norm(position + rotation @ tree.centre[i] - tree.centre[tree.parents[i]], axis=1).max())
 
 
-def _diagonal_below(weight: Float[np.ndarray, "n n"]) -> JointArray:
-    """Diagonal of a matrix ⪯ W: that of W if W is diagonal, else times λ_min of W scaled to a unit diagonal."""
-    diagonal = np.diag(weight)
-    if np.array_equal(weight, np.diag(diagonal)):
-        return diagonal
-    root = np.sqrt(diagonal)
-    return diagonal * least_eigenvalue(weight / root / root[:, None])
-
-
 def _check_weight(weight: Float[np.ndarray, "n n"], nv: int) -> None:
     """Raise ArgumentError unless W is (nv, nv), symmetric and positive definite by more than rounding."""
     symmetric = weight.shape == (nv, nv) and np.isfinite(weight).all() and np.array_equal(weight, weight.T)
-    if not (symmetric and (np.diag(weight) > 0.0).all() and (_diagonal_below(weight) > 0.0).all()):
+    if not (symmetric and (np.diag(weight) > 0.0).all() and (diagonal_below(weight) > 0.0).all()):
         raise ArgumentError(f"the weight is not a symmetric positive definite ({nv}, {nv}) matrix; give D₀ or I.")

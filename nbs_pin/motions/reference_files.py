@@ -56,6 +56,11 @@ class Sampled:
         """Time of the last sample [s]."""
         return float(self.t[-1])
 
+    @property
+    def largest_jerk(self) -> np.ndarray:
+        """Largest |ȧ_d| of each joint until the last sample: the third derivative of each cubic [rad/s³]."""
+        return np.asarray(6.0 * np.abs(self._spline.c[0]).max(axis=0))
+
     @cached_property
     def _spline(self) -> CubicSpline:
         return CubicSpline(self.t, self.q, axis=0)

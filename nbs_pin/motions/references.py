@@ -16,7 +16,10 @@ from nbs_pin.base.records import Reference
 from nbs_pin.robots.robot import Robot
 
 DesiredMotion: TypeAlias = Callable[[Any], Reference]
-"""ref(t) -> Reference, for a time [s] (shapes (n,)) or an array of times (shapes (..., n))."""
+"""ref(t) -> Reference, for a time [s] (shapes (n,)) or an array of times (shapes (..., n)).
+
+Motions may state `duration` [s], how long they last, and `largest_jerk` (n,), a bound of |ȧ_d| while they do [rad/s³].
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,11 @@ class Sinusoid:
         span = np.minimum(robot.upper - robot.lower, 2.0 * np.pi)
         reach = np.minimum.reduce([np.full(robot.nv, amplitude), 0.25 * span, 0.5 * robot.velocity_limit / frequency])
         return cls(reach, frequency, 0.5 * np.pi * (np.arange(robot.nv) % 2), resting_posture(robot))
+
+    @property
+    def largest_jerk(self) -> np.ndarray:
+        """Bound of |ȧ_d| of each joint, |A|ω³ [rad/s³]."""
+        return np.abs(self.amplitude * np.asarray(self.frequency, dtype=float) ** 3)
 
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
@@ -101,6 +109,11 @@ class Hold:
     def __post_init__(self) -> None:
         per_joint(self, "q")
 
+    @property
+    def largest_jerk(self) -> np.ndarray:
+        """0: it does not move [rad/s³]."""
+        return np.zeros(np.size(self.q))
+
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
         q = np.atleast_1d(self.q)
@@ -143,6 +156,12 @@ class MinimumJerk:
     def duration(self) -> float:
         """Time of the last waypoint [s]."""
         return float(self.times[-1])
+
+    @property
+    def largest_jerk(self) -> np.ndarray:
+        """Bound of |ȧ_d| of each joint, the largest 60|Δq|/T³ of the segments [rad/s³]."""
+        moved = np.abs(np.diff(self.waypoints, axis=0))
+        return np.asarray((60.0 * moved / np.diff(self.times)[:, None] ** 3).max(axis=0))
 
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
