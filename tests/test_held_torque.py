@@ -14,6 +14,7 @@ from nbs_pin.certificates.coriolis import CoriolisBounds
 from nbs_pin.certificates.hold import Curvature, SampledLaw, hold_of, rows_in_g
 from nbs_pin.certificates.sampled_loop import _ENLARGED, _excess, _limit, kept_level
 from nbs_pin.certificates.sampled_motion import SampledMotion
+from nbs_pin.controllers.gains import Gains, effective_inertia
 
 SUBSTEPS = 30
 
@@ -184,6 +185,20 @@ def test_continuous_time_is_checked_where_the_held_torque_is_proved_and_in_part_
     again = nbs.certify(law, np.full(6, 5.0), reference=reference, period=0.99 * held.longest)
     assert again.held.is_proved
     assert again.error > certificate.error
+
+
+def test_gains_that_suit_a_period_have_a_proof_at_it():
+    """ur5 at 1 kHz: less damping per inertia than a proof for larger disturbances needs, and a weak network in Φ."""
+    robot = nbs.load_robot("ur5")
+    inertia = effective_inertia(robot, nbs.PinocchioDynamics(robot))
+    gains = Gains(6.0, 1000.0 * inertia, 100.0 * inertia)
+    law = nbs.NeuralBackstepping.for_robot(robot, gains=gains, damping_ceiling=0.05)
+    for weights in law.potential.network.parameters():
+        weights.data *= 0.3
+    box = np.full(6, 1.0)
+    certificate = nbs.certify(law, box, reference=nbs.Sinusoid.for_robot(robot), period=1e-3)
+    assert certificate.held.is_proved
+    assert certificate.error <= 1.4 * nbs.certify(law, box).error
 
 
 def test_a_start_far_away_is_in_the_level_that_is_proved_or_nothing_is():
