@@ -146,7 +146,7 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
 
     diagonal = largest_diagonal(tree)
     weight = np.linalg.norm(key.robot.model.gravity.linear) * np.sqrt(_carried(tree) * diagonal)
-    above, below = np.diag(1.0 / rate), np.diag(1.0 / rate)
+    slowness = np.diag(1.0 / rate)
     return CoriolisBounds(
         relative=relative,
         by_floor=by_floor,
@@ -160,8 +160,8 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
         single=np.array([rate_bound(tree, unit) for unit in np.eye(n)]),
         weight=weight,
         gravity=largest(weight),
-        loss_m=math.sqrt(largest_inertia_bound(tree, above).value),
-        loss_inverse=1.0 / math.sqrt(max(least_inertia_bound(tree, below).value, 1e-300)),
+        loss_m=math.sqrt(largest_inertia_bound(tree, slowness).value),
+        loss_inverse=1.0 / math.sqrt(max(least_inertia_bound(tree, slowness).value, 1e-300)),
     )
 
 

@@ -124,6 +124,37 @@ class Suprema(NamedTuple):
     """|Mż2|_*."""
 
 
+class Late(NamedTuple):
+    """What the reference's jerk adds to the predicted z1 and ż1, in |·|."""
+
+    position: float
+    rate: float
+
+
+class Bent(NamedTuple):
+    """A displacement in three sizes."""
+
+    speed: float
+    """In |·|."""
+    energy: float
+    """In |·|_M."""
+    total: float
+    """Σ|·_i|."""
+
+
+class Coriolis(NamedTuple):
+    """Bounds of C(q, v)."""
+
+    by_speed: float
+    """|C(q, v)z|_* ≤ by_speed·|z|."""
+    by_energy: float
+    """|C(q, v)z|_* ≤ by_energy·|z|_M."""
+    slow: float
+    """|C(q, φ)b|_* ≤ slow·|b|_M, with φ in place of v."""
+    form: float
+    """|aᵀC(q, v)b| ≤ form·|a|_M|b|_M."""
+
+
 @dataclass(frozen=True, eq=False)
 class Hold:
     """A hold that begins in {V' ≤ level}, by numbers that bound it whatever it does."""
@@ -141,8 +172,8 @@ class Hold:
     """|ΛΨb|_M ≤ rest_m·|b|."""
     rest_f: float
     """|ΛΨM⁻¹f|_M ≤ rest_f·|f|_*."""
-    late: tuple[float, float]
-    """What the reference's jerk adds to the predicted z1 and ż1, in |·|."""
+    late: Late
+    """What the reference's jerk adds to the prediction."""
     turn: float
     """Σ γ_i|v_i| [1/s]."""
     speed: float
@@ -157,12 +188,12 @@ class Hold:
     """Longest time between an instant of the hold and that for which the law was evaluated [s]."""
     mean: float
     """Its mean over the hold [s]."""
-    bent: tuple[float, float, float]
-    """What accelerations add to q̂ − q: in |·|, in |·|_M and in Σ|·_i|."""
+    bent: Bent
+    """What accelerations add to q̂ − q."""
     share: float
     """D(z2) ⪯ (1 + share)D₀."""
-    held: tuple[float, float, float, float]
-    """Of C: |C(v)z|_* by |z| and by |z|_M; |C(φ)b|_* by |b|_M; aᵀC(v)b by |a|_M|b|_M."""
+    coriolis: Coriolis
+    """Bounds of C(q, v) over the hold."""
 
 
 def hold_of(loop: SampledLaw, level: float, potential: float) -> Hold | None:
@@ -181,7 +212,7 @@ def hold_of(loop: SampledLaw, level: float, potential: float) -> Hold | None:
             return None
         if all(x <= y for x, y in zip(found, sups, strict=True)):
             stiffness = largest_eigenvalue(loop.root @ k.stiffness @ loop.root)
-            farthest = math.sqrt(stiffness) * ((loop.h + loop.lead) * sups.rate + hold.late[0])
+            farthest = math.sqrt(stiffness) * ((loop.h + loop.lead) * sups.rate + hold.late.position)
             return hold if math.sqrt(level) + farthest <= math.sqrt(potential) else None
         sups = Suprema(*(x * (1.0 + 1e-6) for x in found))
     return None
@@ -216,7 +247,7 @@ def _numbers(loop: SampledLaw, level: float, curve: Curvature, sups: Suprema) ->
     mixed = min(arm.turn_d, arm.spread_d * snu)
     angle = motion.turn + min(arm.turn * sups.rate_m, arm.spread * sups.rate)
     slow_angle = motion.turn + min(arm.turn * arm.loss_m, arm.spread * math.sqrt(loop.loss_of_speed)) * loss
-    held = (
+    coriolis = Coriolis(
         0.5 * (turned + 2.0 * arm.spread_d * speed),
         0.5 * (isk * angle + mixed * speed + arm.spread * speed_m),
         0.5 * (isk * slow_angle + mixed * slow + arm.spread * slow_m),
@@ -231,7 +262,7 @@ def _numbers(loop: SampledLaw, level: float, curve: Curvature, sups: Suprema) ->
         turning=turning,
         rest_m=rest_m,
         rest_f=rest_f,
-        late=(lead**3 / 6.0 * motion.jerk, lead**2 / 2.0 * motion.jerk),
+        late=Late(lead**3 / 6.0 * motion.jerk, lead**2 / 2.0 * motion.jerk),
         turn=turn,
         speed=speed,
         speed_m=speed_m,
@@ -239,27 +270,29 @@ def _numbers(loop: SampledLaw, level: float, curve: Curvature, sups: Suprema) ->
         stretch=stretch,
         half=max(lead, h - lead),
         mean=(0.5 * h * h - h * lead + lead * lead) / h if lead <= h else lead - 0.5 * h,
-        bent=(0.5 * h * h * moved + bend, 0.5 * h * h * moved_m + isk * bend, arm.sum * (0.5 * h * h * moved + bend)),
+        bent=Bent(
+            0.5 * h * h * moved + bend, 0.5 * h * h * moved_m + isk * bend, arm.sum * (0.5 * h * h * moved + bend)
+        ),
         share=share,
-        held=held,
+        coriolis=coriolis,
     )
 
 
 def predicted(b: Hold) -> tuple[float, float]:
     """|ẑ2 − z2| at the start of the hold, for the predicted ẑ2: by |ż1|, and constant."""
-    return b.turning * b.loop.lead, b.turning * b.late[0] + b.late[1]
+    return b.turning * b.loop.lead, b.turning * b.late.position + b.late.rate
 
 
 def lagging(b: Hold, time: float) -> tuple[float, float]:
     """What joints turn between q and q̂, in Σ γ_i|·_i| and in Σ |·_i|, for a bound of |t − t̂| or its mean."""
     arm = b.loop.arm
-    return time * b.turn + arm.turn * b.bent[1], time * b.speed_1 + b.bent[2]
+    return time * b.turn + arm.turn * b.bent.energy, time * b.speed_1 + b.bent.total
 
 
 def changed(b: Hold, time: float) -> float:
     """|Λ(∇²Φ(ẑ1) − ∇²Φ(z1))| by which ż1 is multiplied, for a bound of |t − t̂|."""
     rest = 2.0 * (b.turning - b.curve.centre)
-    return min(rest, b.loop.loss_of_speed * b.curve.change * (time * b.sups.rate + b.bent[0] + b.late[0]))
+    return min(rest, b.loop.loss_of_speed * b.curve.change * (time * b.sups.rate + b.bent.speed + b.late.position))
 
 
 def _force(b: Hold) -> tuple[Float[np.ndarray, " 7"], float]:
@@ -271,14 +304,14 @@ def _force(b: Hold) -> tuple[Float[np.ndarray, " 7"], float]:
     lag, late = predicted(b)
     # ∇Φ and the damping at the predicted state
     row = G + curve.steepest * (b.half * R + 0.5 * h * h * (k.nu * F + b.turning * R)) + lag * R
-    constant = b.loop.t + curve.steepest * b.late[0] + late
+    constant = b.loop.t + curve.steepest * b.late.position + late
     # −ωM z2, and M times the change of φ̇ − ωz2
     turned = curve.centre * RM + b.rest_m * R
     change = isk * changed(b, b.half)
     rest = (
         h * curve.centre * turned + h * (b.rest_f * F + b.rest_m * b.turning * R) + change * R + omega * isk * lag * R
     )
-    extra = (curve.centre * isk + b.rest_m) * b.late[1] + change * b.late[1] + omega * isk * late
+    extra = (curve.centre * isk + b.rest_m) * b.late.rate + change * b.late.rate + omega * isk * late
     inverse = 1.0 + swing * b.turn * h * isk * snu
     row = row + omega * isk * SM + inverse * (curve.centre + omega) * h * F + isk * rest
     constant += isk * extra
@@ -288,7 +321,7 @@ def _force(b: Hold) -> tuple[Float[np.ndarray, " 7"], float]:
     constant += isk * (swing * angle * (extra + isk * motion.acceleration) + isk * motion.jerk * b.half)
     constant += b.loop.arm.gravity * sum_1
     # −C z2, and the change of C(q, v)φ
-    by_speed, by_speed_m, slow, _ = b.held
+    by_speed, by_speed_m, slow, _ = b.coriolis
     row = row + (by_speed + b.loop.viscous) * S + b.loop.alpha * L + swing * slow * h * (snu * F + turned)
     constant += swing * isk * motion.acceleration * (slow * (h + b.loop.lead) + by_speed_m * b.half)
     row = row + swing * by_speed_m * (
@@ -296,8 +329,8 @@ def _force(b: Hold) -> tuple[Float[np.ndarray, " 7"], float]:
     )
     row = row + 2.0 * sum_1 * by_speed * math.sqrt(b.loop.loss_of_speed) * L
     row = row + 2.0 * sum_1 * by_speed * b.turning * b.loop.lead * R
-    constant += swing * by_speed_m * (curve.centre * isk + b.rest_m) * b.late[0]
-    return row, constant + 2.0 * sum_1 * by_speed * (motion.speed + b.turning * b.late[0])
+    constant += swing * by_speed_m * (curve.centre * isk + b.rest_m) * b.late.position
+    return row, constant + 2.0 * sum_1 * by_speed * (motion.speed + b.turning * b.late.position)
 
 
 def _first(b: Hold) -> Suprema | None:

@@ -85,7 +85,7 @@ def _after(loop: SampledLaw, level: float) -> tuple[Kept, float]:
 
 def _seen(b: Hold) -> float:
     """Φ + W of the predicted state: √Φ and √W change by at most half their slopes times the way to it."""
-    moved, late = b.loop.lead * b.sups.rate + b.late[0], predicted(b)
+    moved, late = b.loop.lead * b.sups.rate + b.late.position, predicted(b)
     z2 = late[0] * b.sups.rate + late[1]
     start = math.sqrt(b.level / (1.0 - 0.5 * b.loop.h * b.loop.constants.nu))
     change = 0.5 * math.sqrt(b.curve.steepest * b.curve.growth) * moved
@@ -111,7 +111,7 @@ def _excess(
     k, curve, motion, h, arm = b.loop.constants, b.curve, b.loop.motion, b.loop.h, b.loop.arm
     snu, isk, swing, y_m = math.sqrt(k.nu) * b.stretch, b.isk, b.stretch**2, mean_m(b)
     force, rate = sup.force, sup.rate
-    by_speed, by_speed_m, _, all_m = b.held
+    by_speed, by_speed_m, _, all_m = b.coriolis
     turned = curve.centre * sup.rate_m + b.rest_m * rate
     phi_m = isk * motion.acceleration * ONE + turned
     v_dot = snu * force + phi_m
@@ -161,22 +161,22 @@ def _add_held(
     """Adds ȳᵀ⟨e⟩: the law at the predicted state against the law along the hold."""
     k, curve, motion, h, arm = b.loop.constants, b.curve, b.loop.motion, b.loop.h, b.loop.arm
     snu, isk, swing, y_m, omega = math.sqrt(k.nu) * b.stretch, b.isk, b.stretch**2, mean_m(b), k.omega
-    by_speed, by_speed_m, slow, _ = b.held
+    by_speed, by_speed_m, slow, _ = b.coriolis
     force, rate = sup.force, sup.rate
     angle, sum_1 = lagging(b, b.mean)
     acceleration = k.nu * force + b.turning * rate
     # ∇Φ: its part cΛ⁻¹z1 has no lag on average if the law looks half a period ahead
     linear = curve.centre / k.delta * k.coupling
     uneven = abs(0.5 * h - b.loop.lead) * linear + b.mean * curve.rest
-    q.add(1.0, Y, uneven * rate + (linear + curve.rest) * (h * h / 6.0 * acceleration + b.late[0] * ONE) + seen)
+    q.add(1.0, Y, uneven * rate + (linear + curve.rest) * (h * h / 6.0 * acceleration + b.late.position * ONE) + seen)
     # M(φ̇ − ωz2)
     inverse = 1.0 + swing * b.turn * h * isk * snu
     q.add(0.5 * h * (curve.centre + omega) * inverse, Y, force)
     change = isk * changed(b, b.half)
     rest = 0.5 * h * (curve.centre * turned + b.rest_f * force + b.rest_m * b.turning * rate) + change * rate
-    q.add(1.0, y_m, rest + omega * isk * seen + ((curve.centre * isk + b.rest_m + change) * b.late[1]) * ONE)
+    q.add(1.0, y_m, rest + omega * isk * seen + ((curve.centre * isk + b.rest_m + change) * b.late.rate) * ONE)
     twice = 2.0 * rest + (curve.centre + omega) * h * snu * force + turned + omega * sup.speed_m + omega * isk * seen
-    q.add(swing * angle, y_m, twice + (isk * motion.acceleration + (curve.centre * isk + b.rest_m) * b.late[1]) * ONE)
+    q.add(swing * angle, y_m, twice + (isk * motion.acceleration + (curve.centre * isk + b.rest_m) * b.late.rate) * ONE)
     q.add(isk * motion.jerk * b.half, y_m, ONE)
     # gravity and C(q, v)φ
     bend = 0.5 * h * h * (acceleration + motion.acceleration * ONE) + 0.5 * b.loop.lead**2 * motion.acceleration * ONE
@@ -184,11 +184,11 @@ def _add_held(
     q.add(swing * slow, Y, 0.5 * h * v_dot + b.loop.lead * isk * motion.acceleration * ONE)
     turn_m = b.mean * (turned + isk * motion.acceleration * ONE)
     second = 0.5 * h * h * (curve.centre * (snu * force + turned) + b.rest_f * force + b.rest_m * b.turning * rate)
-    q.add(swing * by_speed_m, Y, turn_m + second + (curve.centre * isk + b.rest_m) * b.late[0] * ONE)
+    q.add(swing * by_speed_m, Y, turn_m + second + (curve.centre * isk + b.rest_m) * b.late.position * ONE)
     slowest = (
         motion.speed * ONE
         + math.sqrt(b.loop.loss_of_speed) * sup.loss
-        + b.turning * (b.half * rate + bend + b.late[0] * ONE)
+        + b.turning * (b.half * rate + bend + b.late.position * ONE)
     )
     q.add(2.0 * sum_1 * by_speed, Y, slowest)
 
