@@ -187,6 +187,18 @@ def test_continuous_time_is_checked_where_the_held_torque_is_proved_and_in_part_
     assert again.error > certificate.error
 
 
+@pytest.mark.parametrize("torque", [0.0, 1e-3])
+def test_what_a_hold_alone_does_to_a_reference_is_bounded(torque):
+    robot = nbs.load_robot("two_link")
+    law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    certificate = nbs.certify(law, np.full(2, torque), reference=reference, period=1e-3)
+    assert certificate.held.is_proved
+    assert certificate.label is Label.PROVED
+    assert 0.0 < certificate.error < 1e-4
+    run = nbs.simulate(nbs.DynamicsPlant.for_robot(robot), law, reference, 1.0, 1e-3)
+    assert 0.0 < np.linalg.norm(run.q - run.q_ref, axis=-1).max() <= certificate.error
+
+
 def test_gains_that_suit_a_period_have_a_proof_at_it():
     """ur5 at 1 kHz: less damping per inertia than a proof for larger disturbances needs, and a weak network in Φ."""
     robot = nbs.load_robot("ur5")

@@ -35,8 +35,12 @@ from nbs_pin.certificates.hold import (
 
 _ENLARGED = (1.1, 1.3, 1.6, 2.0, 3.0, 5.0)
 """Levels of Φ on which ∇²Φ is bounded, relative to the level at the instants."""
-_MOST = 30.0
-"""Largest level that is tried, relative to that in continuous time."""
+_LEAST = 1e-15
+"""Level to begin with if there is no disturbance: holding the torque alone disturbs [J]."""
+_MOST, _SMALL = 2.0, 1e-6
+"""Largest levels tried where the ones below show nothing: relative to that in continuous time, and absolute [J]."""
+_ROUNDS = 100
+"""Levels that are tried, each a little above that which the one before tends to."""
 
 
 class Kept(NamedTuple):
@@ -58,12 +62,17 @@ def kept_level(loop: SampledLaw, least: float) -> Kept:
 
     least: V∞ of the loop in continuous time, or V of the start if that is larger.
     """
-    kept = _after(loop, 1.02 * least)
-    while not kept[1] <= kept[0].level:
-        larger = 1.02 * kept[1]
-        if not larger <= _MOST * least:
+    kept = _after(loop, max(1.02 * least, _LEAST))
+    for _ in range(_ROUNDS):
+        if kept[1] <= kept[0].level:
+            break
+        # A level may be too small for what the reference alone does during a hold.
+        larger = 1.02 * kept[1] if math.isfinite(kept[1]) else 4.0 * kept[0].level
+        if not math.isfinite(kept[1]) and larger > max(_MOST * least, _SMALL):
             return _NOTHING
         kept = _after(loop, larger)
+    if not kept[1] <= kept[0].level:
+        return _NOTHING
     for _ in range(8):
         again = _after(loop, max(1.0005 * kept[1], least))
         if not again[1] <= again[0].level < kept[0].level:
