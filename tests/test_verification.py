@@ -635,3 +635,20 @@ def test_without_its_extra_the_command_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "flint", None)
     with pytest.raises(MissingExtra, match=r"pip install 'nbs-pin\[verify\]'"):
         importlib.import_module("nbs_pin.verification.verify")
+
+
+@pytest.mark.parametrize("what", ["assumptions", "theorem", "comparison"])
+def test_no_premise_can_be_left_out_or_made_a_comparison(what, tmp_path):
+    robot = nbs.load_robot("two_link")
+    law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    document = certificate_document(nbs.certify(law, [5.0, 5.0], reference=reference))
+    if what == "assumptions":
+        document["assumptions"] = document["assumptions"][:-1]
+    elif what == "theorem":
+        document["conditions"] = document["conditions"][1:]
+    else:
+        document["conditions"][-1]["role"] = "comparison"
+    file = tmp_path / "certificate.json"
+    file.write_text(json.dumps(document | {"sha256": seal(document)}))
+    with pytest.raises(FileFormatError, match=r"does not list|no condition|counts as a comparison"):
+        nbs.verify(file)

@@ -1,5 +1,8 @@
 """From what is known of the bodies of the true arm to the bounds that hold for all of them."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from nbs_pin.base.claims import refuse
@@ -51,6 +54,14 @@ def bounds_for_all(
     regressor = BodyRegressor(robot, model, errors)
     along = AlongReference.of(regressor, law, reference, float(motion.t[-1]), constants)
     bounds = BodyBounds.of(robot, tree, errors, constants)
+    # A payload only adds to M, the shares may take from it.
+    own = (
+        bounds
+        if uncertainty.payload is None
+        else BodyBounds.of(robot, tree, replace(uncertainty, payload=None).errors(robot, model), constants)
+    )
+    if uncertainty.inertia > 0.0 and not math.isfinite(own.nu):
+        refuse("within these shares M is not shown to be positive definite in every pose", "give smaller ones")
     rates = BodyRates.of(bounds, constants, motion)
     terms = Terms(law, constants, bounds, along, rates, friction)
     return body_error(terms, base, 0.0 if start is None else _first(law, regressor, start))

@@ -100,7 +100,7 @@ class Terms:
         turn = spread * inertia + mixed * near * 0.5 * (high - low)
         beta = along.spin + turn / math.sqrt(c.delta) + turned + 0.5 * r.force * (force + slip)
         beta = beta + along.roll + m.force * within * lag + 0.5 * slope**2
-        t = along.defect + r.between(along) + (along.pose / c.rho + 2.0 * curved) * along.static
+        t = along.defect + r.between(along, near) + (along.pose / c.rho + 2.0 * curved) * along.static
         t = t + (along.coriolis + around + high * inertia + r.cubic * slip) * slip
         t = t + (along.twist + m.cubic * within * lag) * slip + m.off_around * lag
         t = t + self.friction.alpha * (along.static + 2.0 * lag)

@@ -1,7 +1,7 @@
 """What errors of the bodies do along a reference: everything is linear in them (docs/certificates.md §14)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -80,7 +80,20 @@ class AlongReference:
         rows = [sums.at(k) for k in range(len(t))]
         joints = [np.array([x[i] for x in rows]) * _OUTWARD for i in range(1, 3)]
         model_terms = (x * _OUTWARD for x in sums.of_model(states[0], states[1], regressor.slides))
-        return cls(t, *(np.array([x[0] for x in rows]).T * _OUTWARD), *joints, *model_terms)
+        return cls(t, *(np.array([x[0] for x in rows]).T * _OUTWARD), *joints, *model_terms)._widened()
+
+    def _widened(self) -> "AlongReference":
+        """The bounds up to the neighbouring instants, so that products of them hold between the instants too."""
+        names = [field.name for field in fields(self) if field.name != "t"]
+        return replace(self, **{name: _nearby(getattr(self, name)) for name in names})
+
+
+def _nearby(x: Float[np.ndarray, "rows *n"]) -> Float[np.ndarray, "rows *n"]:
+    """The largest of each row and its neighbours."""
+    found = x.copy()
+    found[1:] = np.maximum(found[1:], x[:-1])
+    found[:-1] = np.maximum(found[:-1], x[1:])
+    return found
 
 
 @dataclass(frozen=True, eq=False)

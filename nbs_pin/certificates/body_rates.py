@@ -59,7 +59,8 @@ class BodyRates:
         v, a = np.abs(motion.v), np.abs(motion.a)
         half = max(motion.half, 0.5 * LONGEST)
         off_q, off_v = half * motion.speed, half * a.max(axis=0)
-        off_a = 0.5 * half / motion.half * np.abs(np.diff(motion.a, axis=0)).max(axis=0)
+        # Between neighbours, so it may change by all that separates them.
+        off_a = max(1.0, math.ceil(half / motion.half)) * np.abs(np.diff(motion.a, axis=0)).max(axis=0)
 
         def around(x: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, " rows"]:
             return np.asarray(x @ mixed + sum(gains) * _sizes(x, c.floor))
@@ -89,11 +90,14 @@ class BodyRates:
             model=ModelRates.of(b, c, motion),
         )
 
-    def between(self, along: AlongReference) -> Scalars:
-        """√(τᵀD₀⁻¹τ) of what w changes up to the nearest instant, for a_d between those of neighbours."""
+    def between(self, along: AlongReference, reached: Scalars) -> Scalars:
+        """√(τᵀD₀⁻¹τ) of what w changes up to the nearest instant, for a_d between those of neighbours.
+
+        reached: Σ g_k|q_k − q_d,k(t_j)| at most.
+        """
         (q, v, a), (near, tilt) = self.off, self.off_pose
         curved = 0.5 * near**2 * self.moved + 0.5 * tilt**2 * self.tilted
-        turned = (along.coriolis + self.around * near + 0.5 * self.off_around) * v
+        turned = (along.coriolis + self.around * reached + 0.5 * self.off_around) * v
         return np.asarray(along.pose * q + curved + turned + self.whole * a)
 
 

@@ -194,10 +194,10 @@ class Certificate:
         """The certificate as JSON can store it."""
         return {
             "disturbance": str(self.admissible),
-            "rate_per_s": self.rate,
+            "rate_per_s": self.rate if self.bodies is None else None,
             "error_rad": self.error,
             "joint_errors_rad": self.joint_errors.tolist(),
-            "printed_error_rad": self.printed_error,
+            "printed_error_rad": self.printed_error if self.bodies is None else None,
             "overshoot_rad": None if self.overshoot is None else self.overshoot[0],
             "joint_overshoots_rad": None if self.overshoot is None else self.overshoot[1].tolist(),
             "joints": list(self.joint_names),

@@ -65,6 +65,8 @@ def certificate_document(certificate: Certificate) -> dict[str, Any]:
     k, friction, constants = certificate.comparison, certificate.friction, certificate.constants
     if certificate.bodies is not None:
         raise ArgumentError("a certificate for uncertain bodies has no file format; give one without `uncertainty`.")
+    if friction.gap.is_shared:
+        raise ArgumentError("friction known to a share has no file format; give a certificate without `uncertainty`.")
     # Held torques have bounds of their own; those of continuous time stand beside them.
     held = certificate.held if certificate.held is not None and certificate.held.is_proved else None
     potential = certificate.potential if held is None else reach(k, certificate.storage)

@@ -37,6 +37,8 @@ class FrictionGap(NamedTuple):
     """Friction of the arm as stated."""
     damping: JointArray
     """The least b [N·m·s/rad], (n,)."""
+    is_shared: bool
+    """Whether b or c is known to a share alone."""
     width: float
     """ε, the larger one of f̂ and f [rad/s]."""
     power: float
@@ -61,7 +63,7 @@ class FrictionGap(NamedTuple):
         for k, (share, stated) in enumerate(zip(shares, (arm.viscous, arm.coulomb), strict=True)):
             gaps[k] = np.abs(gaps[k]) + share * stated if share else gaps[k]
         least = (1.0 - shares[0]) * arm.viscous
-        return cls(gaps[0], gaps[1], arm, least, widest, _WORST * widest * law.coulomb.sum())
+        return cls(gaps[0], gaps[1], arm, least, any(shares), widest, _WORST * widest * law.coulomb.sum())
 
     def torque(self, v: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows n"]:
         """Bound of each torque that is not fed forward [N·m]."""

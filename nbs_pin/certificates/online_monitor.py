@@ -101,7 +101,13 @@ class Watch:
         way: Any = self._way
         if memory is not None and isinstance(memory, WatchMemory) != (self.encoders is None):
             raise ArgumentError("the memory is that of a Watch of another kind; give the one that this Watch returned.")
-        sample = np.array([q, v, *reference, tau, tau_command], dtype=float)
+        rows, n = (q, v, *reference, tau, tau_command), self.certificate.controller.nv
+        if any(np.shape(row) != (n,) for row in rows):
+            raise ArgumentError(
+                f"the sample has rows of shapes {[np.shape(row) for row in rows]}, expected ({n},) each: q, v, the "
+                "reference's q, v and a, tau and tau_command; give one number per joint."
+            )
+        sample = np.array(rows, dtype=float)
         if not np.isfinite(sample).all():
             _, what = not_finite(LoopSamples(np.zeros(1), *sample[:, None]), self.certificate.joint_names)
             return self._lost(memory, what), None if memory is None else way.lost(memory)

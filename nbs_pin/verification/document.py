@@ -17,6 +17,19 @@ except ModuleNotFoundError as error:
     raise MissingExtra("verify needs jsonschema: pip install 'nbs-pin[verify]'.") from error
 
 
+ASSUMED = (
+    "position and velocity are measured as stated",
+    "the reference is twice differentiable",
+    "no joint reaches its stop",
+    "no joint is held back by its velocity limit",
+    "torques stay within the effort limits",
+    "continuous time, no delay",
+)
+"""Assumptions of every certificate whose words do not vary (docs/certificates.md §9)."""
+COMPARED = "> largest torque of the law"
+"""End of the name of a condition that may be a comparison, besides those of the paper as printed."""
+
+
 def read_document(path: Path) -> dict[str, Any]:
     """The content of the file; raises FileFormatError unless it fits the schema and its own number of joints."""
     schema = json.loads(files("nbs_pin.verification").joinpath("certificate.schema.json").read_text("utf-8"))
@@ -27,6 +40,7 @@ def read_document(path: Path) -> dict[str, Any]:
         )
         jsonschema.validate(document, schema)
         _check_sizes(document)
+        _check_premises(document)
     except jsonschema.ValidationError as error:
         rule = f"it does not satisfy {error.validator} {error.validator_value}"
         fault = error.message if len(error.message) < 160 else f"{rule:.160}"
@@ -59,6 +73,19 @@ def _check_sizes(document: dict[str, Any]) -> None:
         raise ValueError("its polygon has not as many heights as edges")
     if any(joint["parent"] >= i for i, joint in enumerate(joints or [])):
         raise ValueError("a joint comes before its parent")
+
+
+def _check_premises(document: dict[str, Any]) -> None:
+    """Raise ValueError if a premise that every certificate has is missing, or one that may fail is only compared."""
+    listed = {x["assumption"] for x in document["assumptions"]}
+    if missing := [text for text in ASSUMED if text not in listed]:
+        raise ValueError(f"it does not list the assumption '{missing[0]}'")
+    names = [x["name"] for x in document["conditions"]]
+    if not any(name.startswith("Theorem 1:") for name in names):
+        raise ValueError("it has no condition of Theorem 1")
+    compared = [x["name"] for x in document["conditions"] if x["role"] == "comparison"]
+    if hidden := [name for name in compared if not name.startswith("printed: ") and not name.endswith(COMPARED)]:
+        raise ValueError(f"its condition '{hidden[0]}' counts as a comparison")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -123,6 +123,8 @@ class _Description:
             )
         found = []
         for i, (parent, rotation, position) in enumerate(places):
+            if parent >= i:
+                raise ValueError(f"joint {i + 1} comes before its parent")
             centre, slides = first[i] / mass[i], self.elements[i].get("type") == "prismatic"
             self.check_kind(self.elements[i], self.joints[i])
             body = (mass[i], centre, second[i] + mass[i] * skew(centre) @ skew(centre), arb(0))
@@ -136,7 +138,8 @@ class _Description:
             raise ValueError(f"joint '{name}' is {kind}")
         if kind == "prismatic":
             low, high = -math.inf if joint["lower"] is None else joint["lower"], joint["upper"]
-            if float(limit.get("lower")) < low or float(limit.get("upper")) > (math.inf if high is None else high):
+            travel = float(limit.get("lower")), float(limit.get("upper"))
+            if not (low <= travel[0] <= travel[1] <= (math.inf if high is None else high)):
                 raise ValueError(f"joint '{name}' has more travel")
 
     def body_of(self, link: str) -> tuple[int, Balls, Balls]:
