@@ -23,7 +23,7 @@ from nbs_pin.kernels import verdicts, watching as at
 
 UNEXPLAINED = (Assumption.MODEL, Assumption.MEASUREMENT, Assumption.DISTURBANCE)
 """What a torque that the readings do not explain can come from."""
-_UNEVEN = 1e-3  # share of a period by which instants may be off their raster
+_UNEVEN = 1e-2  # share of a period by which instants may be off their raster
 
 
 class WindowMemory(NamedTuple):
