@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import nbs_pin as nbs
@@ -338,3 +339,37 @@ def test_a_torque_that_may_be_cut_off_is_named_with_its_joint():
     assert "wrist" in named.name
     assert named.right > named.left == 28.0
     assert not named.voids
+
+
+def test_another_body_is_another_arm_for_what_is_kept():
+    """Bounds are kept by the numbers of the model: an arm edited in place must not get those of its URDF."""
+    robot = nbs.load_robot("two_link")
+    constants = nbs.certify(nbs.NeuralBackstepping.for_robot(robot), np.full(2, 5.0)).constants
+    before = CoriolisBounds.of(robot, constants)
+    heavy = nbs.load_robot("two_link")
+    heavy.model.inertias[2] = pin.Inertia(3.0 * heavy.model.inertias[2].mass, *_rest(heavy.model.inertias[2]))
+    after = CoriolisBounds.of(heavy, constants)
+    assert after.diagonal[0] > 1.5 * before.diagonal[0]
+    assert CoriolisBounds.of(robot, constants) is before
+
+
+def _rest(body):
+    return body.lever, body.inertia
+
+
+def test_a_jerk_that_is_none_is_refused():
+    robot = nbs.load_robot("two_link")
+    law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    for stated in (np.zeros(3), np.array([-1.0, 1.0]), np.array([np.nan, 1.0])):
+        with pytest.raises(nbs.ArgumentError, match="largest_jerk"):
+            nbs.certify(law, np.full(2, 5.0), reference=_Stating(motion, stated), period=1e-3)
+
+
+class _Stating:
+    """A motion that states a bound of its jerk."""
+
+    def __init__(self, motion, jerk):
+        self.motion, self.largest_jerk = motion, jerk
+
+    def __call__(self, t):
+        return self.motion(t)

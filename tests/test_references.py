@@ -368,3 +368,10 @@ def test_accelerations_change_no_faster_than_a_motion_states(motion):
     rates = np.abs(np.diff(motion(t).a, axis=0)) / np.diff(t)[:, None]
     assert (rates <= motion.largest_jerk * (1.0 + 1e-6) + 1e-6).all()
     assert (rates.max(axis=0) >= 0.98 * motion.largest_jerk - 1e-6).all()
+
+
+def test_samples_that_begin_late_state_no_jerk():
+    """The motion is held before them, and jumps when they begin."""
+    t, q = np.linspace(0.5, 1.0, 20), np.sin(np.linspace(0.0, 3.0, 20))[:, None]
+    assert np.isinf(Sampled(t, q).largest_jerk).all()
+    assert np.isfinite(Sampled(t - 0.5, q).largest_jerk).all()

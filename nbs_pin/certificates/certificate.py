@@ -66,7 +66,7 @@ class Certificate:
     potential: float
     """Φ∞ [J]: Φ(z1) ≤ max(V(0), Φ∞) at all times, and ≤ Φ∞ in the limit."""
     error: float
-    """Bound of ‖z1‖ [rad], at all times from z1 = z2 = 0, and in the limit from any other start."""
+    """Bound of ‖z1‖ [rad], at all times from z1 = z2 = 0; in continuous time also in the limit from any other start."""
     joint_errors: JointArray
     """The same for each |z1_i| [rad]."""
     source: str

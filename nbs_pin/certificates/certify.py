@@ -152,7 +152,10 @@ def _jerk(reference: DesiredMotion | None, motion: SampledMotion | None) -> Join
     stated = getattr(reference, "largest_jerk", None)
     if stated is None or motion is None or motion.t[-1] > getattr(reference, "duration", math.inf) * (1.0 + 1e-12):
         return None
-    return np.broadcast_to(np.asarray(stated, dtype=float), motion.q.shape[1:])
+    jerk = floats("largest_jerk of the reference", stated)
+    if jerk.shape != motion.q.shape[1:] or not (jerk >= 0.0).all():
+        raise ArgumentError(f"largest_jerk of the reference is {stated!s:.80}, expected one number ≥ 0 per joint.")
+    return jerk if np.isfinite(jerk).all() else None
 
 
 def _check_arguments(
@@ -348,7 +351,7 @@ def _with_conditions(
         frictions = (law.friction, certificate.friction.gap.arm)
         conditions += effort_margin(robot, law.dynamics, certificate.admissible, motion, frictions)
         if certificate.held is not None:
-            conditions += unsaturated(robot, law.dynamics, law.friction, motion, certificate.held.room)
+            conditions += unsaturated(robot, law.dynamics, motion, certificate.held.room)
         conditions += velocity_margin(robot, motion, 0.0 if start is None else start.v)
         conditions += position_margin(robot, joints, motion)
     if start is not None and robot is not None:

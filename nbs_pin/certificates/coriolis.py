@@ -15,6 +15,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.sampled_motion import SampledMotion
+from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
 from nbs_pin.inertia.bounds import largest_diagonal, largest_inertia_bound, least_inertia_bound
 from nbs_pin.inertia.derivatives import inertia_derivatives, rate_bound
@@ -114,12 +115,9 @@ class _Key:
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self._state = (
-            robot.sha256,
-            str(robot.options),
-            robot.model.armature.tobytes(),
-            robot.model.gravity.vector.tobytes(),
-        )
+        packed = pack_model(robot.model)
+        travel, gravity = (robot.lower, robot.upper), robot.model.gravity.vector
+        self._state = tuple(x.tobytes() for x in (packed.layout, packed.weights, *travel, gravity))
 
     def __hash__(self) -> int:
         return hash(self._state)

@@ -29,7 +29,7 @@ class Asked(NamedTuple):
 def torque_bound(asked: Asked, arm: CoriolisBounds, motion: MotionBounds, half: float) -> JointArray:
     """How far each torque of the law can be from that of the reference at its samples [N·m]; inf if unknown.
 
-    The difference of τ = M(φ̇ − ωz2) + C(q, v)φ + G − ∇Φ − D z2 + f̂(φ) from M a_d + C(q_d, v_d)v_d + G + f̂(v_d) at q_d.
+    The difference of τ = M(φ̇ − ωz2) + C(q, v)φ + G − ∇Φ − D z2 from M a_d + C(q_d, v_d)v_d + G at q_d.
     half: half the time between the samples [s].
     """
     law, k, curve, level = asked.law, asked.constants, asked.curve, asked.level
@@ -59,10 +59,7 @@ def torque_bound(asked: Asked, arm: CoriolisBounds, motion: MotionBounds, half: 
     pose += (z1.sum() + half * motion.speed_1) * (arm.weight + 2.0 * _coriolis(arm, row, own, wanted, wanted)[1])
     faster = arm.sizes(isk * motion.acceleration, motion.acceleration)
     pose += half * (row * isk * motion.jerk + 2.0 * np.minimum(*_coriolis(arm, row, own, faster, wanted)))
-    fed = 0.0 * own
-    if law.friction is not None:
-        fed = law.friction.viscous * (pull[1] / own + half * motion.acceleration / own) + 2.0 * law.friction.coulomb
-    return np.asarray((linear + curved + pose + fed) * UP)
+    return np.asarray((linear + curved + pose) * UP)
 
 
 def _coriolis(

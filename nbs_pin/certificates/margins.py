@@ -112,7 +112,7 @@ def effort_margin(
 
 
 def unsaturated(
-    robot: Robot, dynamics: DynamicsProvider, fed: JointFriction | None, motion: SampledMotion, room: JointArray
+    robot: Robot, dynamics: DynamicsProvider, motion: SampledMotion, room: JointArray
 ) -> tuple[Condition, ...]:
     """Whether every effort limit exceeds the torque of the reference and how far the law's torque may be from it [N·m].
 
@@ -122,7 +122,6 @@ def unsaturated(
     if not (np.isfinite(robot.effort_limit).any() and np.isfinite(room).all()):
         return ()
     torque = inverse_dynamics(dynamics, *motion.rows)
-    torque = torque if fed is None else torque + fed.torque(motion.v)
     because = f"reference over {motion.t[-1]:g} s, and every state of the bounds: docs/certificates.md §15"
     found = _least_room(robot, "effort", np.abs(torque).max(axis=0) + room, "largest torque of the law", because)
     return (replace(found, role=Role.SUFFICIENT if found.holds else Role.COMPARISON),)

@@ -2,10 +2,10 @@
 
 Let ȳ be the mean of z2 at the two ends of a hold, and V' = Φ + ½z2ᵀ(M − ½hD₀)z2 at the instants. Then, over the hold,
 
-    ΔV'/h ≤ −⟨x²⟩ − |ȳ|² − w² − n² + t√(|ȳ|² + b²) + gᵀQg,      g = (x, |ȳ|, w, n, 1),
+    ΔV'/h ≤ −⟨x²⟩ − |ȳ|² − w² − n² + t√(|ȳ|² + d²) + gᵀQg,      g = (x, |ȳ|, w, n, 1),
 
 with |·|² = ·ᵀD₀·, x = √⟨∇ΦᵀΛ∇Φ⟩, w² = ωȳᵀ⟨M⟩ȳ and n² the power of D − D₀. What happens during the hold is bounded by
-rows that are linear in g (`hold.py`); b and Q are made of them (`_excess`) and vanish with h.
+rows that are linear in g (`hold.py`); d and Q are made of them (`_excess`) and vanish with h.
 """
 
 import math
@@ -116,7 +116,7 @@ class _Form:
 def _excess(
     b: Hold, sup: Suprema
 ) -> tuple[Float[np.ndarray, "5 5"], Float[np.ndarray, " 5"], Float[np.ndarray, "5 5"]]:
-    """Q, b, and a bound of ½(V' at both ends) − the mean that decays, all in g."""
+    """Q, d, and a bound of ½(V' at both ends) − the mean that decays, all in g."""
     k, curve, motion, h, arm = b.loop.constants, b.curve, b.loop.motion, b.loop.h, b.loop.arm
     snu, isk, swing, y_m = math.sqrt(k.nu) * b.stretch, b.isk, b.stretch**2, mean_m(b)
     force, rate = sup.force, sup.rate
@@ -211,7 +211,7 @@ def _limit(b: Hold) -> float:
     excess, spread, ends = _excess(b, rows)
 
     def level(choice: Float[np.ndarray, " k"]) -> float:
-        """From t√(y² + b²) ≤ s(y² + b²) + t²/4s, a rate c of V', and the share of y² in W."""
+        """From t√(y² + d²) ≤ s(y² + d²) + t²/4s, a rate c of V', and the share of y² in W."""
         s, c, share = choice.tolist() if k.omega > 0.0 else (*choice.tolist(), 1.0)
         if not (0.0 < s <= 1.0 and 0.0 < c < 2.0 / b.loop.h and 0.0 <= share <= 1.0):
             return math.inf

@@ -58,7 +58,9 @@ class Sampled:
 
     @property
     def largest_jerk(self) -> np.ndarray:
-        """Largest |ȧ_d| of each joint until the last sample: the third derivative of each cubic [rad/s³]."""
+        """Largest |ȧ_d| of each joint until the last sample, of all cubics [rad/s³]; ∞ if it begins after t = 0."""
+        if self.t[0] > 0.0:
+            return np.full(self.q.shape[1], np.inf)
         return np.asarray(6.0 * np.abs(self._spline.c[0]).max(axis=0))
 
     @cached_property
