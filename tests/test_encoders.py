@@ -11,6 +11,7 @@ import pytest
 
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders, Limits
 from nbs_pin.certificates.loop_model import CompiledModel, LoopModel, PlainModel
@@ -308,3 +309,13 @@ def test_wrong_arguments_are_refused(without_type_checks):
         watch.step(memory, 0.0, *row)
     with pytest.raises(ArgumentError, match="another kind"):
         exact.step(memory, 0.001, *row)
+
+
+@pytest.mark.parametrize("encoders", [None, Encoders.of_bits(16)])
+def test_a_sample_of_other_joints_is_refused_at_every_step(encoders):
+    certificate, _ = loop_of("two_link")
+    watch, rows = nbs.Watch(certificate, encoders), [np.zeros(2)] * 7
+    _, memory = watch.step(None, 0.0, rows[0], rows[1], Reference(*rows[2:5]), rows[5], rows[6])
+    for kept, t in ((None, 0.0), (memory, 0.001)):
+        with pytest.raises(ArgumentError, match="one number per joint"):
+            watch.step(kept, t, np.zeros(3), rows[1], Reference(*rows[2:5]), rows[5], rows[6])

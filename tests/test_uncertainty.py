@@ -9,10 +9,12 @@ import pytest
 import nbs_pin as nbs
 from nbs_pin.certificates.attack import worst_of
 from nbs_pin.certificates.body_bounds import BodyBounds
-from nbs_pin.certificates.body_motion import hessian_at_zero
+from nbs_pin.certificates.body_motion import _nearby, hessian_at_zero
+from nbs_pin.certificates.body_rates import BodyRates
 from nbs_pin.certificates.body_regressor import BodyRegressor
 from nbs_pin.certificates.body_response import Response, instants
 from nbs_pin.certificates.constants import constants_of
+from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
 from nbs_pin.dynamics.rigid_tree import RigidTree
 
@@ -260,3 +262,31 @@ def test_what_cannot_be_bounded_is_refused_in_one_sentence():
     found = nbs.certify(law, [0.0, 0.0], reference=reference, duration=1.0, uncertainty=nbs.Uncertainty(inertia=0.01))
     with pytest.raises(nbs.ArgumentError, match="needs exact bodies"):
         nbs.monitor(run, found)
+
+
+def test_shares_that_may_leave_no_positive_inertia_are_refused():
+    """V' needs M ≻ 0 of every arm admitted, and so does a bound of z1 by V'."""
+    robot = nbs.load_robot("two_link")
+    law, reference = nbs.NeuralBackstepping.for_robot(robot, bandwidth=1.0), nbs.Sinusoid.for_robot(robot)
+    for payload in (None, nbs.Payload(0.01)):
+        wide = nbs.Uncertainty(inertia=0.4, payload=payload)
+        with pytest.raises(nbs.CertificateRefused, match="not shown to be positive definite"):
+            nbs.certify(law, np.zeros(2), reference=reference, uncertainty=wide)
+
+
+def test_between_instants_accelerations_may_change_by_all_that_separates_two_of_them():
+    """Of a motion whose acceleration jumps, the nearest instant may be on the other side of the jump."""
+    robot = nbs.load_robot("two_link")
+    law, rng = nbs.NeuralBackstepping.for_robot(robot), np.random.default_rng(0)
+    constants = constants_of(law)
+    bounds = BodyBounds.of(robot, RigidTree.of(robot), nbs.Uncertainty(0.05).errors(robot, robot.model), constants)
+    t = np.linspace(0.0, 10.0, 2001)
+    a = np.repeat(rng.uniform(-2.0, 2.0, (21, 2)), 100, axis=0)[: len(t)]
+    rates = BodyRates.of(bounds, constants, SampledMotion(t, 0.0 * a, 0.0 * a, a))
+    jumps = np.diff(a, axis=0)
+    assert rates.off[2] >= np.sqrt(np.einsum("ti,ij,tj->t", jumps, constants.floor, jumps)).max()
+
+
+def test_bounds_reach_to_the_neighbours_of_an_instant():
+    found = _nearby(np.array([1.0, 5.0, 2.0, 0.0, 3.0]))
+    assert found.tolist() == [5.0, 5.0, 5.0, 3.0, 3.0]

@@ -652,3 +652,22 @@ def test_no_premise_can_be_left_out_or_made_a_comparison(what, tmp_path):
     file.write_text(json.dumps(document | {"sha256": seal(document)}))
     with pytest.raises(FileFormatError, match=r"does not list|no condition|counts as a comparison"):
         nbs.verify(file)
+
+
+def test_friction_known_to_a_share_has_no_file():
+    robot = nbs.load_robot("two_link")
+    law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    friction = nbs.JointFriction(np.array([0.3, 0.2]), np.array([0.5, 0.2]))
+    given = {"reference": reference, "friction": friction, "uncertainty": nbs.Uncertainty(coulomb=0.5)}
+    with pytest.raises(nbs.ArgumentError, match="known to a share"):
+        certificate_document(nbs.certify(law, [5.0, 5.0], **given))
+
+
+def test_a_urdf_whose_joints_come_in_another_order_is_told(tmp_path):
+    document = certificate_document(nbs.certify(build_law("nbs", nbs.load_robot("two_link")), [5.0, 5.0]))
+    first, second = document["arm"]["joints"]
+    first["name"], second["name"] = second["name"], first["name"]
+    file = tmp_path / "certificate.json"
+    file.write_text(json.dumps(document | {"sha256": seal(document)}))
+    with pytest.raises(FileFormatError, match="before its parent"):
+        verify(file)

@@ -65,6 +65,8 @@ class BodyRates:
         def around(x: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, " rows"]:
             return np.asarray(x @ mixed + sum(gains) * _sizes(x, c.floor))
 
+        # The instants of the response lie between those of the motion.
+        v, a = v + off_v, a + off_a
         speed = _sizes(v, c.floor)
         moved = b.whole[0] * _sizes(a, c.floor) + (v @ rates) * speed + 0.5 * dual(rates, c.metric) * speed**2
         return cls(
@@ -128,12 +130,13 @@ class ModelRates:
         def around(x: Float[np.ndarray, "rows n"]) -> float:
             return 0.5 * float((x @ mixed + gains * _sizes(x, c.floor)).max())
 
+        off_v = max(motion.half, 0.5 * LONGEST) * np.abs(motion.a).max(axis=0)
         return cls(
             mixed=math.sqrt(b.model[0] * b.model[1]),
-            around=around(np.abs(motion.v)),
+            around=around(np.abs(motion.v) + off_v),
             cubic=dual(mixed, rate) + 0.5 * dual(degree * rated, c.metric),
             force=0.5 * dual(degree * damped, rate),
-            off_around=around((max(motion.half, 0.5 * LONGEST) * np.abs(motion.a).max(axis=0))[None]),
+            off_around=around(off_v[None]),
             floor=math.sqrt(b.model[1] + b.whole[1]),
         )
 
