@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from nbs_pin.base.exceptions import ArgumentError, RobotError
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.reports.replay import body_poses, replay
 from nbs_pin.robots.meshes import MeshError, find_mesh, read_mesh
@@ -354,13 +354,6 @@ def test_meshes_are_scaled_and_found_where_they_may_be(tmp_path):
     np.testing.assert_allclose(np.ptp(part.vertices, axis=0), [2.0, 3.0, 0.0])
     a, b, c = part.vertices[part.faces[0]]
     assert np.cross(b - a, c - a)[2] < 0.0  # mirrored: outside stays outside
-
-
-def test_an_unknown_shape_is_named_and_a_malformed_one_refused(tmp_path):
-    with pytest.warns(UserWarning, match="geometry 'capsule'"):
-        link_visuals(bare_robot(tmp_path, "<visual><geometry><capsule/></geometry></visual>"))
-    with pytest.raises(RobotError, match="malformed"):
-        link_visuals(bare_robot(tmp_path, '<visual><geometry><box size="a b c"/></geometry></visual>'))
 
 
 def test_couplings_are_what_the_urdf_states(tmp_path):

@@ -159,9 +159,10 @@ def _commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]
 
 
 def _material(visual: Visual) -> MeshPhongMaterial:
-    red, green, blue = (round(255 * min(max(channel, 0.0), 1.0)) for channel in visual.color[:3])
+    shares = [min(max(channel, 0.0), 1.0) for channel in visual.color]
+    red, green, blue = (round(255 * share) for share in shares[:3])
     return MeshPhongMaterial(
-        color=(red << 16) + (green << 8) + blue, opacity=visual.color[3], specular=0x2A2A2A, shininess=38
+        color=(red << 16) + (green << 8) + blue, opacity=shares[3], specular=0x2A2A2A, shininess=38
     )
 
 

@@ -3,6 +3,7 @@
 The dynamics never need meshes; a file that cannot be drawn raises `MeshError`, and the caller decides what to do.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,23 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from lxml import etree
 
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.catalogue import example_robot_share
+from nbs_pin.robots.visual_checks import LARGEST
 
 SUFFIXES = (".stl", ".obj", ".dae")
 MAX_BYTES = 50_000_000
 MAX_FACES = 1_000_000
 MAX_COLORS = 32
+MAX_GROUPS = 2000
+"""Largest number of named parts in a file; each costs milliseconds, however small it is."""
+_GROUPS = {
+    ".obj": rb"(?m)^[ \t]*(?:o|g|usemtl)\b",
+    ".stl": rb"(?m)^[ \t]*solid\b",
+    ".dae": rb"<(?:\w+:)?(?:node|instance_\w+|geometry|triangles|polylist|polygons|material|effect)\b",
+}
 CREASE = np.radians(40.0)
 """Edges with a larger angle between their faces are drawn sharp [rad]."""
 
@@ -45,6 +55,15 @@ def find_mesh(uri: str, urdf: Path, package_dirs: tuple[Path, ...] = ()) -> Path
     These are the URDF's own folder, the ROS package around it (the nearest folder with a `package.xml`),
     example-robot-data, and `package_dirs`. Raises MeshError for another scheme, suffix or folder, or a missing file.
     """
+    try:
+        return _found(uri, urdf, package_dirs)
+    except (OSError, ValueError, RuntimeError) as error:  # of names that the file system cannot hold, or circular links
+        if isinstance(error, MeshError):
+            raise
+        raise MeshError(f"mesh '{uri:.200}' cannot be found ({error!s:.200}): give another file name.") from error
+
+
+def _found(uri: str, urdf: Path, package_dirs: tuple[Path, ...]) -> Path:
     scheme, _, rest = uri.rpartition("://")
     package = next((folder for folder in urdf.parents if (folder / "package.xml").is_file()), urdf.parent)
     roots = [folder.resolve() for folder in (urdf.parent, package, example_robot_share(), *package_dirs)]
@@ -70,23 +89,72 @@ def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
 
     Raises MeshError if the file is too large, unreadable or empty, or if a vertex is not finite.
     """
-    if path.stat().st_size > MAX_BYTES:
-        raise MeshError(f"mesh {path} has {path.stat().st_size} bytes, at most {MAX_BYTES} are drawn: simplify it.")
     try:
-        scene = trimesh.load_scene(path, resolver=_Beside(str(path)))
-    except Exception as error:  # mesh parsers may raise any exception
+        _check_file(path)
+        return _read(path, scale)
+    except MeshError:
+        raise
+    except Exception as error:  # mesh parsers may raise any exception, at once or when the mesh is used
         raise MeshError(f"mesh {path} cannot be read ({type(error).__name__}: {error}): export it again.") from error
+
+
+def _read(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
+    scene = trimesh.load_scene(path, resolver=_Beside(str(path)))
+    _check_scene(path, scene)
     meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
-    count = sum(len(mesh.faces) for mesh in meshes)
-    if not 0 < count <= MAX_FACES:
-        raise MeshError(f"mesh {path} has {count} faces, between 1 and {MAX_FACES} are drawn: repair or simplify it.")
-    if not all(np.isfinite(mesh.vertices).all() for mesh in meshes):
-        raise MeshError(f"mesh {path} has vertices that are not finite: export it again.")
+    if not any(len(mesh.faces) for mesh in meshes):
+        raise MeshError(f"mesh {path} has no faces: export it again.")
+    if not all((np.abs(mesh.vertices * scale) <= LARGEST).all() for mesh in meshes):
+        raise MeshError(f"mesh {path} has vertices that are not finite or beyond {LARGEST:g} m: export it again.")
     pieces: dict[Color | None, list[trimesh.Trimesh]] = {}
     for mesh in meshes:
         for color, faces in _by_color(mesh):
             pieces.setdefault(color, []).append(trimesh.Trimesh(mesh.vertices, faces, process=False))
     return tuple(shaded(trimesh.util.concatenate(group), color, scale) for color, group in pieces.items())
+
+
+def _check_file(path: Path) -> None:
+    """Raises MeshError for a file that is too large or has too many parts."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise MeshError(f"mesh {path} has {size} bytes, at most {MAX_BYTES} are drawn: simplify it.")
+        content = path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"mesh {path} cannot be read ({error.strerror}): check its permissions.") from error
+    groups = sum(1 for _ in re.finditer(_GROUPS[path.suffix.lower()], content))
+    if path.suffix.lower() == ".dae" and groups <= MAX_GROUPS:
+        groups = _placed(content)
+    if groups > MAX_GROUPS:
+        raise MeshError(f"mesh {path} has {groups} parts, at most {MAX_GROUPS} are drawn: join them.")
+
+
+def _placed(collada: bytes) -> int:
+    """How many meshes the scenes of a COLLADA file place; nodes that place nodes can multiply beyond any memory."""
+    root = etree.fromstring(collada, etree.XMLParser(resolve_entities=False, no_network=True))
+    nodes = list(root.iter("{*}node"))
+    named = {f"#{node.get('id')}": node for node in nodes}
+    known: dict[Any, int] = {}
+
+    def count(node: Any) -> int:
+        if node not in known:
+            known[node] = MAX_GROUPS + 1  # what a node that places itself finds
+            inner = [*node.iterfind("{*}node")]
+            inner += [named[link.get("url")] for link in node.iterfind("{*}instance_node") if link.get("url") in named]
+            known[node] = len(node.findall("{*}instance_geometry")) + sum(count(child) for child in inner)
+        return known[node]
+
+    return sum(count(node) for node in root.iterfind(".//{*}visual_scene/{*}node"))
+
+
+def _check_scene(path: Path, scene: Any) -> None:
+    """Raises MeshError if the meshes, counted as often as they are placed, have too many parts or faces."""
+    placed = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
+    if len(placed) > MAX_GROUPS:
+        raise MeshError(f"mesh {path} places {len(placed)} parts, at most {MAX_GROUPS} are drawn: join them.")
+    count = sum(len(getattr(geometry, "faces", ())) for geometry in placed)
+    if count > MAX_FACES:
+        raise MeshError(f"mesh {path} has {count} faces, at most {MAX_FACES} are drawn: simplify it.")
 
 
 def shaded(mesh: Any, color: Color | None, scale: Float[np.ndarray, "3"] | None = None) -> Part:

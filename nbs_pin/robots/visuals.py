@@ -20,7 +20,10 @@ from lxml import etree
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.meshes import Color, MeshError, Part, find_mesh, read_mesh, shaded
 from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.visual_checks import material_faults, visual_fault
 
+MAX_SHAPES = 2000
+"""Links with further shapes than this many in all are drawn as capsules."""
 STEEL: Color = (0.35, 0.45, 0.60, 1.0)
 BRASS: Color = (0.80, 0.60, 0.25, 1.0)
 GREY: Color = (0.70, 0.72, 0.75, 1.0)
@@ -69,50 +72,42 @@ class Couplings:
 
 def read_couplings(robot: Robot) -> Couplings:
     """The mimic joints, except locked ones, and the transmissions that the URDF states."""
-    description, root = _parse(robot)
+    root = _root(robot)
+    for link in root.iterfind("link"):
+        for child in [*link]:
+            link.remove(child)
+    description = _described(robot, root)
     mimics = tuple(
         Mimic(joint.name, joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
         for joint in description.robot.joints
         if joint.mimic is not None
     )
-    transmissions = tuple(
-        Transmission(
-            element.get("name", ""),
-            tuple(joint.get("name", "") for joint in element.iterfind("joint")),
-            float(element.findtext(".//mechanicalReduction", "1")),
-        )
-        for element in root.iterfind("transmission")
-    )
-    return Couplings(mimics, transmissions)
+    try:
+        return Couplings(mimics, tuple(_transmission(element) for element in root.iterfind("transmission")))
+    except ValueError as error:
+        raise RobotError(f"{robot.urdf.path}: a mechanicalReduction is no number ({error}): correct it.") from error
 
 
 def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple[Visual, ...]:
     """The visual geometry of all links; rigid bodies without any are drawn as capsules from joint to joint.
 
-    Meshes may also be read from `package_dirs`; one that cannot be drawn gives a warning.
-
-    Raises:
-        RobotError: If a visual, mimic or limit element is malformed.
+    So are links with a visual that cannot be drawn, whatever is wrong with it: a warning names link and fault. Meshes
+    may also be read from `package_dirs`.
     """
-    description, _ = _parse(robot)
+    root, folders = _root(robot), tuple(Path(folder) for folder in package_dirs)
+    faults = _without_faulty_visuals(root)
+    description = _described(robot, root)
     materials = {material.name: material.color for material in description.robot.materials if material.color}
-    folders = tuple(Path(folder) for folder in package_dirs)
     visuals: list[Visual] = []
-    bare: set[str] = set()
     for link in description.robot.links:
         for visual in link.visuals:
             try:
-                parts = _parts(visual.geometry, robot.urdf.path, folders)
+                visuals += _drawn(link.name, visual, _parts(visual.geometry, robot.urdf.path, folders), materials)
             except MeshError as error:
-                warnings.warn(f"link '{link.name}' is drawn as a capsule: {error}", stacklevel=2)
-                bare.add(link.name)
-                continue
-            placement = np.eye(4) if visual.origin is None else np.asarray(visual.origin, dtype=float)
-            stated = _stated_color(visual.material, materials)
-            visuals += [
-                Visual(link.name, placement, part.vertices, part.faces, part.color or stated or GREY) for part in parts
-            ]
-    return (*visuals, *_capsules(robot, {visual.link for visual in visuals}, bare))
+                faults.setdefault(link.name, str(error))
+    for name, fault in faults.items():
+        warnings.warn(f"link '{name}' is drawn as a capsule: {fault}", stacklevel=2)
+    return (*visuals, *_capsules(robot, {visual.link for visual in visuals}, set(faults)))
 
 
 def tip(robot: Robot) -> tuple[int, Float[np.ndarray, "3"]]:
@@ -122,26 +117,54 @@ def tip(robot: Robot) -> tuple[int, Float[np.ndarray, "3"]]:
     return last, _far_end(robot.model.inertias[last].lever, frames)
 
 
-def _parse(robot: Robot) -> tuple[yourdfpy.URDF, Any]:
-    """The description for yourdfpy, without the elements that are not drawn, and its lxml root."""
+def _root(robot: Robot) -> Any:
+    """The description as an lxml element, without comments."""
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True)
     try:
-        root = etree.fromstring(robot.urdf.xml, etree.XMLParser(resolve_entities=False, no_network=True))
+        return etree.fromstring(robot.urdf.xml, parser)
     except etree.XMLSyntaxError as error:  # yourdfpy would try to repair it
         raise RobotError(f"{robot.urdf.path} is not well-formed XML ({error}): correct it.") from error
+
+
+def _transmission(element: Any) -> Transmission:
+    joints = tuple(joint.get("name", "") for joint in element.iterfind("joint"))
+    return Transmission(element.get("name", ""), joints, float(element.findtext(".//mechanicalReduction", "1")))
+
+
+def _without_faulty_visuals(root: Any) -> dict[str, str]:
+    """Remove from the description what is not drawn, and visuals that cannot be; the faults of these by link."""
+    materials, shapes = material_faults(root), 0
+    faults: dict[str, str] = {}
+    for child in [*root]:
+        if child.tag not in ("link", "material") or (child.tag == "material" and child.get("name", "") in materials):
+            root.remove(child)
     for link in root.iterfind("link"):
-        for child in [*link.iterfind("collision"), *link.iterfind("inertial")]:
-            link.remove(child)
-        for visual in link.findall("visual"):
-            shape = next(iter(visual.find("geometry") if visual.find("geometry") is not None else ()), None)
-            if shape is None or shape.tag not in ("box", "cylinder", "sphere", "mesh"):
-                kind = "no geometry" if shape is None else f"geometry '{shape.tag}'"
-                warnings.warn(f"link '{link.get('name')}' has a visual with {kind}: it is not drawn.", stacklevel=3)
-                link.remove(visual)
+        for child in [*link]:
+            fault = visual_fault(child, materials) if child.tag == "visual" else "not drawn"
+            shapes += not fault
+            if not fault and shapes > MAX_SHAPES:
+                fault = f"the arm has more than {MAX_SHAPES} shapes"
+            if fault:
+                link.remove(child)
+            if fault and child.tag == "visual":
+                faults.setdefault(link.get("name", ""), f"{fault}: correct it.")
+    return faults
+
+
+def _described(robot: Robot, root: Any) -> yourdfpy.URDF:
+    """The description as yourdfpy reads it."""
     try:
-        return yourdfpy.URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False), root
+        return yourdfpy.URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False)
     except (ValueError, KeyError, TypeError, IndexError) as error:
-        message = f"{robot.urdf.path}: a visual, mimic or limit element is malformed ({error}): correct it."
+        message = f"{robot.urdf.path}: a mimic or limit element is malformed ({error}): correct it."
         raise RobotError(message) from error
+
+
+def _drawn(link: str, visual: Any, parts: tuple[Part, ...], materials: dict[str, Any]) -> list[Visual]:
+    """The parts of a visual, placed and coloured."""
+    placement = np.eye(4) if visual.origin is None else np.asarray(visual.origin, dtype=float)
+    stated = _stated_color(visual.material, materials)
+    return [Visual(link, placement, part.vertices, part.faces, part.color or stated or GREY) for part in parts]
 
 
 def _parts(geometry: Any, urdf: Path, package_dirs: tuple[Path, ...]) -> tuple[Part, ...]:
