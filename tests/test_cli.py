@@ -275,17 +275,6 @@ def test_a_stop_the_moment_the_folder_is_made_leaves_nothing(tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
-def test_ctrl_c_while_drawing_keeps_the_old_results_whole(two_link, monkeypatch, capsys):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    before = contents(two_link)
-    monkeypatch.setattr("nbs_pin.commands.track.replay", interrupted)
-    assert track(two_link, "--seed", "9", "--force") == 130
-    assert "interrupted" in capsys.readouterr().err
-    assert contents(two_link) == before
-
-
 def test_a_reader_who_leaves_early_is_no_error():
     process = subprocess.Popen([*NBS_PIN, "robots"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.close()

@@ -202,7 +202,7 @@ def test_the_chosen_start_of_a_batch_is_shown(tmp_path):
         ({"robot_sha256": "0" * 64}, "not the arm that ran"),
         ({"robot": "three_link"}, "not the arm that ran"),
         ({"robot_options": {"gravity": 1.62}}, "not the arm that ran"),
-        ({"robot_options": {"spin": 1}}, "loads its robot with spin"),
+        ({"robot_options": {"spin": 1}}, "options that this version does not know .spin: 1"),
         ({"joint_names": ("a", "b")}, "moves joints a, b"),
         ({"q": np.full((501, 2), np.nan)}, "not finite"),
     ],

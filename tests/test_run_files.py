@@ -82,7 +82,7 @@ def test_a_run_without_robot_options_is_read(path):
         ({"period": np.array(0.0)}, "'period'"),
         ({"t": 0.01 * np.arange(5)[::-1]}, "'t'"),
         ({"q": np.zeros((5, 2), dtype=int)}, "'q' is int64, expected real numbers"),
-        ({"info": np.array("{")}, "'info' is not JSON"),
+        ({"info": np.array("{")}, "'info' cannot be read as JSON"),
         ({"info": np.array("[1]")}, "'info' is a list"),
         ({"robot_options": np.array("[1]")}, "'robot_options' is a list"),
         ({"robot_options": np.array(1.0)}, "'robot_options' is float64"),

@@ -22,6 +22,8 @@ from nbs_pin.base.npz import LARGEST
 
 MANIFEST = "manifest.json"
 """Name of the entry that lists the others with their checksums."""
+DEEPEST = 64
+"""Most levels of lists and objects in JSON; what handles them deeper overflows the stack."""
 _CHECKSUM = 64
 _DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, NotImplementedError, RuntimeError)
 
@@ -63,7 +65,7 @@ def read_archive(path: str | Path, file_format: str) -> dict[str, bytes]:
     return entries
 
 
-def parse_json(path: str | Path, name: str, content: bytes) -> dict[str, Any]:
+def parse_json(path: str | Path, name: str, content: str | bytes) -> dict[str, Any]:
     """The JSON object in the entry `name`.
 
     Raises:
@@ -71,6 +73,8 @@ def parse_json(path: str | Path, name: str, content: bytes) -> dict[str, Any]:
     """
     try:
         value = json.loads(content, object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite)
+        if _depth(value) > DEEPEST:
+            raise ValueError(f"more than {DEEPEST} levels deep")
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: '{name}' cannot be read as JSON ({error}); write the file again.") from error
     if not isinstance(value, dict):
@@ -120,6 +124,16 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(dict(pairs)) < len(pairs):
         raise ValueError(f"repeated key among {', '.join(key for key, _ in pairs)}")
     return dict(pairs)
+
+
+def _depth(value: Any) -> int:
+    """How many lists and objects enclose the innermost value."""
+    level, depth = [value], 0
+    while level:
+        inner = [list(x.values()) if isinstance(x, dict) else x for x in level if isinstance(x, dict | list)]
+        depth += bool(inner)
+        level = [x for values in inner for x in values]
+    return depth
 
 
 def _finite(number: str) -> float:

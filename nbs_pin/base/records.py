@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.archives import parse_json
 from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
@@ -103,7 +104,8 @@ class Run:
         Raises:
             FileFormatError: If the file is damaged, a key is missing, a shape is wrong or a number is not finite.
         """
-        data = {"robot_options": np.array("{}"), **read_npz(path)}  # absent in the oldest run files
+        names = {entry.name for entry in dataclasses.fields(cls)} | {"format"}
+        data = {"robot_options": np.array("{}"), **read_npz(path, names)}  # absent in the oldest run files
         require(data, path, {"format": "U", "t": "f", **dict.fromkeys(_PER_ROW, "f"), "effort_limit": "f"})
         require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", *_JSON), "U")})
         require(data, path, {"period": "f"})
@@ -112,13 +114,14 @@ class Run:
         _check_shapes(path, data)
         _check_numbers(path, data)
         return cls(
-            **{name: data[name] for name in ("t", *_PER_ROW, "effort_limit", "continuous")},
+            **{name: data[name].astype(float, copy=False) for name in ("t", *_PER_ROW, "effort_limit")},
+            continuous=data["continuous"],
             joint_names=tuple(str(name) for name in data["joint_names"]),
             period=float(data["period"]),
             robot=str(data["robot"]),
             robot_sha256=str(data["robot_sha256"]),
-            robot_options=_parsed(path, data, "robot_options"),
-            info=_parsed(path, data, "info"),
+            robot_options=parse_json(path, "robot_options", str(data["robot_options"])),
+            info=parse_json(path, "info", str(data["info"])),
         )
 
 
@@ -126,10 +129,10 @@ def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
     shape = data["q"].shape
     expected = dict.fromkeys(_PER_ROW, shape) | dict.fromkeys(_PER_JOINT, shape[-1:]) | {"t": shape[:1], "period": ()}
     for name, wanted in expected.items():
-        if len(shape) < 2 or data[name].shape != wanted:
+        if len(shape) < 2 or 0 in shape or data[name].shape != wanted:
             raise FileFormatError(
                 f"{path}: '{name}' has shape {data[name].shape}, expected {wanted} for q of shape {shape}, "
-                "(rows, ..., joints); record the run again."
+                "(rows, ..., joints), at least one of each; record the run again."
             )
 
 
@@ -150,15 +153,3 @@ def _dumped(name: str, value: dict[str, Any]) -> str:
         return json.dumps(value, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ArgumentError(f"run.{name} cannot be stored as JSON ({error}); use numbers, text and lists.") from error
-
-
-def _parsed(path: str | Path, data: dict[str, np.ndarray], name: str) -> dict[str, Any]:
-    try:
-        value = json.loads(str(data[name]))
-    except json.JSONDecodeError as error:
-        raise FileFormatError(f"{path}: '{name}' is not JSON ({error}); record the run again.") from error
-    if not isinstance(value, dict):
-        raise FileFormatError(
-            f"{path}: '{name}' is a {type(value).__name__}, expected an object; record the run again."
-        )
-    return value

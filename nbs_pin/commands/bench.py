@@ -7,11 +7,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from nbs_pin.base.files import write_whole
+from nbs_pin.base.files import replaced_together
 from nbs_pin.benchmarks import bench
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import SUMMARY, summary_text, table
+from nbs_pin.commands.results import SUMMARY, drawing, summary_text, table
 from nbs_pin.reports.charts import plot_scaling
 
 _COLUMNS = {
@@ -46,18 +46,20 @@ def run(options: Bench, console: Console, notes: Console) -> None:
         for row in bench.bench(options.arms, calls=options.calls, long=options.long):
             rows.append(row)
             status.update(f"measured {row.key}")
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_whole(options.out / SUMMARY, summary_text(bench.summary(rows)).encode())
+    picture = options.out / "joints.png"
+    with replaced_together(options.out, [SUMMARY, picture.name]) as draft:
+        (draft / SUMMARY).write_text(summary_text(bench.summary(rows)), encoding="utf-8")
     chain = [row.figures for row in rows if row.what == "joints"]
     lines = {"compiled law": "p50_us", "two RNEA": "two_rnea_us"}
     series = {name: [figures[key] for figures in chain] for name, key in lines.items()}
-    plot_scaling([figures["joints"] for figures in chain], series, options.out / "joints.png")
+    with drawing(picture):
+        plot_scaling([figures["joints"] for figures in chain], series, picture)
     for what, columns in _COLUMNS.items():
         if any(row.what == what for row in rows):
             console.print(_shown(what, columns, [row for row in rows if row.what == what]))
     if known is not None:
         console.print(_moved(bench.compare(rows, known)))
-    console.print(str(options.out / SUMMARY), str(options.out / "joints.png"), sep="\n", highlight=False)
+    console.print(str(options.out / SUMMARY), str(picture), sep="\n", highlight=False)
 
 
 def _read(path: Path) -> Any:

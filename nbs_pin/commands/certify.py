@@ -20,7 +20,7 @@ from nbs_pin.cli import NO_PROMISE
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import print_certificate
-from nbs_pin.commands.results import SUMMARY, Results
+from nbs_pin.commands.results import SUMMARY, Results, drawing
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.friction import JointFriction
@@ -30,7 +30,7 @@ from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.checkpoints import load, save
 
 FILES = ("certificate.png", "run.npz", SUMMARY)
-"""Files of `write_results`, the summary last; run.npz only if a worst motion was found."""
+"""Files of `write_results`; run.npz only if a worst motion was found."""
 MONITOR, DESIGNED, CERTIFICATE = "monitor.png", "controller.nbs", "certificate.json"
 """Further files, for a monitored run, for a design and for `nbs-pin verify`."""
 
@@ -45,7 +45,7 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         robot = arm_of(controller, task)
         watched = None if options.monitor is None else Run.load(options.monitor)
     results = Results.of(options, robot.name, robot, against=robot.source)
-    results.check((*FILES, MONITOR, DESIGNED, CERTIFICATE), options.force, whose="another certificate")
+    results = results.check((*FILES, MONITOR, DESIGNED, CERTIFICATE), options.force, whose="another certificate")
     with results.made() as folder:
         proposal = None
         if options.wanted is not None:
@@ -194,29 +194,26 @@ def figures(result: Certified) -> dict[str, Any]:
 
 
 def write_results(result: Certified, results: Results, *, as_file: bool = False) -> tuple[dict[str, Any], list[str]]:
-    """Write the files; returns the figures and the names of the files.
+    """Write the files, the pictures last; returns the figures and the names of the files.
 
-    as_file: whether to write `CERTIFICATE`; one of another certificate in the folder does not stay there.
+    as_file: whether to write `CERTIFICATE`; no file of another certificate stays in the folder.
     Raises OSError if they cannot be written.
     """
-    found, folder, written = figures(result), results.folder, [FILES[0]]
-    plot_certificate(result.certificate, result.attack, folder / FILES[0])
-    if result.attack is not None:
-        result.attack.run.save(folder / FILES[1])
-        written.append(FILES[1])
+    found, folder = figures(result), results.folder
+    with results.replaced((FILES[1], DESIGNED, CERTIFICATE, FILES[0], MONITOR), found) as draft:
+        if result.attack is not None:
+            result.attack.run.save(draft / FILES[1])
+        if result.proposal is not None:
+            save(result.proposal.controller, draft / DESIGNED)
+        if as_file:
+            write_certificate(result.certificate, draft / CERTIFICATE)
+    with drawing(folder / FILES[0]) as path:
+        plot_certificate(result.certificate, result.attack, path)
     if result.watched is not None:
-        plot_monitor(result.watched, folder / MONITOR)
-        written.append(MONITOR)
-    if result.proposal is not None:
-        save(result.proposal.controller, folder / DESIGNED)
-        written.append(DESIGNED)
-    if as_file:
-        write_certificate(result.certificate, folder / CERTIFICATE)
-        written.append(CERTIFICATE)
-    else:
-        (folder / CERTIFICATE).unlink(missing_ok=True)
-    results.write_summary(found)
-    return found, [*written, SUMMARY]
+        with drawing(folder / MONITOR) as path:
+            plot_monitor(result.watched, path)
+    written = (FILES[0], FILES[1], MONITOR, DESIGNED, CERTIFICATE, SUMMARY)
+    return found, [name for name in written if (folder / name).exists()]
 
 
 def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:

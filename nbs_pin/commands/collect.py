@@ -9,7 +9,7 @@ from rich.text import Text
 
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import SUMMARY, Results, keywords, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import torque_limits
@@ -18,7 +18,7 @@ from nbs_pin.reports.plotting import ACTUAL, LIMIT, TORQUE, picture
 from nbs_pin.robots.robot import Robot, load_robot
 
 FILES = ("data.npz", "coverage.png", SUMMARY)
-"""The files that are written, the data first and the summary last."""
+"""The files that are written."""
 _DOTS = 4000
 _AT_LIMIT = 1.0 - 1e-9
 
@@ -30,7 +30,7 @@ def run(options: Collect, console: Console, notes: Console) -> None:
     if options.friction and not (robot.damping.any() or robot.friction.any()):
         raise OptionError(f"--friction was given, but the URDF of {robot.name} states none; omit it.")
     results = Results.of(options, robot.name, robot, robot=robot.source)
-    results.check(FILES, options.force, whose="other data")
+    results = results.check(FILES, options.force, whose="other data")
     given = keywords(options, collect) | {
         "noise": Noise(0.0 if options.encoder_bits is None else 2.0**-options.encoder_bits, options.torque_noise),
         "acceleration": "differentiated" if options.differentiated else None,
@@ -39,9 +39,10 @@ def run(options: Collect, console: Console, notes: Console) -> None:
         data = collect(robot, options.recipe, options.samples, options.seed, **given, progress=True)
         with notes.status(f"writing into {folder}"):
             found = figures(data, robot)
-            data.save(folder / FILES[0])
-            plot_coverage(data, folder / FILES[1], robot)
-            results.write_summary(found)
+            with results.replaced(FILES, found) as draft:
+                data.save(draft / FILES[0])
+            with drawing(folder / FILES[1]) as path:
+                plot_coverage(data, path, robot)
     _print(console, f"{robot.name}, {options.recipe}", found)
     results.show(console, FILES)
 

@@ -18,7 +18,7 @@ from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.values import SAVED, OptionError
-from nbs_pin.commands.results import SUMMARY, Results, keywords, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
 from nbs_pin.controllers.gains import gains_for_robot
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -33,7 +33,7 @@ from nbs_pin.simulation.simulate import simulate
 from nbs_pin.storage.checkpoints import load
 
 FILES = ("errors.png", "errors.csv", SUMMARY)
-"""Files of `write_results`, the summary last."""
+"""Files of `write_results`."""
 TRAJECTORIES = 374
 """Starts with which the bound on δ holds for 95 % of further ones, at confidence 1 − 1e-6 (`accuracy/mismatch.py`)."""
 _ENDINGS = ("", ".nbs", ".urdf", ".xacro", ".xml")
@@ -48,7 +48,7 @@ def run(options: Compare, console: Console, notes: Console) -> None:
         region = _region(options, robot)
         recorded = None if options.along is None else Run.load(options.along)
     results = Results.of(options, robot.name, robot, against=robot.source)
-    results.check(FILES, options.force, whose="another comparison")
+    results = results.check(FILES, options.force, whose="another comparison")
     given = keywords(options, compare_models) | region | {"joints": _pair(options, robot.nv), "run": recorded}
     title = f"{Path(options.model).name} against {robot.name}"
     with results.made() as folder:
@@ -218,12 +218,13 @@ def figures(result: Comparison, robot: Robot) -> dict[str, Any]:
 
 def write_results(result: Comparison, robot: Robot, results: Results, title: str) -> dict[str, Any]:
     """Write `FILES` and return the figures; raises OSError if they cannot be written."""
-    found, folder = figures(result, robot), results.folder
+    found = figures(result, robot)
+    with results.replaced((FILES[1], FILES[0]), found) as draft:
+        write_csv(draft / FILES[1], ("figure", "where", "value"), list(_rows(found, robot)))
     labels = [f"{joint.name} [{'m' if joint.prismatic else 'rad'}]" for joint in robot.joints]
     why = result.missing or "no closed loop was run"
-    plot_model_errors(result.errors, result.heat, folder / FILES[0], title=title, joints=labels, missing=why)
-    write_csv(folder / FILES[1], ("figure", "where", "value"), list(_rows(found, robot)))
-    results.write_summary(found)
+    with drawing(results.folder / FILES[0]) as path:
+        plot_model_errors(result.errors, result.heat, path, title=title, joints=labels, missing=why)
     return found
 
 

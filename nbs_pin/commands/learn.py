@@ -12,7 +12,7 @@ from rich.text import Text
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
 from nbs_pin.cli.learn import Learn
-from nbs_pin.commands.results import SUMMARY, Results, sha256_of, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
@@ -20,11 +20,12 @@ from nbs_pin.identification.fit import fit, split_data
 from nbs_pin.identification.fit_report import FitReport, torque_errors
 from nbs_pin.identification.logs import load_log
 from nbs_pin.reports.plotting import ACTUAL, LIMIT, REFERENCE, picture
+from nbs_pin.robots.named import load_named
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.checkpoints import save
 
 FILES = ("model.nbs", "learning.png", SUMMARY)
-"""The files that are written, the model first and the summary last."""
+"""The files that are written."""
 _ENDED = {"held out": "no further progress on held-out data", "iterations": "all iterations done"}
 
 
@@ -35,7 +36,7 @@ def run(options: Learn, console: Console, notes: Console) -> None:
     name = options.data.stem if robot is None else robot.name
     # Data are identified by their fingerprint, not by their path.
     results = Results.of(options, name, robot, data=None, data_sha256=sha256_of(options.data))
-    results.check(FILES, options.force, whole={"interrupted": False}, whose="another model")
+    results = results.check(FILES, options.force, whole={"interrupted": False}, whose="another model")
     given = {name: getattr(options, name) for name in ("optimiser", "iterations")}
     given["loss"] = None if options.loss == "torque" else options.loss  # which every model minimises
     given = {name: value for name, value in given.items() if value is not None}
@@ -45,9 +46,10 @@ def run(options: Learn, console: Console, notes: Console) -> None:
         interrupted = result.report.stopped == "interrupted"
         with notes.status(f"writing into {folder}"):
             found = figures(result)
-            save(result.model, folder / FILES[0], info={"learned": results.facts | {"interrupted": interrupted}})
-            plot_learning(result, folder / FILES[1])
-            results.write_summary(found, interrupted=interrupted)
+            with results.replaced(FILES, found, interrupted=interrupted) as draft:
+                save(result.model, draft / FILES[0], info={"learned": results.facts | {"interrupted": interrupted}})
+            with drawing(folder / FILES[1]) as path:
+                plot_learning(result, path)
     _print(console, f"{name}, {options.model}", found)
     results.show(console, FILES)
     if interrupted:
@@ -77,7 +79,8 @@ def arm_of(data: Dataset) -> Robot | None:
     said = data.about.get("robot")
     if not isinstance(said, dict) or not said.get("source"):
         return None
-    robot = load_robot(said["source"], **said.get("options", {}))
+    options = said.get("options", {})
+    robot = load_named(repr(data), str(said["source"]), options if isinstance(options, dict) else {"options": options})
     if robot.sha256 != said.get("sha256", robot.sha256):
         raise ArgumentError(
             f"{data!r}: the description {said['source']} has changed since; give the arm as it was then."

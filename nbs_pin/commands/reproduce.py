@@ -7,7 +7,6 @@ from typing import Any
 
 from rich.console import Console
 
-from nbs_pin.base.files import write_whole
 from nbs_pin.benchmarks.fair import fair_part
 from nbs_pin.cli.reproduce import Reproduce
 from nbs_pin.commands.results import SUMMARY, Results
@@ -32,15 +31,17 @@ PARTS: dict[str, Callable[[Path, int, bool], Sequence[Any]]] = {
 def run(options: Reproduce, console: Console, notes: Console) -> None:
     """Run the parts, write and print; raises NbsPinError or OSError."""
     results = Results.of(options, "paper", None)
-    results.check(FILES, options.force)
+    results = results.check(FILES, options.force)
     chosen = list(PARTS) if options.part == "all" else [options.part]
     began = time.perf_counter()
     with results.made() as folder:
+        for name in FILES[::-1]:  # what describes earlier parts, which are replaced one by one
+            (folder / name).unlink(missing_ok=True)
         sections = [section for name in chosen for section in PARTS[name](folder, options.seed, True)]
         wall_time = time.perf_counter() - began
         lead = f"Written by `nbs-pin reproduce --part {options.part} --seed {options.seed}` in {wall_time:.0f} s."
-        write_whole(folder / FILES[0], page("The paper's experiments, reproduced", lead, sections).encode())
         figures = {name: value for section in sections for name, value in section.figures.items()}
-        results.write_summary(figures, wall_time_s=wall_time)
+        with results.replaced(FILES[:1], figures, wall_time_s=wall_time) as draft:
+            (draft / FILES[0]).write_text(page("The paper's experiments, reproduced", lead, sections), encoding="utf-8")
     console.print(f"{', '.join(chosen)}: done in {wall_time:.0f} s", highlight=False)
     results.show(console, FILES)

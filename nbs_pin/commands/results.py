@@ -6,8 +6,9 @@ import hashlib
 import inspect
 import json
 import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.files import write_whole
+from nbs_pin.base.files import replaced_together
 from nbs_pin.base.versions import versions
 from nbs_pin.cli.values import OptionError
 from nbs_pin.robots.robot import Robot
 
 SUMMARY = "summary.json"
+_MOST_FOLDERS = 1000
 _NO_SETTINGS = ("out", "resume", "force")
 
 
@@ -32,6 +34,8 @@ class Results:
     folder: Path
     facts: dict[str, Any]
     """Settings, versions and the arm's fingerprint, which are equal for identical runs."""
+    is_default: bool = False
+    """Whether the folder was not given, so that another may be taken."""
 
     @classmethod
     def of(cls, options: Any, name: str, robot: Robot | None, /, **resolved: Any) -> "Results":
@@ -46,7 +50,8 @@ class Results:
         command = type(options).__name__.lower()
         folder = options.out or Path("out") / f"{command}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
         sha256 = {} if robot is None else {"robot_sha256": robot.sha256}
-        return cls(folder, {"settings": settings_of(options, **resolved), "versions": versions(), **sha256})
+        facts = {"settings": settings_of(options, **resolved), "versions": versions(), **sha256}
+        return cls(folder, facts, options.out is None)
 
     def check(
         self,
@@ -56,8 +61,9 @@ class Results:
         whole: Mapping[str, Any] | None = None,
         whose: str = "another run",
         remedy: str = "give another --out",
-    ) -> None:
-        """Raises OptionError if the folder holds results of another run.
+        unfinished: str = "",
+    ) -> "Results":
+        """These results if the folder is free for them, or else, unless it was given, in the next of NAME-2, NAME-3, ….
 
         Args:
             names: The files that count as results.
@@ -65,15 +71,35 @@ class Results:
             whole: Entries that summary.json must have besides the facts.
             whose: Name of other results in the error.
             remedy: Advice in the error besides --force.
+            unfinished: File of work that could be continued; no other folder is taken in its place.
+
+        Raises:
+            OptionError: If the folder that was given is a file or holds results of another run.
         """
-        if self.folder.exists() and not self.folder.is_dir():
-            raise OptionError(f"--out '{self.folder}' is a file; give a folder.")
-        present = [name for name in names if (self.folder / name).exists()]
-        if not present or force:
-            return
-        summary, same = summary_in(self.folder), self.facts | dict(whole or {})
-        if {key: summary.get(key) for key in same} != same:  # results without a readable summary are another run's
-            raise OptionError(f"'{self.folder}' holds {present[0]} of {whose}; {remedy}, or --force to replace it.")
+        same = self.facts | dict(whole or {})
+        for k in range(1, _MOST_FOLDERS):
+            folder = self.folder if k == 1 else self.folder.with_name(f"{self.folder.name}-{k}")
+            if folder.exists() and not folder.is_dir():
+                raise OptionError(f"--out '{folder}' is a file; give a folder.")
+            present = [name for name in names if (folder / name).exists()]
+            summary = summary_in(folder)
+            if not present or force or {key: summary.get(key) for key in same} == same:
+                return replace(self, folder=folder)
+            # Results without a readable summary are another run's, or those of one that was stopped.
+            stopped = unfinished in present and {key: summary.get(key, self.facts[key]) for key in self.facts}
+            if not self.is_default or stopped == self.facts:
+                break
+        raise OptionError(f"'{folder}' holds {present[0]} of {whose}; {remedy}, or --force to replace it.")
+
+    def held(self, name: str) -> "Results":
+        """These results in the folder, of those that `check` may have taken, that holds the file and these facts."""
+        for k in range(2, _MOST_FOLDERS) if self.is_default else ():
+            folder = self.folder.with_name(f"{self.folder.name}-{k}")
+            if not folder.exists():
+                break
+            if (folder / name).exists() and {key: summary_in(folder).get(key) for key in self.facts} == self.facts:
+                return replace(self, folder=folder)
+        return self
 
     @contextlib.contextmanager
     def made(self) -> Iterator[Path]:
@@ -87,14 +113,38 @@ class Results:
                 if path.is_dir() and not any(path.iterdir()):
                     path.rmdir()
 
-    def write_summary(self, figures: Mapping[str, Any], **more: Any) -> Path:
-        """Write summary.json with the facts, the figures and further entries, all as JSON can store them."""
-        return write_whole(self.folder / SUMMARY, summary_text(self.facts | more | {"figures": figures}).encode())
+    @contextlib.contextmanager
+    def replaced(self, names: Sequence[str], figures: Mapping[str, Any], **more: Any) -> Iterator[Path]:
+        """A folder for the new results that are data, which take the place of all those in `names` when the block ends.
+
+        summary.json is added with the facts, the figures and further entries. Whenever the process ends, the files of
+        those names in the folder belong to one run. Pictures are drawn afterwards, within `drawing`.
+        """
+        with replaced_together(self.folder, [SUMMARY, *names]) as draft:
+            yield draft
+            summary = summary_text(self.facts | more | {"figures": figures})
+            (draft / SUMMARY).write_text(summary, encoding="utf-8")
 
     def show(self, console: Console, names: Iterable[str]) -> None:
-        """Print the paths of the results, one per line."""
+        """Print the paths of the results that exist, one per line."""
         for name in names:
-            console.print(str(self.folder / name), soft_wrap=True, highlight=False, markup=False)
+            if (self.folder / name).exists():
+                console.print(str(self.folder / name), soft_wrap=True, highlight=False, markup=False)
+
+
+@contextlib.contextmanager
+def drawing(path: Path) -> Iterator[Path]:
+    """Around the drawing of a picture of results that are already written: they outlive whatever goes wrong in it.
+
+    A fault of the drawing is told in a warning; an OSError, as for a full disk, goes on.
+    """
+    try:
+        yield path
+    except OSError:
+        raise
+    except Exception as error:  # drawing libraries may raise any exception
+        message = f"'{path}' was not drawn ({type(error).__name__}: {error!s:.500}); the other results are whole."
+        warnings.warn(message, stacklevel=3)
 
 
 def settings_of(options: Any, **resolved: Any) -> dict[str, Any]:

@@ -1,10 +1,7 @@
 """`nbs-pin track`: simulate an arm that follows a motion; write run, summary, figure and replay."""
 
-import os
-import tempfile
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +15,7 @@ from nbs_pin.base.records import Reference, Run
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_numbers
 from nbs_pin.commands.inputs import arm_of, law_of
-from nbs_pin.commands.results import SUMMARY, Results, keywords, summary_text, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.dynamics.friction import JointFriction
@@ -36,7 +33,7 @@ from nbs_pin.simulation.registry import build_plant
 from nbs_pin.simulation.simulate import simulate
 
 FILES = ("run.npz", "tracking.png", "replay.html", SUMMARY)
-"""Files of `write_results`, the summary last."""
+"""Files of `write_results`."""
 _NOTICEABLE = 1.0  # compilation times above this are printed [s]
 _ROWS_OF_ARRAYS = 8  # arrays of a Run with one number per row and joint
 
@@ -50,7 +47,7 @@ def run(options: Track, console: Console, notes: Console) -> None:
     motion, length = motion_of(options.reference, robot, frequency=options.frequency, period=options.period)
     duration = options.duration or length
     results = Results.of(options, robot.name, robot, robot=robot.source, duration=duration)
-    results.check(FILES, options.force)
+    results = results.check(FILES, options.force)
     given = keywords(options, track) | {
         "reference": motion,
         "duration": duration,
@@ -61,10 +58,9 @@ def run(options: Track, console: Console, notes: Console) -> None:
         recorded, compile_time, wall_time = track(robot, **given, progress=True)
         recorded.info.update(reference=options.reference, **results.facts)
         found = figures(recorded, robot)
-        with notes.status(f"drawing picture and replay into {folder}"):
+        with notes.status(f"writing run, picture and replay into {folder}"):
             times = {"compile_time_s": compile_time, "wall_time_s": wall_time}
-            summary = results.facts | {"seed": options.seed, **times, "figures": found}
-            write_results(recorded, folder, robot, summary)
+            write_results(recorded, results, robot, found, seed=options.seed, **times)
     _print(console, f"{robot.name}, {options.controller} in {options.plant}", found, compile_time, wall_time)
     results.show(console, FILES)
 
@@ -153,22 +149,18 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     return values
 
 
-def write_results(run: Run, folder: str | Path, robot: Robot, summary: dict[str, Any]) -> Path:
-    """Write `FILES` for the run into the folder, and return the folder; `summary` is the content of summary.json.
+def write_results(run: Run, results: Results, robot: Robot, figures: dict[str, Any], **more: Any) -> None:
+    """Write `FILES`, the run and summary.json first; a picture that cannot be drawn is told in a warning.
 
-    Files of those names are replaced only after all have been drawn. Raises OSError if they cannot be written.
+    `more` are further entries of summary.json. Raises OSError if something cannot be written.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as drafts:
-        draft = Path(drafts)
-        run.save(draft / "run.npz")
-        plot_tracking(run, draft / "tracking.png")
-        replay(run, draft / "replay.html", robot)
-        (draft / SUMMARY).write_text(summary_text(summary), encoding="utf-8")
-        for name in FILES:
-            os.replace(draft / name, folder / name)
-    return folder
+    folder = results.folder
+    with results.replaced(FILES, figures, **more) as draft:
+        run.save(draft / FILES[0])
+    with drawing(folder / FILES[1]) as path:
+        plot_tracking(run, path)
+    with drawing(folder / FILES[2]) as path:
+        replay(run, path, robot)
 
 
 def _check_size(nv: int, duration: float, period: float) -> None:

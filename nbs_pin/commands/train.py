@@ -11,7 +11,7 @@ from nbs_pin.base.records import Run
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import plain_numbers
 from nbs_pin.commands.inputs import arm_of, law_of
-from nbs_pin.commands.results import SUMMARY, Results, keywords, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import Sinusoid, check_reference
@@ -27,7 +27,7 @@ from nbs_pin.training.train import Training, train
 CHECKPOINT = "training.ckpt"
 """The checkpoint that `train_robot` keeps up to date in its folder."""
 FILES = ("controller.nbs", "learning.png", SUMMARY)
-"""Files of `write_results`, the summary last."""
+"""Files of `write_results`."""
 _LONGER = 3.0  # duration of fresh motions over that of training motions
 
 
@@ -36,10 +36,13 @@ def run(options: Train, console: Console, notes: Console) -> None:
     with notes.status(f"loading {options.robot}"):
         robot = arm_of(options)
     results = Results.of(options, robot.name, robot, robot=robot.source)
-    if not options.resume:
+    if options.resume:
+        results = results.held(CHECKPOINT)
+    else:
         whose, remedy = "another or an unfinished training", "give another --out, --resume to continue it"
         names, whole = (CHECKPOINT, *FILES), {"interrupted": False}
-        results.check(names, options.force, whole=whole, whose=whose, remedy=remedy)
+        told: dict[str, Any] = {"whole": whole, "whose": whose, "remedy": remedy, "unfinished": CHECKPOINT}
+        results = results.check(names, options.force, **told)
     given = keywords(options, train_robot) | {
         "frequencies": tuple(plain_numbers(options.frequencies) or ()),
         "gains": not options.fixed_gains,
@@ -140,13 +143,14 @@ def figures(result: Trained) -> dict[str, Any]:
 
 
 def write_results(result: Trained, results: Results, *, interrupted: bool) -> dict[str, Any]:
-    """Write `FILES`, the trained controller first, and return the figures; raises OSError if they cannot be written."""
+    """Write `FILES`, the picture last, and return the figures; raises OSError if they cannot be written."""
     numbers, training = figures(result), result.training
-    save(training.controller, results.folder / FILES[0], info={"trained": results.facts | {"interrupted": interrupted}})
-    shown = training.history, training.held_out, training.best_epoch, result.before, result.after
-    plot_training(*shown, results.folder / FILES[1])
     curves = plain({"history": training.history, "held_out": training.held_out})
-    results.write_summary(numbers, interrupted=interrupted, **curves)
+    with results.replaced(FILES, numbers, interrupted=interrupted, **curves) as draft:
+        save(training.controller, draft / FILES[0], info={"trained": results.facts | {"interrupted": interrupted}})
+    shown = training.history, training.held_out, training.best_epoch, result.before, result.after
+    with drawing(results.folder / FILES[1]) as path:
+        plot_training(*shown, path)
     return numbers
 
 

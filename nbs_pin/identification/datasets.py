@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nbs_pin.base.archives import parse_json
 from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
@@ -137,7 +138,7 @@ def load_dataset(path: str | Path) -> Dataset:
         FileNotFoundError: If the file does not exist.
         FileFormatError: If it is damaged, of another format, lacks an array, or its arrays are not a valid dataset.
     """
-    data = read_npz(path)
+    data = read_npz(path, {entry.name for entry in fields(Dataset)} | {"format"})
     require(data, path, {"format": "U"})
     if str(data["format"]) != DATASET_FORMAT:
         raise FileFormatError(f"{path}: format '{data['format']}', expected '{DATASET_FORMAT}'; collect it again.")
@@ -148,9 +149,9 @@ def load_dataset(path: str | Path) -> Dataset:
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
     try:
-        about = json.loads(str(data["about"]))
+        about = parse_json(path, "about", str(data["about"]))
         return Dataset(**arrays, robot=str(data["robot"]), about=about)
-    except (ArgumentError, json.JSONDecodeError) as error:
+    except ArgumentError as error:
         raise FileFormatError(f"{path}: {error}") from error
 
 

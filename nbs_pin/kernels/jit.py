@@ -13,6 +13,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from nbs_pin.kernels.cache_files import SealedCacheFile
+
 INTERPRETED = bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 """Whether kernels run as Python."""
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
@@ -93,8 +95,9 @@ def _cached(dispatcher: Any) -> Any:
     # numba renews machine code when the file of the function has changed, but not when that of a function it calls, or
     # of a constant it uses, has: here one change anywhere in the folder renews everything. The version is read first,
     # before the types of arguments, which an older folder may have defined otherwise.
-    file = dispatcher._cache._cache_file
-    file._source_stamp, file._version = _SOURCES, f"{numba.__version__} {_SOURCES}"
+    cache = dispatcher._cache
+    version = f"{numba.__version__} {_SOURCES}"
+    cache._cache_file = SealedCacheFile(cache._cache_path, cache._impl.filename_base, _SOURCES, version)
     return dispatcher
 
 

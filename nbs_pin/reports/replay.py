@@ -25,11 +25,14 @@ from meshcat.path import Path as ScenePath
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import Run
-from nbs_pin.robots.robot import Robot, configuration_difference, load_robot
+from nbs_pin.robots.named import load_named
+from nbs_pin.robots.robot import Robot, configuration_difference
 from nbs_pin.robots.visuals import Visual, link_visuals, tip
 
 FRAME_RATE = 50.0
 """Frames per second of run time [1/s]; the page interpolates between them."""
+FARTHEST = 1e6
+"""Configurations beyond this are not drawn [rad, m]."""
 MAX_FRAMES = 12_000
 """Longer runs get fewer frames per second, so that the page stays small."""
 
@@ -71,6 +74,8 @@ def replay(
     q, q_ref = (_one_start(array, start)[rows] for array in (run.q, run.q_ref))
     if not (np.isfinite(q).all() and np.isfinite(q_ref).all()):
         raise ArgumentError("the run has configurations that are not finite: show the part before it diverged.")
+    if max(np.abs(q).max(), np.abs(q_ref).max()) > FARTHEST:
+        raise ArgumentError(f"the run has configurations beyond ±{FARTHEST:g}: show the part before it diverged.")
     poses = np.stack([body_poses(robot, q), body_poses(robot, q_ref)], axis=1)
     visuals = link_visuals(robot, package_dirs)
     joint, point = tip(robot)
@@ -109,10 +114,7 @@ def _robot_of(run: Run) -> Robot:
     """The robot that the run names; raises ArgumentError unless it is still the one that ran."""
     if not run.robot:
         raise ArgumentError("the run names no robot: give it as replay(run, path, robot=load_robot(…)).")
-    unknown = run.robot_options.keys() - {"gravity", "lock", "zero_limits"}
-    if unknown:
-        raise ArgumentError(f"the run loads its robot with {', '.join(sorted(unknown))}, unknown here: give robot=….")
-    robot = load_robot(run.robot, **run.robot_options)
+    robot = load_named("the run", run.robot, run.robot_options)
     if robot.sha256 != run.robot_sha256:
         raise ArgumentError(
             f"'{run.robot}' is not the arm that ran (description or gravity differ: {robot.sha256[:12]} now, "

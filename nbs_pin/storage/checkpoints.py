@@ -12,14 +12,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
 from nbs_pin.base.archives import parse_json, read_archive, write_archive
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError, RobotError, RobotNotFound
+from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
-from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.robots.named import load_named
+from nbs_pin.robots.robot import Robot
 from nbs_pin.storage.descriptions import Settings, Stored, describe, described_robot, rebuild
 
 FORMAT = "nbs_pin checkpoint 1"
@@ -120,6 +124,7 @@ def read_checkpoint(path: str | Path, robot: Robot | None = None) -> Checkpoint:
         controller = rebuild(settings, _tensors(path, _CONTROLLER, entries), arm)
     if robot is not None and robot.nv != controller.nv:
         raise ArgumentError(f"{path} is for {controller.nv} joints and {robot.name} has {robot.nv}; give its own arm.")
+    _check_finite(path, controller)
     if f"{_TRAINING}.json" not in entries:
         return Checkpoint(controller, None)
     facts = parse_json(path, f"{_TRAINING}.json", entries[f"{_TRAINING}.json"])
@@ -155,6 +160,21 @@ def _tensors(path: str | Path, name: str, entries: Mapping[str, bytes]) -> dict[
         raise FileFormatError(f"{path}: '{name}.safetensors' is damaged ({error}); use an older copy.") from error
 
 
+def _check_finite(path: str | Path, stored: Stored) -> None:
+    """Raises FileFormatError if settings and weights, each of them finite, overflow together."""
+    n = stored.nv
+    with torch.no_grad(), np.errstate(all="ignore"):
+        q, v = (torch.stack([torch.full((n,), near), torch.ones(n)]).double() for near in (0.1, 0.01))
+        if isinstance(stored, Controller):
+            found, _ = stored.step(stored.initial_memory(q), q, v, Reference(0.0 * q, 0.5 * v, 0.5 * v), 1e-3)
+        else:
+            found = stored.reference_torque(q, v, v, v)
+    if not np.isfinite(np.asarray(found)).all():
+        raise FileFormatError(
+            f"{path}: its torques are not finite near rest, so that numbers in it overflow; train it again."
+        )
+
+
 def _arm(path: str | Path, stored: Settings, given: Robot | None) -> Robot:
     """The arm described, with its stored effort limits, or `given` if that is the same arm."""
     robot = _loaded(path, stored) if given is None else given
@@ -176,11 +196,7 @@ def _arm(path: str | Path, stored: Settings, given: Robot | None) -> Robot:
 def _loaded(path: str | Path, stored: Settings) -> Robot:
     try:
         with _refusing(path):
-            return load_robot(stored["source"], **stored["options"])
-    except TypeError as error:
-        raise FileFormatError(
-            f"{path}: its arm is loaded with options that this version does not know ({error}); give it as robot=…."
-        ) from error
+            return load_named(str(path), stored["source"], stored["options"])
     except RobotNotFound as error:
         raise RobotNotFound(
             f"{path} is for the arm '{stored['name']}' of {stored['source']}, which is not there; give it as "
@@ -194,4 +210,5 @@ def _refusing(path: str | Path) -> Iterator[None]:
     try:
         yield
     except ArgumentError as error:
-        raise FileFormatError(f"{path}: {error}; save the controller again with this version.") from error
+        fault = str(error).rstrip(".")
+        raise FileFormatError(f"{path}: {fault}; save the controller again with this version.") from error

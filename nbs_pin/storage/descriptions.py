@@ -22,6 +22,9 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.registry import NETWORKS, PROVIDERS
 from nbs_pin.robots.robot import Robot
 
+LARGEST_WEIGHT = 1e12
+"""Largest gain or weight in size: products of those of a few layers stay finite."""
+
 Settings: TypeAlias = dict[str, Any]
 """A part in JSON: its `kind`, its settings by name, and its own parts."""
 
@@ -140,9 +143,9 @@ def _check_tensors(tensors: Mapping[str, torch.Tensor], module: nn.Module) -> No
         if (found.shape, found.dtype) != (x.shape, x.dtype):
             stated = [f"{tuple(t.shape)} {t.dtype}" for t in (found, x)]
             raise ArgumentError(f"tensor '{name}' is {stated[0]}, expected {stated[1]}")
-        bad = int((~torch.isfinite(found)).sum())
+        bad = int((~(found.double().abs() <= LARGEST_WEIGHT)).sum())
         if bad:
-            raise ArgumentError(f"tensor '{name}' has {bad} numbers that are not finite")
+            raise ArgumentError(f"tensor '{name}' has {bad} numbers that are not finite or beyond {LARGEST_WEIGHT:g}")
         if name in fixed and not torch.equal(found, x):
             raise ArgumentError(f"tensor '{name}' is not what its constructor makes")
 
