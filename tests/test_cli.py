@@ -1,5 +1,6 @@
 """The command line: what it writes, what it prints, what it refuses, and what it leaves behind when stopped."""
 
+import os
 import re
 import resource
 import shlex
@@ -23,6 +24,7 @@ from nbs_pin.robots.catalogue import find
 from nbs_pin.simulation import metrics
 from tests.commands import check_results_are_kept_unless_forced, contents, refusal, summary
 
+ROOT = str(Path(__file__).parent.parent)
 NBS_PIN = (sys.executable, "-m", "nbs_pin.cli")
 TRACKS = {
     "two_link": "--duration 1.5 --start-error 0.3 --disturbance square:2,1@8 --seed 3",
@@ -261,6 +263,39 @@ def test_a_stop_in_the_simulation_leaves_nothing(tmp_path, number, code):
     process.send_signal(number)
     assert process.wait(timeout=60) == code
     assert not folder.exists()
+
+
+def is_handled(process, number):
+    """Whether the process has a handler for the signal; before that it is the interpreter that starts."""
+    caught = re.search(r"SigCgt:\s*(\w+)", Path(f"/proc/{process.pid}/status").read_text())
+    return caught is not None and bool(int(caught[1], 16) >> (number - 1) & 1)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stop_while_modules_are_imported_is_one_line(tmp_path, number, code):
+    for delay in (0.0, 0.002, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0):
+        command = [*NBS_PIN, "track", "two_link", "--duration", "1000", "--out", str(tmp_path / "run")]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        while not is_handled(process, signal.SIGTERM):  # Python itself handles SIGINT somewhat earlier
+            assert process.poll() is None
+        time.sleep(delay)
+        process.send_signal(number)
+        printed = process.communicate(timeout=60)
+        assert (process.returncode, *printed) == (code, "", "nbs-pin: interrupted.\n"), delay
+        assert not (tmp_path / "run").exists()
+
+
+def test_what_would_make_a_library_fail_is_one_sentence(tmp_path):
+    gone = tmp_path / "gone"
+    shell = 'cd "$1"; rmdir "$1"; exec "$2" -m nbs_pin.cli robots'
+    gone.mkdir()
+    command = ["sh", "-c", shell, "sh", str(gone), sys.executable]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": ROOT})
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "the current folder no longer exists" in done.stderr
+    done = nbs_pin("robots", env=os.environ | {"NUMBA_NUM_THREADS": "abc"})
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "NUMBA_NUM_THREADS is 'abc'" in done.stderr
 
 
 def test_a_stop_the_moment_the_folder_is_made_leaves_nothing(tmp_path, monkeypatch, capsys):

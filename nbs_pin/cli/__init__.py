@@ -1,64 +1,22 @@
-"""The command line `nbs-pin`: one module per command, whose heavy imports wait until it runs."""
+"""The command line `nbs-pin`.
 
-import contextlib
-import difflib
-import io
+This file imports almost nothing, so that Ctrl-C and SIGTERM are handled from the first millisecond. `shell.py` reads
+the arguments, one module per command has its options, and `nbs_pin.commands` does the work.
+"""
+
 import os
-import re
 import signal
 import sys
 import threading
-import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Annotated, Any, Union, cast
+from typing import Any
 
-import tyro
-from rich.console import Console
+from nbs_pin.cli.exit_codes import NO_PROMISE, SIGNALLED
 
-from nbs_pin import __version__
-from nbs_pin.base.exceptions import CertificateRefused, NbsPinError
-from nbs_pin.cli.bench import Bench
-from nbs_pin.cli.certify import Certify
-from nbs_pin.cli.collect import Collect
-from nbs_pin.cli.compare import Compare
-from nbs_pin.cli.learn import Learn
-from nbs_pin.cli.replay import Replay
-from nbs_pin.cli.reproduce import Reproduce
-from nbs_pin.cli.robots import Robots
-from nbs_pin.cli.track import Track
-from nbs_pin.cli.train import Train
-from nbs_pin.cli.values import OptionError
-from nbs_pin.cli.verify import Verify
+__all__ = ["COMMANDS", "NO_PROMISE", "main", "parse"]
 
-COMMANDS: dict[str, type] = {
-    "track": Track,
-    "train": Train,
-    "collect": Collect,
-    "learn": Learn,
-    "compare": Compare,
-    "certify": Certify,
-    "verify": Verify,
-    "replay": Replay,
-    "reproduce": Reproduce,
-    "bench": Bench,
-    "robots": Robots,
-}
-"""The options class of every command. The module of the same name in `nbs_pin.commands` does the work in `run`."""
-BAD_INPUT, NO_PROMISE, INTERRUPTED = 2, 3, 130
-_DESCRIPTION = (
-    "Tracking control for any URDF arm. `nbs-pin COMMAND --help` lists the options of a command, "
-    "`nbs-pin --version` prints the version. Exit codes: 0 success, 2 bad input, 3 no promise from certify or verify, "
-    "130 interrupted."
-)
-
-
-class Output(Console):
-    """Standard output, whose reader may close it early."""
-
-    def on_broken_pipe(self) -> None:
-        """Let `main` end quietly; rich would exit with code 1."""
-        raise BrokenPipeError
+_HANDLED = (signal.SIGINT, signal.SIGTERM)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,127 +25,47 @@ def main(argv: Sequence[str] | None = None) -> int:
     It is 0 for success, 2 for bad input (one sentence on stderr), 3 if `certify` gives no promise (refused, or a
     condition fails) or `verify` does not confirm one, 130 after Ctrl-C, 143 after SIGTERM.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? for them
-    notes = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
-    arguments = sys.argv[1:] if argv is None else list(argv)
-    with _stops() as stops, _warnings_to(notes):
-        try:
-            return _run(arguments, notes, stops)
-        except BaseException as error:
-            # A signal during the import of an extension surfaces as an ImportError, so signals are checked first.
-            if stops or isinstance(error, KeyboardInterrupt):
-                notes.print("nbs-pin: interrupted.")
-                return stops[0] if stops else INTERRUPTED
-            return _failed(error, notes)
-
-
-def _failed(error: BaseException, notes: Console) -> int:
-    """Print one sentence for an error that the user can correct and return the exit code; re-raise any other."""
-    if isinstance(error, NbsPinError):
-        notes.print(f"nbs-pin: error: {_one_line(str(error))}")
-    elif isinstance(error, BrokenPipeError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has closed the pipe
-        return 0
-    elif isinstance(error, OSError):
-        where = f"'{error.filename}': " if error.filename is not None else ""
-        reason = (error.strerror or str(error)).lower()
-        notes.print(f"nbs-pin: error: {where}{reason}; check the path, its permissions and the free space.")
-    else:
-        raise error
-    return NO_PROMISE if isinstance(error, CertificateRefused) else BAD_INPUT
-
-
-def _run(arguments: list[str], notes: Console, stops: list[int]) -> int:
-    console = Output()
-    if arguments == ["--version"]:
-        console.print(f"nbs-pin {__version__}", highlight=False)
-        return 0
-    command = parse(arguments)
-    if command is not None:
-        with notes.status("loading"):
-            body = import_module(f"nbs_pin.commands.{arguments[0]}")
-        if stops:  # a library that is being imported may swallow the interrupt
-            raise KeyboardInterrupt
-        return body.run(command, console, notes) or 0
-    return 0
-
-
-def parse(arguments: list[str]) -> Any:
-    """The options of the command, None if help was printed; raises OptionError for anything else."""
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
-        raise OptionError(f"no command '{arguments[0]}'; {_near(arguments[0], COMMANDS)}give {', '.join(COMMANDS)}.")
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint):
-            command, unknown = tyro.cli(
-                cast(Any, Union[tuple(_subcommand(name) for name in COMMANDS)]),  # noqa: UP007
-                prog="nbs-pin",
-                description=_DESCRIPTION,
-                args=arguments,
-                config=(tyro.conf.FlagCreatePairsOff,),
-                return_unknown_args=True,
-            )
-    except SystemExit as stop:
-        if stop.code in (0, None):
-            return None
-        raise OptionError(f"{_first_paragraph(complaint.getvalue())}; see nbs-pin --help.") from None
-    if unknown:
-        flags = [f"--{name.replace('_', '-')}" for name in vars(command)]
-        what = "has no option" if unknown[0].startswith("-") else "takes no argument"
-        remedy = f"{_near(unknown[0], flags)}see nbs-pin {arguments[0]} --help."
-        raise OptionError(f"nbs-pin {arguments[0]} {what} '{unknown[0]}'; {remedy}")
-    return command
-
-
-def _subcommand(name: str) -> Any:
-    return Annotated[COMMANDS[name], tyro.conf.subcommand(name)]
-
-
-def _near(word: str, words: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word.partition("=")[0], words, n=1)
-    return f"did you mean {near[0]}? " if near else ""
-
-
-def _first_paragraph(box: str) -> str:
-    """The text in tyro's error box before its first rule, as one line."""
-    inside = [line.strip("│ ") for line in box.splitlines() if not line.startswith(("╭", "╰"))]
-    rules = [k for k, line in enumerate(inside) if line.startswith("─")]
-    return _one_line(" ".join(inside[: rules[0] if rules else None])).rstrip(".")
-
-
-def _one_line(text: str) -> str:
-    return re.sub(r"\s+", " ", text).strip()
-
-
-@contextlib.contextmanager
-def _stops() -> Iterator[list[int]]:
-    """The exit codes of received signals; Ctrl-C and SIGTERM raise KeyboardInterrupt, so that drafts are removed.
-
-    Only the main thread can handle signals; in others the list stays empty.
-    """
+    arguments, alone = list(sys.argv[1:] if argv is None else argv), argv is None
+    if threading.current_thread() is not threading.main_thread():  # only the main thread can handle signals
+        return _shell().run(arguments, [], lambda: None)
     stops: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield stops
-        return
 
     def stop(number: int, _: Any) -> None:
-        stops.append(128 + number)
+        stops.append(SIGNALLED + number)
         raise KeyboardInterrupt
 
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    # While modules are imported an exception could be swallowed or reappear as another one, and nothing is to be kept.
+    previous = _handle(_leave if alone else stop)
     try:
-        yield stops
+        return _shell().run(arguments, stops, lambda: _handle(stop))
+    except KeyboardInterrupt:  # in the moments that `run` does not cover
+        code = stops[0] if stops else SIGNALLED + signal.SIGINT
+        if alone:
+            _leave(code - SIGNALLED, None)
+        return code
     finally:
         for number, handler in previous.items():
-            signal.signal(number, handler)
+            signal.signal(number, _leave if alone else handler)
 
 
-@contextlib.contextmanager
-def _warnings_to(notes: Console) -> Iterator[None]:
-    """Print warnings as one line each, without deprecations, which address the authors of a library."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        warnings.showwarning = lambda message, *_, **__: notes.print(f"nbs-pin: warning: {_one_line(str(message))}")
-        yield
+def _handle(handler: Callable[[int, Any], None]) -> dict[signal.Signals, Any]:
+    """Let the handler receive the signals; returns those before it."""
+    return {number: signal.signal(number, handler) for number in _HANDLED}
+
+
+def _leave(number: int, _: Any) -> None:
+    """End the process at once: nothing has been done yet, or all has been written."""
+    clear = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a spinner that hides the cursor may be shown
+    os.write(2, f"{clear}nbs-pin: interrupted.\n".encode())
+    os._exit(SIGNALLED + number)
+
+
+def _shell() -> Any:
+    return import_module("nbs_pin.cli.shell")
+
+
+def __getattr__(name: str) -> Any:
+    """COMMANDS and parse of `shell.py`."""
+    if name in __all__:
+        return getattr(_shell(), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

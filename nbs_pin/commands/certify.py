@@ -16,8 +16,8 @@ from nbs_pin.certificates.certificate_file import write_certificate
 from nbs_pin.certificates.loads import MARGIN
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.certificates.uncertainty import Uncertainty
-from nbs_pin.cli import NO_PROMISE
 from nbs_pin.cli.certify import Certify
+from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import print_certificate
 from nbs_pin.commands.results import SUMMARY, Results, drawing

@@ -5,7 +5,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.cli import NO_PROMISE
+from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.verify import Verify
 from nbs_pin.verification.verify import FALSE, OPEN, TAKEN, VERIFIED, Verification, verify
 

@@ -30,13 +30,13 @@ class SealedCacheFile(IndexDataCacheFile):
     """
 
     def __init__(self, folder: str, name: str, stamp: str, version: str) -> None:
-        super().__init__(cache_path=folder, filename_base=f"{name}.sealed", source_stamp=stamp)
+        super().__init__(cache_path=folder, filename_base=f"{name}.sealed", source_stamp=stamp)  # type: ignore[no-untyped-call]
         self._version = version
 
     def save(self, key: Any, data: Any) -> None:
         """Keep machine code; if it cannot be written, a warning says so and it is compiled again next time."""
         try:
-            super().save(key, data)
+            super().save(key, data)  # type: ignore[no-untyped-call]
         except OSError as error:
             _tell(self._cache_path, f"cannot be kept ({error.strerror}): it is compiled again next time")
 
@@ -51,7 +51,7 @@ class SealedCacheFile(IndexDataCacheFile):
         return overloads if stamp == self._source_stamp else {}
 
     def _load_data(self, name: str) -> Any:
-        return pickle.loads(self._content(self._data_path(name)))
+        return pickle.loads(self._content(self._data_path(name)))  # type: ignore[no-untyped-call]
 
     def _content(self, path: str) -> bytes:
         """The content of a file; raises OSError if it cannot be read or is damaged."""

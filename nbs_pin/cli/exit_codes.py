@@ -1,0 +1,8 @@
+"""Exit codes of `nbs-pin`; 0 is success."""
+
+BAD_INPUT = 2
+"""One sentence on stderr says what to correct."""
+NO_PROMISE = 3
+"""`certify` gives no promise, or `verify` does not confirm one."""
+SIGNALLED = 128
+"""Plus the number of the signal: 130 after Ctrl-C, 143 after SIGTERM."""
