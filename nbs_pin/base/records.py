@@ -13,6 +13,7 @@ from nbs_pin.base.archives import parse_json
 from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
+from nbs_pin.base.units import JointUnits, units_of
 
 RUN_FORMAT = "nbs_pin run 1"
 """Value of the entry `format` in a run file."""
@@ -81,11 +82,23 @@ class Run:
     """`Robot.options` of that arm."""
     info: dict[str, Any] = field(default_factory=dict)
     """Further metadata (controller, plant, seed, versions), stored as JSON."""
+    prismatic: Bool[np.ndarray, " n"] | None = None
+    """True for joints that slide, with q in [m] and a force tau [N]; None, as in older files, is for no joint."""
 
     @property
     def nv(self) -> int:
         """Number of joints."""
         return int(self.q.shape[-1])
+
+    @property
+    def slides(self) -> Bool[np.ndarray, " n"]:
+        """`prismatic`, or False for every joint if it is not stated."""
+        return np.zeros(self.nv, dtype=bool) if self.prismatic is None else self.prismatic
+
+    @property
+    def units(self) -> tuple[JointUnits, ...]:
+        """The units of every joint."""
+        return units_of(self.slides)
 
     def save(self, path: str | Path) -> None:
         """Write the run to an npz file atomically; missing folders are created.
@@ -94,6 +107,7 @@ class Run:
             ArgumentError: If `info` or `robot_options` cannot be stored as JSON.
         """
         values = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+        values = {name: value for name, value in values.items() if value is not None}
         texts = {name: _dumped(name, values[name]) for name in _JSON} | {"format": RUN_FORMAT}
         write_npz(path, {name: np.asarray(value) for name, value in (values | texts).items()})
 
@@ -108,7 +122,7 @@ class Run:
         data = {"robot_options": np.array("{}"), **read_npz(path, names)}  # absent in the oldest run files
         require(data, path, {"format": "U", "t": "f", **dict.fromkeys(_PER_ROW, "f"), "effort_limit": "f"})
         require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", *_JSON), "U")})
-        require(data, path, {"period": "f"})
+        require(data, path, {"period": "f", **({"prismatic": "b"} if "prismatic" in data else {})})
         if str(data["format"]) != RUN_FORMAT:
             raise FileFormatError(f"{path}: format '{data['format']}', expected '{RUN_FORMAT}'; record the run again.")
         _check_shapes(path, data)
@@ -122,12 +136,14 @@ class Run:
             robot_sha256=str(data["robot_sha256"]),
             robot_options=parse_json(path, "robot_options", str(data["robot_options"])),
             info=parse_json(path, "info", str(data["info"])),
+            prismatic=data.get("prismatic"),
         )
 
 
 def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
     shape = data["q"].shape
-    expected = dict.fromkeys(_PER_ROW, shape) | dict.fromkeys(_PER_JOINT, shape[-1:]) | {"t": shape[:1], "period": ()}
+    joints = (*_PER_JOINT, *(["prismatic"] if "prismatic" in data else []))
+    expected = dict.fromkeys(_PER_ROW, shape) | dict.fromkeys(joints, shape[-1:]) | {"t": shape[:1], "period": ()}
     for name, wanted in expected.items():
         if len(shape) < 2 or 0 in shape or data[name].shape != wanted:
             raise FileFormatError(

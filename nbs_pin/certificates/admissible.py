@@ -1,5 +1,6 @@
 """Admissible disturbances: every τ_d(t) that stays inside a box or a ball."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,6 +11,7 @@ from nbs_pin.base.arrays import JointArray, Vectors
 from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.claims import Claim, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.units import TURNING, several, with_units
 
 _LEAST, _GREATEST = 1e-100, 1e100
 
@@ -101,9 +103,14 @@ class Admissible:
         size = np.linalg.norm(direction, axis=-1, keepdims=True)
         return (self.radius or 0.0) * direction / np.where(size > 0.0, size, 1.0)
 
-    def __str__(self) -> str:
+    def told(self, units: Sequence[str]) -> str:
+        """The bound in words, with the unit of every joint's torque."""
         if self.box is None:
-            return f"‖τ_d‖ ≤ {self.radius:g} N·m"
-        if len(set(self.box.tolist())) == 1:
-            return f"|τ_d,i| ≤ {self.box[0]:g} N·m on every joint"
-        return f"|τ_d,i| ≤ ({', '.join(f'{x:g}' for x in self.box)}) N·m"
+            return f"‖τ_d‖ ≤ {self.radius:g} {several(units)}"
+        if len({*zip(self.box.tolist(), units, strict=True)}) == 1:
+            return f"|τ_d,i| ≤ {self.box[0]:g} {units[0]} on every joint"
+        sides = with_units([f"{x:g}" for x in self.box], units)
+        return f"|τ_d,i| ≤ ({', '.join(sides)})" + (f" {units[0]}" if len(set(units)) == 1 else "")
+
+    def __str__(self) -> str:
+        return self.told((TURNING.torque,) * (1 if self.box is None else len(self.box)))

@@ -1,7 +1,7 @@
 """A certificate: bounds of the tracking error, what they rest on, and how each is known."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from nbs_pin.accuracy.mismatch import Mismatch
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.records import Reference
+from nbs_pin.base.units import over_joints, several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.body_error import BodyError
 from nbs_pin.certificates.claims import Assumed, Assumption, Condition, Role, assumed
@@ -19,7 +20,6 @@ from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.error_bounds import radians
 from nbs_pin.certificates.friction_error import FrictionError
 from nbs_pin.certificates.held_torque import HeldTorque
-from nbs_pin.certificates.margins import units
 from nbs_pin.certificates.model_error import ModelError
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.robots.robot import Robot
@@ -110,8 +110,7 @@ class Certificate:
     @property
     def lines(self) -> tuple[Claim, ...]:
         """Every bound and every constant, with its label and reason."""
-        return (
-            *_bounds(self),
+        whole = (
             *(() if self.held is None else (self.held.line,)),
             *self.admissible.claims,
             *self.constants.lines,
@@ -120,6 +119,7 @@ class Certificate:
             *(() if self.bodies is None else self.bodies.lines),
             *self.margins,
         )
+        return (*_bounds(self), *(self._over_joints(claim) for claim in whole))
 
     @property
     def printed_error(self) -> float:
@@ -142,7 +142,7 @@ class Certificate:
         robot, box, found = self.robot, self.admissible.largest(self.controller.nv), []
         if robot is not None and (box >= robot.effort_limit).any():
             i = int(np.argmax(box / robot.effort_limit))
-            unit = "N" if robot.joints[i].prismatic else "N·m"
+            unit = units("torque", robot.prismatic)[i]
             found.append(
                 f"the disturbance of {self.joint_names[i]}, {box[i]:.3g} {unit}, is no less than the "
                 f"{robot.effort_limit[i]:.3g} {unit} of its motor, so no law can hold it; give a smaller one"
@@ -166,7 +166,21 @@ class Certificate:
     @property
     def joint_units(self) -> tuple[str, ...]:
         """Unit of the error of each joint: rad, or m for a prismatic joint."""
-        return units(self.robot, self.controller.nv)
+        return units("position", self._prismatic)
+
+    @property
+    def disturbance(self) -> str:
+        """The disturbance in words, with units."""
+        return self.admissible.told(units("torque", self._prismatic))
+
+    def _over_joints(self, claim: Claim) -> Claim:
+        """A claim about all joints, with the units of those that slide."""
+        unit = over_joints(claim.unit, self._prismatic)
+        return claim if unit == claim.unit else replace(claim, unit=unit)
+
+    @property
+    def _prismatic(self) -> np.ndarray:
+        return np.zeros(self.controller.nv, dtype=bool) if self.robot is None else self.robot.prismatic
 
     @property
     def storage(self) -> float:
@@ -193,7 +207,7 @@ class Certificate:
     def summary(self) -> dict[str, Any]:
         """The certificate as JSON can store it."""
         return {
-            "disturbance": str(self.admissible),
+            "disturbance": self.disturbance,
             "rate_per_s": self.rate if self.bodies is None else None,
             "error_rad": self.error,
             "joint_errors_rad": self.joint_errors.tolist(),
@@ -223,7 +237,7 @@ def _bounds(certificate: Certificate) -> tuple[Claim, ...]:
         nothing = "disturbance and constant model error"
         source = f"{source}, for loops drawn alike and up to t = {certificate.mismatch.duration:.4g} s"
     joints = zip(certificate.joint_names, certificate.joint_errors.tolist(), certificate.joint_units, strict=True)
-    whole = "rad" if set(certificate.joint_units) == {"rad"} else "rad, m"
+    whole = several(certificate.joint_units)
     printed = Claim(
         _PRINTED, certificate.printed_error, whole, Label.EMPIRICAL, _TRUE if harmless else _FALSE, Group.BOUNDS
     )

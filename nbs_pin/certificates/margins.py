@@ -10,6 +10,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, refuse
 from nbs_pin.base.records import Reference
+from nbs_pin.base.units import units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.claims import Assumption, Condition, Role
 from nbs_pin.certificates.constants import configurations
@@ -168,8 +169,7 @@ def _least_room(robot: Robot, kind: str, needed: JointArray, what: str, because:
     limit = robot.effort_limit if kind == "effort" else robot.velocity_limit
     share = needed / limit
     worst = int(np.argmax(share))
-    slides = robot.joints[worst].prismatic
-    unit = {"effort": ("N·m", "N"), "velocity": ("rad/s", "m/s")}[kind][slides]
+    unit = units("torque" if kind == "effort" else kind, robot.prismatic)[worst]
     checks = Assumption.EFFORT if kind == "effort" else Assumption.VELOCITY
     name = f"{kind} limit of {robot.joint_names[worst]} > {what}"
     sides = float(limit[worst]), float(needed[worst])
@@ -188,7 +188,7 @@ def position_margin(robot: Robot, errors: JointArray, motion: SampledMotion) -> 
     if not np.isfinite(left[joint]):
         return ()
     name, because = f"room of {robot.joint_names[joint]} to its position limits > |z1_i|", f"over {motion.t[-1]:g} s"
-    sides, unit = (float(left[joint]), float(errors[joint])), units(robot)[joint]
+    sides, unit = (float(left[joint]), float(errors[joint])), units("position", robot.prismatic)[joint]
     return (Condition(name, *sides, unit, Label.PROVED, because, checks=Assumption.STOPS),)
 
 
@@ -198,11 +198,6 @@ def smoothness(motion: SampledMotion) -> tuple[Condition, ...]:
     name = f"reference: allowed > change of joint {joint + 1} at t = {t:.4g} s that its derivatives do not explain"
     because = f"{len(motion.t)} instants; nothing is checked between them"
     return (Condition(name, allowed, rest, "", Label.EMPIRICAL, because, Role.NECESSARY, Assumption.REFERENCE),)
-
-
-def units(robot: Robot | None, nv: int = 0) -> tuple[str, ...]:
-    """Unit of each joint's position."""
-    return ("rad",) * nv if robot is None else tuple("m" if joint.prismatic else "rad" for joint in robot.joints)
 
 
 def check_box(

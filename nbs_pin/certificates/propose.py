@@ -16,6 +16,7 @@ import numpy as np
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, positive
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
+from nbs_pin.base.units import units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.comparison_system import ComparisonSystem, level, reach
@@ -303,7 +304,9 @@ def _wanted(error: PerJoint, nv: int) -> np.ndarray:
     """The wanted error of every joint [rad]."""
     wanted = floats("the wanted error", error)
     if wanted.shape not in ((), (nv,)) or not (np.isfinite(wanted).all() and (wanted > 0.0).all()):
-        raise ArgumentError(f"the wanted error is {error}; give one number > 0, or {nv}, one per joint [rad].")
+        raise ArgumentError(
+            f"the wanted error is {error}; give one number > 0, or {nv}, one per joint [rad, m where it slides]."
+        )
     return np.full(nv, wanted)
 
 
@@ -312,10 +315,11 @@ def _check_limits(robot: Robot, arm: _Arm) -> None:
     spare = robot.effort_limit - arm.reference_torque - arm.disturbance
     i = int(np.argmin(spare))
     if spare[i] <= 0.0:
+        unit = units("torque", robot.prismatic)[i]
         raise ArgumentError(
-            f"joint '{robot.joint_names[i]}' of {robot.name} gives {robot.effort_limit[i]:g} N·m, and reference and"
-            f" disturbance alone take {arm.reference_torque[i]:.3g} + {arm.disturbance[i]:.3g} N·m; no gains can help:"
-            " give a gentler motion, less load or a stronger drive."
+            f"joint '{robot.joint_names[i]}' of {robot.name} gives {robot.effort_limit[i]:g} {unit}, and reference and"
+            f" disturbance alone take {arm.reference_torque[i]:.3g} + {arm.disturbance[i]:.3g} {unit}; no gains can"
+            " help: give a gentler motion, less load or a stronger drive."
         )
 
 
@@ -356,8 +360,9 @@ def _too_weak(robot: Robot, arm: _Arm, candidates: "list[_Candidate]", admissibl
         return f"{admissible} does not determine the gains; give a disturbance above 0."
     best = min(candidates, key=lambda c: c.share(arm, robot))
     i = int(np.argmax(best.torque(arm) / robot.effort_limit))
+    unit = units("torque", robot.prismatic)[i]
     return (
         f"the torque limit of joint '{robot.joint_names[i]}' of {robot.name} forbids it: reference, disturbance and"
-        f" the stiffness at its error bound take {best.torque(arm)[i]:.3g} N·m, whatever the wanted error, and it"
+        f" the stiffness at its error bound take {best.torque(arm)[i]:.3g} {unit}, whatever the wanted error, and it"
         f" gives {robot.effort_limit[i]:g}; take a gentler motion, less load or a stronger drive."
     )

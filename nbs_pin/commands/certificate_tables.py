@@ -7,6 +7,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nbs_pin.base.units import SLIDING, column, units
+
 _ERRORS = ("rad", "m", "rad, m")
 """Units of the error bounds, which have a table of their own."""
 _ORDER = (
@@ -22,13 +24,13 @@ _ORDER = (
 )
 """Groups of claims, in the order in which they are printed."""
 
-_GAINS = (
-    ("K", "N·m/rad", "N/m"),
-    ("Λ", "rad/s per N·m", "m/s per N"),
-    ("D₀", "N·m·s/rad", "N·s/m"),
-    ("torque", "N·m", "N"),
-)
-"""Columns of a design per joint, with the units for revolute and for prismatic joints."""
+_GAINS = {
+    "K": ("stiffness_Nm_per_rad", "stiffness"),
+    "Λ": ("rate_rad_per_s_per_Nm", "rate"),
+    "D₀": ("damping_Nms_per_rad", "damping"),
+    "torque": ("torque_Nm", "torque"),
+}
+"""Columns of a design per joint: the figures, and the fields of `JointUnits` that say in what they are."""
 
 
 def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> None:
@@ -120,14 +122,14 @@ def _design(figures: dict[str, Any]) -> Table:
         f"design: ω = {design['bandwidth_rad_per_s']:.3g} rad/s, control period {1e3 * design['period_s']:g} ms, "
         f"{design['torque_share'] or 0.0:.0%} of a torque limit at the bound"
     )
-    slides = "m" in figures["certificate"]["units"]
-    headings = [
-        f"{name}\n[{turning},\n{sliding}]" if slides else f"{name}\n[{turning}]" for name, turning, sliding in _GAINS
+    slides = [unit == SLIDING.position for unit in figures["certificate"]["units"]]
+    columns = [
+        column(name, [_number(value) for value in design[key]], units(quantity, slides))
+        for name, (key, quantity) in _GAINS.items()
     ]
-    table = _table(title, "joint", *headings)
-    columns = ("stiffness_Nm_per_rad", "rate_rad_per_s_per_Nm", "damping_Nms_per_rad", "torque_Nm")
-    for joint, *values in zip(figures["certificate"]["joints"], *(design[name] for name in columns), strict=True):
-        table.add_row(Text(joint), *(_number(value) for value in values))
+    table = _table(title, "joint", *(heading for heading, _ in columns))
+    for joint, *cells in zip(figures["certificate"]["joints"], *(cells for _, cells in columns), strict=True):
+        table.add_row(Text(joint), *cells)
     return table
 
 

@@ -211,7 +211,7 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
         plot_certificate(result.certificate, result.attack, path)
     if result.watched is not None:
         with drawing(folder / MONITOR) as path:
-            plot_monitor(result.watched, path)
+            plot_monitor(result.watched, path, units=result.certificate.joint_units)
     written = (FILES[0], FILES[1], MONITOR, DESIGNED, CERTIFICATE, SUMMARY)
     return found, [name for name in written if (folder / name).exists()]
 
@@ -228,7 +228,8 @@ def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
         return Admissible.of(numbers[0], nv)
     if len(numbers) not in (1, nv):
         raise ArgumentError(
-            f"{len(numbers)} torques were given for {nv} joints; give one for all joints, or one per joint [N·m]."
+            f"{len(numbers)} torques were given for {nv} joints; give one for all joints, or one per joint "
+            "[N·m, N where it slides]."
         )
     return Admissible.of(np.full(nv, numbers, dtype=float), nv)
 

@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from nbs_pin.base.units import by_quantity, column, units_of
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
@@ -54,6 +55,7 @@ def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
         "samples": len(data),
         "trajectories": data.trajectories,
         "joints": list(robot.joint_names),
+        "units": by_quantity(robot.prismatic),
         "q_least_rad": data.q.min(axis=0).tolist(),
         "q_most_rad": data.q.max(axis=0).tolist(),
         "rms_velocity_rad_per_s": _rms(data.v),
@@ -86,10 +88,10 @@ def plot_coverage(data: Dataset, path: str | Path, robot: Robot) -> Path:
             for bound in (-limit, limit):
                 if np.abs(tau[:, joint]).max() > 0.5 * limit:
                     torques.axhline(bound, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
-            length, force = ("m", "N") if info.prismatic else ("rad", "N·m")
+            (of,) = units_of([info.prismatic])
             states.set_title(info.name, loc="left")
-            states.set(xlabel=f"q [{length}]", ylabel=f"v [{length}/s]")
-            torques.set(xlabel=f"acceleration [{length}/s²]", ylabel=f"τ [{force}]")
+            states.set(xlabel=f"q [{of.position}]", ylabel=f"v [{of.velocity}]")
+            torques.set(xlabel=f"acceleration [{of.acceleration}]", ylabel=f"τ [{of.torque}]")
     return Path(path)
 
 
@@ -99,12 +101,20 @@ def _rms(x: np.ndarray) -> list[float]:
 
 def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
     """Print a row per joint; `figures` from the function of that name."""
-    headings = ("q from\n[rad]", "to\n[rad]", "RMS v\n[rad/s]", "RMS acc.\n[rad/s²]", "RMS τ\n[N·m]", "at limit")
-    shown = table(title, *headings)
-    columns = ("q_least_rad", "q_most_rad", "rms_velocity_rad_per_s", "rms_acceleration_rad_per_s2", "rms_torque_Nm")
-    numbers = zip(*(figures[name] for name in columns), strict=True)
-    for joint, row, saturated in zip(figures["joints"], numbers, figures["at_torque_limit_fraction"], strict=True):
-        shown.add_row(Text(joint), *(f"{x:.3g}" for x in row), f"{saturated:.1%}")
+    names = {
+        "q from": ("q_least_rad", "position"),
+        "to": ("q_most_rad", "position"),
+        "RMS v": ("rms_velocity_rad_per_s", "velocity"),
+        "RMS acc.": ("rms_acceleration_rad_per_s2", "acceleration"),
+        "RMS τ": ("rms_torque_Nm", "torque"),
+    }
+    columns = [
+        column(name, [f"{x:.3g}" for x in figures[key]], figures["units"][of]) for name, (key, of) in names.items()
+    ]
+    columns.append(("at limit", [f"{share:.1%}" for share in figures["at_torque_limit_fraction"]]))
+    shown = table(title, *(heading for heading, _ in columns))
+    for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
+        shown.add_row(Text(joint), *row)
     console.print(shown)
     plural = "trajectory" if figures["trajectories"] == 1 else "trajectories"
     console.print(f"{figures['samples']} samples of {figures['trajectories']} {plural}", highlight=False)

@@ -16,6 +16,7 @@ from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
+from nbs_pin.base.units import by_quantity, several, units_of
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.values import SAVED, OptionError
 from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
@@ -185,6 +186,7 @@ def figures(result: Comparison, robot: Robot) -> dict[str, Any]:
         "relative_error": e.errors._asdict(),
         "torque_nmse": e.torque_nmse,
         "joints": list(robot.joint_names),
+        "units": by_quantity(robot.prismatic),
         "torque_rms_Nm": e.torque_rms,
         "torque_deviation_Nm": e.torque_deviation,
         "eigenvalue_margin_kgm2": e.eigenvalue_margin,
@@ -221,10 +223,11 @@ def write_results(result: Comparison, robot: Robot, results: Results, title: str
     found = figures(result, robot)
     with results.replaced((FILES[1], FILES[0]), found) as draft:
         write_csv(draft / FILES[1], ("figure", "where", "value"), list(_rows(found, robot)))
-    labels = [f"{joint.name} [{'m' if joint.prismatic else 'rad'}]" for joint in robot.joints]
+    of = units_of(robot.prismatic)
+    labels = [f"{name} [{unit.position}]" for name, unit in zip(robot.joint_names, of, strict=True)]
     why = result.missing or "no closed loop was run"
     with drawing(results.folder / FILES[0]) as path:
-        plot_model_errors(result.errors, result.heat, path, title=title, joints=labels, missing=why)
+        plot_model_errors(result.errors, result.heat, path, title=title, joints=labels, units=of, missing=why)
     return found
 
 
@@ -310,7 +313,8 @@ def _mismatch_lines(figures: dict[str, Any]) -> list[str]:
     if found is None:
         return [" ".join(figures["no_closed_loop_because"].split())]
     constants = (_number(found[name]) for name in ("a_Nm_per_rad", "b_Nms_per_rad", "c_Nm"))
-    bound = "closed loop: ‖δ‖ ≤ {} ‖q‖ + {} ‖v‖ + {} N·m".format(*constants)
+    torque = several(figures["units"]["torque"])
+    bound = "closed loop: ‖δ‖ ≤ {} ‖q‖ + {} ‖v‖ + {} {}".format(*constants, torque)
     if found["violation_chance"] >= 1.0:
         return [f"{bound} on this run; {found['trajectories']} starts are too few to bound further ones"]
     return [

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
+from nbs_pin.base.units import by_quantity, column, several, units
 from nbs_pin.cli.learn import Learn
 from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table
 from nbs_pin.dynamics.friction import JointFriction
@@ -117,6 +118,7 @@ def figures(result: Learned) -> dict[str, Any]:
             "trajectories": result.train.trajectories,
             "test_samples": 0 if result.test is None else len(result.test),
             "joints": result.joints,
+            "units": by_quantity(result.prismatic),
             "rms_torque_error_Nm": _errors(result, result.train),
             "rms_test_torque_error_Nm": None if result.test is None else _errors(result, result.test),
             "torque_deviation_Nm": result.train.tau.std(axis=0),
@@ -161,8 +163,7 @@ def _draw_errors(axes: Any, result: Learned) -> None:
     axes.set_xticks(
         place, result.joints, rotation=30 if len(place) > 4 else 0, ha="right" if len(place) > 4 else "center"
     )
-    unit = "N, N·m" if any(result.prismatic) else "N·m"
-    axes.set_title(f"RMS torque error [{unit}]", loc="left")
+    axes.set_title(f"RMS torque error [{several(units('torque', result.prismatic))}]", loc="left")
     axes.legend(frameon=False)
 
 
@@ -172,17 +173,19 @@ def _errors(result: Learned, data: Dataset) -> np.ndarray:
 
 def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
     """Print a row per joint, then figures of the whole arm."""
-    headings = ("torque\ndeviation [N·m]", "error [N·m]", "error, held\nout [N·m]", "friction\n[N·m·s, N·m]")
-    shown = table(title, *headings)
-    for i, joint in enumerate(figures["joints"]):
-        test, viscous = figures["rms_test_torque_error_Nm"], figures["viscous_friction"]
-        shown.add_row(
-            Text(joint),
-            f"{figures['torque_deviation_Nm'][i]:.4g}",
-            f"{figures['rms_torque_error_Nm'][i]:.2e}",
-            "none" if test is None else f"{test[i]:.2e}",
-            "none" if viscous is None else f"{viscous[i]:.3g}, {figures['coulomb_friction_Nm'][i]:.3g}",
-        )
+    test, viscous, of = figures["rms_test_torque_error_Nm"], figures["viscous_friction"], figures["units"]
+    none = ["none"] * len(figures["joints"])
+    coulomb = [f"{x:.3g}" for x in figures["coulomb_friction_Nm"] or ()] or none
+    columns = [
+        column("torque\ndeviation", [f"{x:.4g}" for x in figures["torque_deviation_Nm"]], of["torque"]),
+        column("error", [f"{x:.2e}" for x in figures["rms_torque_error_Nm"]], of["torque"]),
+        column("error, held\nout", none if test is None else [f"{x:.2e}" for x in test], of["torque"]),
+        column("viscous\nfriction", none if viscous is None else [f"{x:.3g}" for x in viscous], of["damping"]),
+        column("Coulomb\nfriction", coulomb, of["torque"]),
+    ]
+    shown = table(title, *(heading for heading, _ in columns))
+    for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
+        shown.add_row(Text(joint), *row)
     console.print(shown)
     for line in _lines(figures):
         console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -3,11 +3,13 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nbs_pin.base.units import TURNING, units
 from nbs_pin.cli.robots import Robots
 from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import Robot, load_robot
@@ -18,10 +20,8 @@ class Arm(NamedTuple):
 
     name: str
     joints: int
-    least_effort: float
-    """Smallest effort limit of its joints [N·m], inf without limits."""
-    most_effort: float
-    """Largest effort limit of its joints [N·m], inf without limits."""
+    efforts: dict[str, tuple[float, float]]
+    """Smallest and largest effort limit of its joints, inf without limits, by unit: N·m, and N of those that slide."""
     continuous: int
     """Number of continuous joints."""
     viscous_friction: bool
@@ -53,22 +53,29 @@ def known_arms() -> list[Arm]:
 
 def describe(name: str, robot: Robot) -> Arm:
     """The figures of one arm."""
-    effort = robot.effort_limit
+    forces, limits = np.array(units("torque", robot.prismatic)), robot.effort_limit
+    efforts = {str(unit): limits[forces == unit] for unit in dict.fromkeys(forces.tolist())}
     return Arm(
         name,
         robot.nv,
-        float(effort.min()),
-        float(effort.max()),
+        {unit: (float(effort.min()), float(effort.max())) for unit, effort in efforts.items()},
         int(robot.continuous.sum()),
         bool(robot.damping.any()),
         bool(robot.friction.any()),
     )
 
 
+def _span(least: float, most: float, unit: str) -> str:
+    """Effort limits, with their unit unless it is that of the heading."""
+    if math.isinf(least):
+        return "none"
+    span = f"{least:g} to {most:g}" if most > least else f"{least:g}"
+    return span if unit == TURNING.torque else f"{span} {unit}"
+
+
 def _cells(arm: Arm) -> tuple[str, ...]:
     """The cells of an arm's row."""
-    span = f"{arm.least_effort:g}" + (f" to {arm.most_effort:g}" if arm.most_effort > arm.least_effort else "")
-    effort = "none" if math.isinf(arm.least_effort) else span
+    effort = ", ".join(_span(*ends, unit) for unit, ends in arm.efforts.items())
     frictions = {"viscous": arm.viscous_friction, "Coulomb": arm.coulomb_friction}
     kinds = [kind for kind, present in frictions.items() if present]
     return arm.name, str(arm.joints), effort, str(arm.continuous), ", ".join(kinds) or "no"

@@ -12,6 +12,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.npz import LARGEST
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Reference, Run
+from nbs_pin.base.units import by_quantity, column, several
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_numbers
 from nbs_pin.commands.inputs import arm_of, law_of
@@ -137,11 +138,13 @@ def track(
 
 
 def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
-    """`metrics.summary` of the run and the RMS error over its last 30 % [rad], as JSON can store them.
+    """`metrics.summary` of the run and the RMS error over its last 30 %, as JSON can store them.
 
-    With a robot, also how far each joint left its position range [rad], as the plants have no joint stops.
+    With a robot, also how far each joint left its position range, as the plants have no joint stops. `units` says in
+    what the numbers of each joint are: those of one that slides are in m and N, whatever the key says.
     """
     values = metrics.summary(run)
+    values["units"] = by_quantity(run.slides)
     values["rms_error_last_30_percent_rad"] = metrics.rms_error(run, 0.7 * float(run.t[-1])).tolist()
     if robot is not None:
         beyond = np.maximum(robot.lower - run.q, run.q - robot.upper).reshape(-1, run.nv)
@@ -193,17 +196,20 @@ def _start(options: Track, nv: int) -> list[float] | None:
 
 def _print(console: Console, title: str, figures: dict[str, Any], compile_time: float, wall_time: float) -> None:
     """Print a row per joint, then figures of the whole arm; `figures` from the function of that name."""
-    after = figures["late_after_s"]
-    late = f"after {after:g} s\n[rad]"
-    shown = table(title, "RMS error\n[rad]", late, "last 30 %\n[rad]", "peak\n[N·m]", "limit\n[N·m]")
-    columns = ("rms_error_rad", "rms_error_late_rad", "rms_error_last_30_percent_rad")
-    torques = zip(figures["joint_peak_torque_Nm"], figures["effort_limit_Nm"], strict=True)
-    for joint, errors, (peak, limit) in zip(
-        figures["joints"], zip(*(figures[name] for name in columns), strict=True), torques, strict=True
-    ):
-        shown.add_row(
-            Text(joint), *(f"{e:.2e}" for e in errors), f"{peak:.4g}", "none" if limit is None else f"{limit:.4g}"
-        )
+    lengths, forces = figures["units"]["position"], figures["units"]["torque"]
+    errors = {
+        "RMS error": "rms_error_rad",
+        f"after {figures['late_after_s']:g} s": "rms_error_late_rad",
+        "last 30 %": "rms_error_last_30_percent_rad",
+    }
+    columns = [column(name, [f"{e:.2e}" for e in figures[key]], lengths) for name, key in errors.items()]
+    columns += [
+        column("peak", [f"{peak:.4g}" for peak in figures["joint_peak_torque_Nm"]], forces),
+        column("limit", ["none" if x is None else f"{x:.4g}" for x in figures["effort_limit_Nm"]], forces),
+    ]
+    shown = table(title, *(heading for heading, _ in columns))
+    for joint, *cells in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
+        shown.add_row(Text(joint), *cells)
     console.print(shown)
     for line in _lines(figures, compile_time, wall_time):
         console.print(line, highlight=False, markup=False)
@@ -217,12 +223,13 @@ def _converged(figures: dict[str, Any]) -> str:
 
 def _lines(figures: dict[str, Any], compile_time: float, wall_time: float) -> list[str]:
     saturated, late = figures["saturated_fraction"], figures["saturated_fraction_late"]
-    outside = zip(figures["joints"], figures["outside_position_range_rad"], strict=True)
+    units = figures["units"]["position"]
+    outside = zip(figures["joints"], figures["outside_position_range_rad"], units, strict=True)
     return [
-        f"converged (‖error‖ < 0.1 rad to the end): {_converged(figures)}",
+        f"converged (‖error‖ < 0.1 {several(units)} to the end): {_converged(figures)}",
         f"some joint at its effort limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
-        *(f"{joint} left its range by {excess:.3g} rad: the plant has no joint stops" for joint, excess in outside
-          if excess > 0.0),
+        *(f"{joint} left its range by {excess:.3g} {unit}: the plant has no joint stops"
+          for joint, excess, unit in outside if excess > 0.0),
         *([f"compiled the law in {compile_time:.1f} s, once on this machine"] if compile_time > _NOTICEABLE else []),
         f"simulated {figures['duration_s']:g} s in {wall_time:.1f} s",
     ]  # fmt: skip

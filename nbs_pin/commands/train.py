@@ -8,6 +8,7 @@ from rich.text import Text
 
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
+from nbs_pin.base.units import by_quantity, several
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import plain_numbers
 from nbs_pin.commands.inputs import arm_of, law_of
@@ -134,6 +135,7 @@ def figures(result: Trained) -> dict[str, Any]:
             "held_out_cost": [held_out[0], held_out[best]],
             "held_out_cost_lowered_by": 1.0 - held_out[best] / held_out[0],
             "seconds": training.seconds,
+            "units": {name: several(given) for name, given in by_quantity(result.before.slides).items()},
             "fresh_starts": result.before.q.shape[1],
             "before": fresh_figures(result.before),
             "after": fresh_figures(result.after),
@@ -164,14 +166,19 @@ def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
     for name in ("median", "worst"):
         times = (on[f"convergence_time_{name}_s"] for on in both)
         shown.add_row(Text(f"converged, {name} [s]"), *("never" if t is None else f"{t:.3f}" for t in times))
-    shown.add_row(Text("peak torque [N·m]"), *(_number(on["peak_torque_Nm"], ".4g") for on in both))
-    shown.add_row(Text("RMS torque [N·m]"), *(_number(on["rms_torque_Nm"], ".4g") for on in both))
+    shown.add_row(
+        Text(f"peak torque [{figures['units']['torque']}]"), *(_number(on["peak_torque_Nm"], ".4g") for on in both)
+    )
+    shown.add_row(
+        Text(f"RMS torque [{figures['units']['torque']}]"), *(_number(on["rms_torque_Nm"], ".4g") for on in both)
+    )
     shown.add_row(Text("some joint at its limit"), *(_number(on["saturated_fraction"], ".2%") for on in both))
     console.print(shown)
     ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
     for line in (
         f"held-out cost lowered by {_number(figures['held_out_cost_lowered_by'], '.1%')}; "
-        f"converged means ‖error‖ < 0.1 rad to the end, over {figures['fresh_starts']} fresh starts",
+        f"converged means ‖error‖ < 0.1 {figures['units']['position']} to the end, "
+        f"over {figures['fresh_starts']} fresh starts",
         f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
         f"the best after {figures['best_epoch']}",
     ):

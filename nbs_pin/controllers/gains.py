@@ -13,6 +13,7 @@ from nbs_pin.base.arrays import Array, JointArray, is_torch_array
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import Tensors
+from nbs_pin.base.units import units
 from nbs_pin.controllers.gain import Gain
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robots.robot import Robot
@@ -113,10 +114,11 @@ def warn_if_too_fast(robot: Robot, dynamics: DynamicsProvider, bandwidth: float,
     asked = bandwidth**2 * largest_inertia(robot, dynamics) * start_error / robot.effort_limit
     worst = int(np.argmax(asked))
     if asked[worst] > 6.0:
+        unit = units("position", robot.prismatic)[worst]
         warnings.warn(
             f"at a bandwidth of {bandwidth:g} rad/s joint '{robot.joint_names[worst]}' of {robot.name} needs"
-            f" {asked[worst]:.1f} times its effort limit from an error of {start_error} rad and may not converge; take"
-            f" at most {bandwidth * np.sqrt(6.0 / asked[worst]):.3g} rad/s, or start on the reference.",
+            f" {asked[worst]:.1f} times its effort limit from an error of {start_error} {unit} and may not converge;"
+            f" take at most {bandwidth * np.sqrt(6.0 / asked[worst]):.3g} rad/s, or start on the reference.",
             stacklevel=3,
         )
 

@@ -1,6 +1,7 @@
 """Figures of certificates: bounds beside what happened, in the style of `plotting`."""
 
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from nbs_pin.base.units import several
 from nbs_pin.certificates.attack import Attack
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
@@ -29,18 +31,19 @@ _TERMS = {
 }
 
 
-def plot_monitor(monitored: Monitored, path: str | Path) -> Path:
+def plot_monitor(monitored: Monitored, path: str | Path, *, units: Sequence[str] = ("rad",)) -> Path:
     """Plot a run against its certificate and write the picture (PNG); returns its path.
 
     V and its bound on a logarithmic scale; ‖z1‖ and its bound, with the |z1_i| that exceeds its own most; V̇ and each of
-    its terms; and when each assumption failed. Saturated stretches are shaded, exceeded bounds are marked.
+    its terms; and when each assumption failed. Saturated stretches are shaded, exceeded bounds are marked. units: of
+    every joint's error.
     """
     rows = max(len(monitored.failures), 1)
     with picture(path, 11.0, 8.2 + 0.34 * rows) as figure:
         heights = [2.6, 1.8, 3.0, 0.35 + 0.34 * rows]
         storage, error, terms, flags = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         _draw_storage(storage, monitored)
-        _draw_error(error, monitored)
+        _draw_error(error, monitored, several(units))
         _draw_terms(terms, monitored)
         _draw_flags(flags, monitored)
         for axes in (storage, error, terms):
@@ -74,7 +77,7 @@ def plot_certificate(certificate: Certificate, attack: Attack | None, path: str 
 def _standing(certificate: Certificate, width: int) -> str:
     """The arm, the disturbance and how the bounds are known; below, wrapped to the width, why they are void."""
     arm = "" if certificate.robot is None else _plain(certificate.robot.name) + ", "
-    title = f"{arm}{certificate.admissible}: {certificate.label}"
+    title = f"{arm}{certificate.disturbance}: {certificate.label}"
     if not certificate.void:
         return title
     failed = f"the bounds are void, as these conditions fail: {'; '.join(certificate.void)}"
@@ -95,11 +98,11 @@ def _draw_storage(axes: Axes, seen: Monitored) -> None:
     _title(axes, "storage function [J]")
 
 
-def _draw_error(axes: Axes, seen: Monitored) -> None:
+def _draw_error(axes: Axes, seen: Monitored, unit: str) -> None:
     axes.plot(
-        *thin(seen.t, seen.error_bound), color=LIMIT, linestyle=_DASHED, label=f"bound, {_ends(seen.error_bound)}"
+        *thin(seen.t, seen.error_bound), color=LIMIT, linestyle=_DASHED, label=f"bound, {_ends(seen.error_bound, unit)}"
     )
-    axes.plot(*thin(seen.t, seen.error), color=ERROR, label=f"‖z1‖, at most {seen.error.max():.3g} rad")
+    axes.plot(*thin(seen.t, seen.error), color=ERROR, label=f"‖z1‖, at most {seen.error.max():.3g} {unit}")
     _mark(axes, seen, "‖z1‖", seen.error)
     names = [f"|z1| of {name}" for name in seen.joint_names]
     i = int((seen.joint_errors - seen.joint_bounds).max(axis=0).argmax())
@@ -108,7 +111,7 @@ def _draw_error(axes: Axes, seen: Monitored) -> None:
         axes.plot(*thin(seen.t, seen.joint_bounds[:, i]), color=_VIOLET, linewidth=1.0, linestyle=_DASHED)
     axes.set_ylim(0.0, 1.15 * max(float(seen.error_bound.max()), float(seen.error.max()), 1e-12))
     axes.yaxis.set_major_locator(MaxNLocator(4))
-    _title(axes, "tracking error [rad]")
+    _title(axes, f"tracking error [{unit}]")
 
 
 def _draw_terms(axes: Axes, seen: Monitored) -> None:
@@ -150,7 +153,7 @@ def _draw_attack(axes: Axes, certificate: Certificate, attack: Attack) -> None:
         axes.axhline(value, color=colour, linestyle=style, label=label)
     axes.set(xlabel="time [s]", xlim=(0.0, run.t[-1]), ylim=(0.0, 1.35 * max(certificate.error, attack.error)))
     ratio = f": certified ÷ found = {certificate.error / attack.error:.2f}" if attack.error > 0.0 else ""
-    unit = ", ".join(dict.fromkeys(certificate.joint_units))
+    unit = several(certificate.joint_units)
     axes.set_title(f"‖z1‖ [{unit}], {attack.found_by}{ratio}", loc="left", color=_INK)
     axes.legend(frameon=False, loc="upper left", ncols=1)
 
@@ -170,7 +173,7 @@ def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) ->
     axes.grid(visible=False, axis="y")
     axes.set_xlim(0.0, 1.18 * float(max(bounds.max(), found.max())) or 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    title = f"|z1| of each joint [{', '.join(dict.fromkeys(units))}]"
+    title = f"|z1| of each joint [{several(units)}]"
     if attack is not None:
         _title(axes, title)
         return
@@ -186,9 +189,9 @@ def _shade(axes: Axes, seen: Monitored) -> None:
     axes.broken_barh(bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=SATURATED, alpha=0.3, linewidth=0)
 
 
-def _ends(values: np.ndarray) -> str:
+def _ends(values: np.ndarray, unit: str) -> str:
     first, last = (f"{x:.3g}" for x in values[[0, -1]].tolist())
-    return f"{first} rad" if first == last else f"{first} to {last} rad"
+    return f"{first} {unit}" if first == last else f"{first} to {last} {unit}"
 
 
 def _mark(axes: Axes, seen: Monitored, name: str, values: np.ndarray) -> None:

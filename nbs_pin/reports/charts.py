@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.base.records import Run
+from nbs_pin.base.units import several
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
 from nbs_pin.simulation.metrics import PAPER_THRESHOLD, squared_error
 
@@ -81,7 +82,7 @@ def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
     axes.annotate("converged", (1.0, mark), xycoords=("axes fraction", "data"), ha="right", va="bottom", color=ERROR)
     axes.set_yscale("log")
     axes.set(xlabel="time [s]", xlim=(0.0, run.t[-1]))
-    axes.set_title(f"‖error‖ of {size.shape[1]} fresh motions [rad]", loc="left")
+    axes.set_title(f"‖error‖ of {size.shape[1]} fresh motions [{several(of.position for of in run.units)}]", loc="left")
     axes.legend(frameon=False)
 
 

@@ -16,6 +16,7 @@ from nbs_pin.accuracy.compare import Growth, ModelErrors
 from nbs_pin.accuracy.energy_drift import FreeMotion
 from nbs_pin.accuracy.error_maps import ErrorMap
 from nbs_pin.accuracy.mismatch import Mismatch
+from nbs_pin.base.units import TURNING, JointUnits, several
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
 
 INK, NOTE, PALE, VIOLET = "#1d2733", "#5d6b7a", "#eef3f9", "#7a4fa3"
@@ -42,6 +43,7 @@ def plot_model_errors(
     *,
     title: str,
     joints: Sequence[str],
+    units: Sequence[JointUnits] | None = None,
     missing: str = "no closed loop was run",
 ) -> Path:
     """Plot the result of `compare` on one page and write the picture (PNG); returns its path.
@@ -49,17 +51,18 @@ def plot_model_errors(
     The figures in a row; maps of the errors of M, C v and G over two joints (omitted without a map); errors against
     speed and against distance from the centre of the box, and the torque error of every joint; the errors of single
     samples, energy in free motion, and ‖δ‖ along the closed loop with its bound. missing: the note in its place if no
-    closed loop was run. joints: their names with units.
+    closed loop was run. joints: their names with units. units: of every joint, None if all of them turn.
     """
+    units = [TURNING] * len(joints) if units is None else units
     joints, rows = [joint.replace("$", r"\$") for joint in joints], 2 if heat is None else 3
     with picture(path, 13.5, 1.4 + 3.3 * rows) as figure:
         heights = (1.4, *([3.3] if heat is not None else []), 6.6)
         parts = np.ravel(np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights)))
-        _draw_figures(parts[0], errors, title)
+        _draw_figures(parts[0], errors, title, several(of.velocity for of in units))
         if heat is not None:
             _draw_maps(parts[1], heat, joints)
         growth, last = parts[-1].subplots(2, 3)
-        _draw_growth(growth, errors, joints)
+        _draw_growth(growth, errors, joints, [of.torque for of in units])
         _draw_samples(last[0], errors)
         if errors.motion is None:
             _leave_out(last[1], "no free motion was run")
@@ -68,7 +71,7 @@ def plot_model_errors(
         if errors.mismatch is None:
             _leave_out(last[2], missing)
         else:
-            _draw_mismatch(last[2], errors.mismatch)
+            _draw_mismatch(last[2], errors.mismatch, several(of.torque for of in units))
     return Path(path)
 
 
@@ -107,7 +110,7 @@ def _draw_seeds(axes: Axes, curve: Mapping[int, Sequence[float]], colour: str, n
     axes.fill_between(sizes, low, high, color=colour, alpha=0.12, linewidth=0)
 
 
-def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
+def _draw_figures(head: SubFigure, errors: ModelErrors, title: str, unit: str) -> None:
     """The title and a row of tiles, each with a name and a number."""
     low, high = errors.mass_ratio
     tiles = {f"error of {label}": number(getattr(errors, name)) for name, (label, _) in LOOKS.items()}
@@ -120,7 +123,7 @@ def _draw_figures(head: SubFigure, errors: ModelErrors, title: str) -> None:
     head.text(0.012, 0.86, title.replace("$", r"\$"), fontsize=14, fontweight="bold", color=INK, va="center")
     fast = errors.box.speed
     speed = f"{fast[0]:.3g}" if np.ptp(fast) == 0.0 else f"{fast.min():.3g} to {fast.max():.3g}"
-    where = f"{errors.samples} uniform states, |v| ≤ {speed} rad/s, seed {errors.seed}"
+    where = f"{errors.samples} uniform states, |v| ≤ {speed} {unit}, seed {errors.seed}"
     head.text(0.988, 0.86, where, color=NOTE, ha="right", va="center")
     axes = head.add_axes((0.0, 0.08, 1.0, 0.56))
     axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
@@ -163,7 +166,7 @@ def _draw_maps(part: SubFigure, heat: ErrorMap, names: Sequence[str]) -> None:
     _log_ticks(bar.ax.yaxis, *bar.ax.get_ylim())
 
 
-def _draw_growth(panels: np.ndarray, errors: ModelErrors, names: Sequence[str]) -> None:
+def _draw_growth(panels: np.ndarray, errors: ModelErrors, names: Sequence[str], units: Sequence[str]) -> None:
     """Errors against speed, against distance, and per joint."""
     speed, distance, joints = panels
     _draw_curves(speed, errors.by_speed, ("coriolis", "inverse", "forward"))
@@ -178,7 +181,7 @@ def _draw_growth(panels: np.ndarray, errors: ModelErrors, names: Sequence[str]) 
         axes.axvspan(1.0, growth.at[-1], color=PALE, zorder=0)
         axes.set_xlim(growth.at[0], growth.at[-1])
     distance.annotate("outside", (0.985, 0.03), xycoords="axes fraction", ha="right", color=NOTE)
-    _draw_joints(joints, errors, names)
+    _draw_joints(joints, errors, names, units)
 
 
 def _draw_curves(axes: Axes, growth: Growth, shown: Sequence[str]) -> None:
@@ -190,7 +193,7 @@ def _draw_curves(axes: Axes, growth: Growth, shown: Sequence[str]) -> None:
     axes.legend(frameon=False, ncols=len(shown))
 
 
-def _draw_joints(axes: Axes, errors: ModelErrors, names: Sequence[str]) -> None:
+def _draw_joints(axes: Axes, errors: ModelErrors, names: Sequence[str], units: Sequence[str]) -> None:
     """Torque error of every joint, relative to the standard deviation of its torque."""
     rows = np.arange(len(names))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -198,9 +201,14 @@ def _draw_joints(axes: Axes, errors: ModelErrors, names: Sequence[str]) -> None:
     low, high = _limits(np.nanmin(shares), np.nanmax(shares))
     axes.hlines(rows, low, shares, color=LOOKS["inverse"][1], alpha=0.35, linewidth=3.0)
     axes.plot(shares, rows, "o", color=LOOKS["inverse"][1], markersize=5.5, clip_on=False)
-    for row, (value, torque) in enumerate(zip(shares, errors.torque_rms, strict=True)):
+    for row, (value, torque, unit) in enumerate(zip(shares, errors.torque_rms, units, strict=True)):
         axes.annotate(
-            f"{number(torque)} N·m", (value, row), xytext=(7, 0), textcoords="offset points", va="center", fontsize=7.5
+            f"{number(torque)} {unit}",
+            (value, row),
+            xytext=(7, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=7.5,
         )
     axes.set_xscale("log")
     axes.set(xlim=(low, high * (high / low) ** 0.25), ylim=(len(names) - 0.4, -0.6))
@@ -248,7 +256,7 @@ def _draw_energy(axes: Axes, motion: FreeMotion) -> None:
     axes.legend(frameon=False, loc="lower right", title="median to worst start", title_fontsize=7.5, alignment="left")
 
 
-def _draw_mismatch(axes: Axes, mismatch: Mismatch) -> None:
+def _draw_mismatch(axes: Axes, mismatch: Mismatch, unit: str) -> None:
     """‖δ‖ over time, median and worst trajectory, with the largest bound at the same states."""
     bound = mismatch.bound(mismatch.q_norm, mismatch.v_norm)
     size = _seen(mismatch.size)
@@ -261,7 +269,7 @@ def _draw_mismatch(axes: Axes, mismatch: Mismatch) -> None:
     low, high = axes.get_ylim()
     axes.set_ylim(low, high * (high / low) ** 0.45)
     axes.set(xlabel="time [s]", xlim=(mismatch.t[0], mismatch.t[-1]))
-    axes.set_title("closed loop: mismatch ‖δ‖ [N·m]", loc="left", color=INK)
+    axes.set_title(f"closed loop: mismatch ‖δ‖ [{unit}]", loc="left", color=INK)
     axes.legend(frameon=False, ncols=3, loc="upper left", bbox_to_anchor=(0.0, 0.87), handlelength=1.4)
     if mismatch.violation < 1.0:
         sure = f"a further start exceeds it: ≤ {mismatch.violation:.1%} (confidence 1 − {number(mismatch.doubt)})"

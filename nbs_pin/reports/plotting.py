@@ -84,6 +84,11 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
             _draw_error(error_axes, run.t, error[:, joint])
             _draw_torque(torque_axes, run.t, tau[:, joint], float(run.effort_limit[joint]), cut[:, joint])
             position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color="#1d2733")
+            if len(set(run.units)) > 1:
+                of = run.units[joint]
+                for axes, unit in zip(grid[joint], (of.position, of.position, of.torque), strict=True):
+                    axes.annotate(f"[{unit}]", (0.0, 1.0), xycoords="axes fraction", va="bottom", fontsize=7,
+                                  color="#5d6b7a")  # fmt: skip
         _dress(figure, grid, run, fraction)
     return Path(path)
 
@@ -129,7 +134,11 @@ def _draw_torque(axes: Axes, t: Float[np.ndarray, " rows"], tau: Float[np.ndarra
 
 def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
     """Titles, the legend and the time axis."""
-    for axes, title in zip(grid[0], ("position [rad]", "|error| [rad]", "torque [N·m]"), strict=True):
+    kinds = {(of.position, of.position, of.torque) for of in run.units}
+    beside = [f" [{unit}]" for unit in kinds.pop()] if len(kinds) == 1 else ["", "", ""]  # else each row has its own
+    for axes, title in zip(
+        grid[0], map("".join, zip(("position", "|error|", "torque"), beside, strict=True)), strict=True
+    ):
         axes.set_title(title, loc="left", fontsize=9.5, color="#1d2733", pad=9)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")

@@ -110,6 +110,7 @@ class Loop:
             robot="" if robot is None else robot.source,
             robot_sha256="" if robot is None else robot.sha256,
             robot_options={} if robot is None else robot.options,
+            prismatic=np.zeros(n, dtype=bool) if robot is None else robot.prismatic,
             info={"controller": controller, "plant": repr(self.plant), "plant_step": self.step, "lookahead": self.lead},
         )
         run.q[0], run.v[0] = q0, v0
@@ -169,6 +170,7 @@ def _effort_limit(plant: Plant, given: Any) -> np.ndarray:
     limit = np.asarray(given, dtype=float)
     if limit.shape not in ((), (plant.nv,)) or not (limit > 0.0).all():
         raise ArgumentError(
-            f"effort_limit is {given}, expected one number > 0 or {plant.nv} of them [N·m]; np.inf means no limit."
+            f"effort_limit is {given}, expected one number > 0 or {plant.nv} of them [N·m, N where it "
+            "slides]; np.inf means no limit."
         )
     return np.full(plant.nv, limit)

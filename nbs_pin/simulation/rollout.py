@@ -170,7 +170,9 @@ def _constant_torque(tau_d: Any, nv: int) -> np.ndarray:
     """The torque as an array; raises ArgumentError unless it is one finite number or one per joint."""
     torque = floats("disturbance", 0.0 if tau_d is None else tau_d)
     if torque.shape not in ((), (nv,)) or not np.isfinite(torque).all():
-        raise ArgumentError(f"disturbance is {tau_d}, expected one finite torque or {nv}, one per joint [N·m].")
+        raise ArgumentError(
+            f"disturbance is {tau_d}, expected one finite torque or {nv}, one per joint [N·m, N where it slides]."
+        )
     return torque
 
 

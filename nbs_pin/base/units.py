@@ -1,0 +1,66 @@
+"""Units of joints: rad and N·m where a joint turns, m and N where it slides; all that shows numbers asks here."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+
+class JointUnits(NamedTuple):
+    """The units of what belongs to one joint."""
+
+    position: str
+    velocity: str
+    acceleration: str
+    torque: str
+    stiffness: str
+    damping: str
+    rate: str
+    curvature: str
+    inertia: str
+
+
+TURNING = JointUnits("rad", "rad/s", "rad/s²", "N·m", "N·m/rad", "N·m·s/rad", "rad/s per N·m", "J/rad²", "kg·m²")
+SLIDING = JointUnits("m", "m/s", "m/s²", "N", "N/m", "N·s/m", "m/s per N", "J/m²", "kg")
+
+
+def units_of(prismatic: Iterable[bool]) -> tuple[JointUnits, ...]:
+    """The units of every joint, of which `prismatic` says whether it slides."""
+    return tuple(SLIDING if slides else TURNING for slides in prismatic)
+
+
+def units(quantity: str, prismatic: Iterable[bool]) -> tuple[str, ...]:
+    """The unit of a quantity (a field of `JointUnits`) for every joint."""
+    return tuple(getattr(of, quantity) for of in units_of(prismatic))
+
+
+def several(given: Iterable[str]) -> str:
+    """The units of numbers that are taken together, such as a norm over all joints: each once, as in "rad, m"."""
+    return ", ".join(sorted(dict.fromkeys(given), key=lambda unit: unit in SLIDING))
+
+
+def by_quantity(prismatic: Iterable[bool]) -> dict[str, list[str]]:
+    """The unit of every joint, by quantity, as JSON can store it."""
+    return {
+        name: list(given)
+        for name, given in zip(JointUnits._fields, zip(*units_of(prismatic), strict=True), strict=True)
+    }
+
+
+def over_joints(unit: str, prismatic: Iterable[bool]) -> str:
+    """The unit of a number over all joints, such as a norm or a maximum: `unit` if all of them turn."""
+    if unit not in TURNING:
+        return unit
+    return several(of[TURNING.index(unit)] for of in units_of(prismatic))
+
+
+def with_units(texts: Sequence[str], given: Sequence[str]) -> list[str]:
+    """Numbers with the units of their joints, left out if all are alike; "none" has no unit."""
+    if len(set(given)) == 1:
+        return list(texts)
+    return [text if text == "none" else f"{text} {unit}" for text, unit in zip(texts, given, strict=True)]
+
+
+def column(name: str, texts: Sequence[str], given: Sequence[str]) -> tuple[str, list[str]]:
+    """Heading and cells of a table with a row per joint: the unit is in the heading, or in the cells if they differ."""
+    if len(set(given)) == 1:
+        return f"{name}\n[{given[0]}]", list(texts)
+    return name, with_units(texts, given)
