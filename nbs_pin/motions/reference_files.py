@@ -19,6 +19,7 @@ FEWEST_SAMPLES = 4
 """Fewest samples of a not-a-knot cubic spline."""
 PLAUSIBLE_JUMP = 1.0
 """Change of velocity from one sample to the next that is always accepted [rad/s]."""
+_LARGEST = 1e9  # [s, rad] and [1/s]; the fourth power of it, in the equations of the spline, is finite
 _SUDDEN = 10.0  # times the median change of velocity nearby is a jump; fast smooth motions reach two or three
 _AROUND = 7  # samples in that median; an outlier of q affects the velocity change at only three of them
 _MISREAD = 0.1  # tolerance of a stated velocity against dq/dt, relative to the joint's largest speed
@@ -120,6 +121,18 @@ def _fault(t: np.ndarray, q: np.ndarray, columns: list[str]) -> str:
     if not (np.diff(t) > 0.0).all():
         row = int(np.argmin(np.diff(t) > 0.0)) + 1
         return f"time must increase, but row {row + 1} ({t[row]:g}) is not after row {row} ({t[row - 1]:g}); sort it"
+    return _overflow(table, ["t", *columns])
+
+
+def _overflow(table: np.ndarray, names: list[str]) -> str:
+    """Which number is so large, or so soon after the one before, that the spline overflows; or an empty string."""
+    if np.abs(table).max() > _LARGEST:
+        row, column = np.argwhere(np.abs(table) > _LARGEST)[0]
+        return f"row {row + 1}, column {names[column]}: {table[row, column]:g} is beyond ±{_LARGEST:g}; correct it"
+    steps = np.diff(table[:, 0])
+    if steps.min() < 1.0 / _LARGEST:
+        row = int(np.argmin(steps)) + 1
+        return f"row {row + 1} is {steps.min():g} s after row {row}, expected at least {1.0 / _LARGEST:g} s; correct t"
     return ""
 
 

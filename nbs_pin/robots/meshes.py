@@ -3,6 +3,7 @@
 The dynamics never need meshes; a file that cannot be drawn raises `MeshError`, and the caller decides what to do.
 """
 
+import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.catalogue import example_robot_share
 from nbs_pin.robots.visual_checks import LARGEST
 
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else it prints tracebacks of faults that we tell
 SUFFIXES = (".stl", ".obj", ".dae")
 MAX_BYTES = 50_000_000
 MAX_FACES = 1_000_000
