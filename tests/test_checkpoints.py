@@ -439,6 +439,28 @@ def test_contents_that_make_no_controller_are_refused(path, change, message):
         nbs.load(resealed(path, change))
 
 
+@pytest.mark.parametrize("size", [1e13, 1e20, 1e308])
+def test_weights_that_overflow_are_refused(path, size):
+    """Each number is finite, and what the layers make of them is not."""
+    for name in ("potential.network.wx0", "damping.lower.w1", "rate.nominal"):
+        with pytest.raises(FileFormatError, match=rf"edited.nbs: .*tensor '{name}' has .* beyond 1e\+12|overflow"):
+            nbs.load(resealed(path, lambda _, t, name=name: t[name].fill_(size)))
+
+
+def test_settings_that_overflow_are_refused(tmp_path):
+    law = nbs.PID.for_robot(TWO_LINK)
+    nbs.save(law, tmp_path / "pid.nbs")
+    for name, value in (("filter_time", [1.0]), ("filter_time", 1e308)):
+        edited = resealed(tmp_path / "pid.nbs", lambda d, _, n=name, v=value: d["controller"].update({n: v}))
+        try:
+            torque, _ = nbs.load(edited).step(
+                law.initial_memory(np.zeros(2)), np.ones(2), np.ones(2), nbs.Reference(*np.zeros((3, 2))), 1e-3
+            )
+        except FileFormatError:
+            continue
+        assert np.isfinite(torque).all()
+
+
 UNREADABLE = ['{"a": 1, "a": 2}', '{"a": NaN}', '{"a": 1e999}', "", "[" * 100_000, '{"a": ' + "9" * 5000 + "}"]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
-from nbs_pin.base.npz import LARGEST, read_npz, write_npz
+from nbs_pin.base.npz import HARMLESS, LARGEST, read_npz, write_npz
 from nbs_pin.base.records import Run
 
 SIGNALS = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
@@ -150,3 +150,42 @@ def test_the_file_keeps_the_users_permissions(tmp_path):
 def test_a_missing_run_is_not_found(tmp_path):
     with pytest.raises(FileNotFoundError):
         Run.load(tmp_path / "none.npz")
+
+
+def test_an_entry_that_nobody_needs_is_not_unpacked(path, monkeypatch):
+    """Run.load takes what it knows; what else is in the file may be of any size or kind."""
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("unused.npy", bytes(2 * HARMLESS))
+    assert Run.load(path).nv == 2
+    with pytest.raises(FileFormatError, match=r"run\.npz: declares .* at most 100 times as many are unpacked"):
+        read_npz(path)
+
+
+def test_many_entries_of_the_same_bytes_are_one_bomb(path):
+    np.savez_compressed(path, a=np.zeros(HARMLESS // 8), b=np.zeros(10))
+    with pytest.raises(FileFormatError, match="at most 100 times"):
+        read_npz(path)
+    assert read_npz(path, {"b"})["b"].shape == (10,)
+
+
+def test_directories_that_point_elsewhere_are_damage(path):
+    """zipfile seeks before the beginning of the file: an OSError that is none of the disk."""
+    content = path.read_bytes()
+    for begin in (1, 64, 300):
+        path.write_bytes(content[begin:])
+        with pytest.raises(FileFormatError, match=r"run\.npz: not an intact npz file"):
+            Run.load(path)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100 + "1" + "}" * 100, '{"a": NaN}', '{"a": 1, "a": 2}'])
+def test_json_that_would_overflow_the_stack_or_mislead_is_refused(path, text):
+    arrays = dict(np.load(path)) | {"info": np.array(text)}
+    write_npz(path, arrays)
+    with pytest.raises(FileFormatError, match="'info' cannot be read as JSON"):
+        Run.load(path)
+
+
+def test_numbers_of_other_widths_and_byte_orders_become_float64(path):
+    arrays = {name: x.astype(">f4") if x.dtype.kind == "f" else x for name, x in np.load(path).items()}
+    write_npz(path, arrays)
+    assert {Run.load(path).q.dtype, Run.load(path).effort_limit.dtype} == {np.dtype(float)}

@@ -1,12 +1,16 @@
 """A .xacro file is expanded, its includes beside it, and goes through the same checks as a URDF."""
 
 import sys
+from dataclasses import replace
 
 import pytest
 
+import nbs_pin as nbs
 from nbs_pin.base.exceptions import MissingExtra, RobotError
+from nbs_pin.reports.replay import replay
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.robots.urdf import read_urdf
+from tests.test_replay import moving_run
 
 
 def write(folder, text, name):
@@ -48,3 +52,24 @@ def test_xacro_without_its_extra_names_the_command(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "xacrodoc", None)
     with pytest.raises(MissingExtra, match=r"pip install 'nbs-pin\[xacro\]'"):
         read_urdf(write(tmp_path, XACRO, "arm.xacro"))
+
+
+def test_a_xacro_file_that_a_file_names_is_expanded_only_if_the_user_gives_it(tmp_path, monkeypatch):
+    """What is expanded can read the environment and other files into names that end up in pages."""
+    arm = write(tmp_path, XACRO.replace("xarm", "$(env SECRET)").replace("${1 + 1}", "2"), "arm.xacro")
+    write(tmp_path, INCLUDED, "link.xacro")
+    monkeypatch.setenv("SECRET", "told")
+    robot = load_robot(arm)
+    assert robot.name == "told"
+    run = moving_run(robot)
+    link = tmp_path / "arm.urdf"
+    link.symlink_to(arm)
+    for source in (str(arm), "arm.xacro", str(tmp_path / "." / "arm.XACRO"), str(link)):
+        named = replace(run, robot=source)
+        with pytest.raises(RobotError, match=r"a xacro file, .* give it yourself if you trust it, as robot=load_robot"):
+            replay(named, tmp_path / "page.html")
+    assert "told" in replay(run, tmp_path / "page.html", robot).read_text()
+    nbs.save(nbs.PD.for_robot(robot), tmp_path / "law.nbs")
+    with pytest.raises(RobotError, match=r"law\.nbs is of the arm .*, a xacro file"):
+        nbs.load(tmp_path / "law.nbs")
+    assert nbs.load(tmp_path / "law.nbs", robot).nv == 1

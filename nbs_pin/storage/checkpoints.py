@@ -161,18 +161,25 @@ def _tensors(path: str | Path, name: str, entries: Mapping[str, bytes]) -> dict[
 
 
 def _check_finite(path: str | Path, stored: Stored) -> None:
-    """Raises FileFormatError if settings and weights, each of them finite, overflow together."""
+    """Raises FileFormatError if settings and weights, each of them acceptable, give no finite torques together."""
     n = stored.nv
+    try:
+        found = _torques(stored, n)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise FileFormatError(f"{path}: its torques cannot be computed ({error}); save it again.") from error
+    if not np.isfinite(np.asarray(found)).all():
+        raise FileFormatError(
+            f"{path}: its torques are not finite near rest, as numbers in it overflow; train it again."
+        )
+
+
+def _torques(stored: Stored, n: int) -> Any:
+    """The torques near rest and at a larger error."""
     with torch.no_grad(), np.errstate(all="ignore"):
         q, v = (torch.stack([torch.full((n,), near), torch.ones(n)]).double() for near in (0.1, 0.01))
         if isinstance(stored, Controller):
-            found, _ = stored.step(stored.initial_memory(q), q, v, Reference(0.0 * q, 0.5 * v, 0.5 * v), 1e-3)
-        else:
-            found = stored.reference_torque(q, v, v, v)
-    if not np.isfinite(np.asarray(found)).all():
-        raise FileFormatError(
-            f"{path}: its torques are not finite near rest, so that numbers in it overflow; train it again."
-        )
+            return stored.step(stored.initial_memory(q), q, v, Reference(0.0 * q, 0.5 * v, 0.5 * v), 1e-3)[0]
+        return stored.reference_torque(q, v, v, v)
 
 
 def _arm(path: str | Path, stored: Settings, given: Robot | None) -> Robot:
