@@ -246,7 +246,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path):
     )
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith("nbs-pin: error: ")
-    assert "too large" in done.stderr
+    assert f"'{tmp_path / 'run' / 'run.npz'}': file too large" in done.stderr
     assert not (tmp_path / "run").exists()
 
 

@@ -30,7 +30,7 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     _remove_abandoned_drafts(path)
     draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        with draft.open("xb") as file:
+        with _naming(draft, path), draft.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -58,7 +58,8 @@ def replaced_together(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     _remove_abandoned_folders(folder)
     with tempfile.TemporaryDirectory(dir=folder, prefix=_WRITING) as drafts, _locked(Path(drafts)) as draft:
-        yield draft
+        with _naming(draft, folder):
+            yield draft
         new = [name for name in (*names[1:], names[0]) if (draft / name).exists()]
         for name in new:
             with (draft / name).open("rb") as file:
@@ -68,6 +69,19 @@ def replaced_together(folder: Path, names: Sequence[str]) -> Iterator[Path]:
         except KeyboardInterrupt:
             _move(draft, folder, names, new)  # either all of the new files or none
             raise
+
+
+@contextmanager
+def _naming(draft: Path, final: Path) -> Iterator[None]:
+    """An OSError in the block names the final file, in place of a draft or of none, as when a disk is full."""
+    try:
+        yield
+    except OSError as error:
+        named = str(final if error.filename is None else error.filename)
+        if named.startswith(str(draft)):
+            named = f"{final}{named.removeprefix(str(draft))}"
+        error.filename = named
+        raise
 
 
 def _move(draft: Path, folder: Path, names: Sequence[str], new: Sequence[str]) -> None:

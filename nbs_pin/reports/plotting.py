@@ -1,6 +1,7 @@
 """Figures of runs, and the style of every figure, without any global plotting state."""
 
 import io
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,7 +40,8 @@ def picture(path: str | Path, width: float, height: float, dpi: int = 120) -> It
 
     It is written whole, or not at all if drawing fails. Raises OSError if it cannot be written.
     """
-    with rc_context(_STYLE):
+    with rc_context(_STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing")  # a name in another script; it stands in summary.json
         figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
