@@ -168,7 +168,8 @@ def test_ctrl_c_before_the_first_epoch_leaves_nothing(tmp_path, capsys, monkeypa
     assert not list(tmp_path.iterdir())
 
 
-def test_a_real_ctrl_c_at_a_terminal(tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_real_signal_at_a_terminal(tmp_path, number, code):
     """The bar says the cost and the time left; the signal ends the training within an epoch, results written."""
     ours, theirs = pty.openpty()
     command = [sys.executable, "-m", "nbs_pin.cli", "train", "two_link", *QUICK, "--epochs", "100000"]
@@ -179,8 +180,8 @@ def test_a_real_ctrl_c_at_a_terminal(tmp_path):
     shown = b""
     while b"cost" not in shown or not (tmp_path / "run" / "training.ckpt").exists():
         shown += os.read(ours, 4096)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130
+    process.send_signal(number)
+    assert process.wait(timeout=60) == code
     os.close(ours)
     assert b"from 0.0" in shown
     assert sorted(contents(tmp_path / "run")) == FILES

@@ -17,6 +17,7 @@ from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Run
+from nbs_pin.base.units import several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.ensemble import LoopEnsemble, Peaks, law_of
 from nbs_pin.certificates.torque_waves import FASTEST, SLOWEST, constant, in_step, random_disturbances, square
@@ -103,7 +104,9 @@ def attack(
     peaks = ensemble.peaks(motion, waves, progress)
     pack = _Ascent.of(motion, waves, peaks, starts)
     history = [float(peaks.error.max())]
-    for k in tracked(range(rounds), lambda: f"attack: {history[-1]:.4g} rad so far", progress):
+    arm = ensemble.loop.plant.robot
+    unit = several(units("position", [False] if arm is None else arm.prismatic))
+    for k in tracked(range(rounds), lambda: f"attack: {history[-1]:.4g} {unit} so far", progress):
         pack = pack.ascend(ensemble, admissible, at_end=k % 2 == 0)
         history.append(max(history[-1], float(pack.peaks.error.max())))
     worst = int(pack.peaks.error.argmax())

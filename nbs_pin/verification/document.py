@@ -103,3 +103,9 @@ def _finite(text: str) -> float:
 def _whole(text: str) -> int:
     _finite(text)
     return int(text)
+
+
+def unit(document: dict[str, Any], turning: str, sliding: str) -> str:
+    """The unit of a number over all joints of the arm: those of joints that turn and of joints that slide."""
+    slides = {joint["prismatic"] for joint in (document["arm"] or {"joints": []})["joints"]} or {False}
+    return ", ".join(sliding if kind else turning for kind in sorted(slides))

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nbs_pin.verification.balls import Balls, arb, balls, certain, ctx, inverse, positive_definite, skew
-from nbs_pin.verification.document import is_unchanged, read_document
+from nbs_pin.verification.document import is_unchanged, read_document, unit
 from nbs_pin.verification.trees import Link, differences, stated_tree, urdf_tree
 
 BITS = 192
@@ -258,16 +258,16 @@ def _errors(document: dict[str, Any]) -> Iterator[Check]:
         forms = (arb(x) ** 2 * stiffness - np.diag(arb(level) * balls(part)) for x, part in whole + single)
         return level <= 0.0 or all(positive_definite(form) for form in forms)
 
-    level = document["bounds"]["potential"]
+    level, length = document["bounds"]["potential"], unit(document, "rad", "m")
     yield _decided("‖z1‖ and |z1_i|", bounded(document["bounds"], level), "e²S ≻ Φ∞I and e_i²S ≻ Φ∞e_ie_iᵀ, §2")
     if start is not None:
         yield Check("V(0) of the start", TAKEN, f"{start['storage']:.6g} J, which takes the weights of the law")
         yield _decided("errors from the start", bounded(start, max(level, start["storage"])), "Φ ≤ max(V(0), Φ∞), §3")
     if document["linear"] is not None:
-        yield Check("‖z1‖ of one joint", OPEN, f"{document['linear']['error']:.6g} rad by linear theory, §4")
+        yield Check("‖z1‖ of one joint", OPEN, f"{document['linear']['error']:.6g} {length} by linear theory, §4")
     if document["held"] is not None:
         held = document["held"]
-        yield Check("‖z1‖ with held torques", OPEN, f"{held['error']:.6g} rad at {1e3 * held['period']:g} ms, §13")
+        yield Check("‖z1‖ with held torques", OPEN, f"{held['error']:.6g} {length} at {1e3 * held['period']:g} ms, §13")
     for i, joint in enumerate(document["arm"]["joints"] if document["arm"] else []):
         if joint["continuous"]:
             largest = max(sizes["joint_errors"][i] for sizes in (document["bounds"], start) if sizes)
@@ -288,8 +288,8 @@ def _stated(document: dict[str, Any]) -> Iterator[Check]:
     weakest = max([*(x["label"] for x in claims), "PROVED" if holding else "EMPIRICAL"], key=_LABELS.index)
     yield _decided(f"label {document['label']}", document["label"] == weakest, "the weakest of claims and conditions")
     given, kind = document["disturbance"], document["law"]["kind"]
-    box = f"‖τ_d‖ ≤ {given['radius']:g} N·m" if given["box"] is None else f"|τ_d,i| ≤ {given['box']} N·m"
-    yield Check("disturbance", TAKEN, box)
+    box = f"‖τ_d‖ ≤ {given['radius']:g}" if given["box"] is None else f"|τ_d,i| ≤ {given['box']}"
+    yield Check("disturbance", TAKEN, f"{box} {unit(document, 'N·m', 'N')}")
     if any(any(document["friction"][key]) for key in ("viscous", "coulomb", "fed_viscous", "fed_coulomb")):
         yield Check("joint friction and |v_d|", TAKEN, "b, c, b̂, ĉ, ε and the speed of the reference as in the file")
     yield Check(f"law {kind}", TAKEN, "Φ ≥ z1ᵀSz1, D ⪰ D₀, Λ, ω and ζ as in the file, by the structure of its code")
