@@ -1,7 +1,7 @@
 """Units of joints: rad and N·m where a joint turns, m and N where it slides; all that shows numbers asks here."""
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class JointUnits(NamedTuple):
@@ -22,12 +22,12 @@ TURNING = JointUnits("rad", "rad/s", "rad/s²", "N·m", "N·m/rad", "N·m·s/rad
 SLIDING = JointUnits("m", "m/s", "m/s²", "N", "N/m", "N·s/m", "m/s per N", "J/m²", "kg")
 
 
-def units_of(prismatic: Iterable[bool]) -> tuple[JointUnits, ...]:
-    """The units of every joint, of which `prismatic` says whether it slides."""
+def units_of(prismatic: Iterable[Any]) -> tuple[JointUnits, ...]:
+    """The units of every joint, of which `prismatic` says (True, False) whether it slides."""
     return tuple(SLIDING if slides else TURNING for slides in prismatic)
 
 
-def units(quantity: str, prismatic: Iterable[bool]) -> tuple[str, ...]:
+def units(quantity: str, prismatic: Iterable[Any]) -> tuple[str, ...]:
     """The unit of a quantity (a field of `JointUnits`) for every joint."""
     return tuple(getattr(of, quantity) for of in units_of(prismatic))
 
@@ -37,7 +37,7 @@ def several(given: Iterable[str]) -> str:
     return ", ".join(sorted(dict.fromkeys(given), key=lambda unit: unit in SLIDING))
 
 
-def by_quantity(prismatic: Iterable[bool]) -> dict[str, list[str]]:
+def by_quantity(prismatic: Iterable[Any]) -> dict[str, list[str]]:
     """The unit of every joint, by quantity, as JSON can store it."""
     return {
         name: list(given)
@@ -45,7 +45,7 @@ def by_quantity(prismatic: Iterable[bool]) -> dict[str, list[str]]:
     }
 
 
-def over_joints(unit: str, prismatic: Iterable[bool]) -> str:
+def over_joints(unit: str, prismatic: Iterable[Any]) -> str:
     """The unit of a number over all joints, such as a norm or a maximum: `unit` if all of them turn."""
     if unit not in TURNING:
         return unit
