@@ -1,13 +1,14 @@
 """`nbs-pin certify`: bounds of the tracking error before the arm moves, and the worst motion that a search finds."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.values import (
     OptionError,
     choice,
@@ -121,3 +122,5 @@ class Certify:
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another certificate in that folder."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

@@ -1,11 +1,12 @@
 """`nbs-pin learn`: a model of an arm from data, and its error on held-out motions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.values import choice, default, integer, number
 from nbs_pin.identification.registry import MODELS
 
@@ -49,3 +50,5 @@ class Learn:
     """Folder for the results."""
     force: bool = False
     """Overwrite another model in that folder."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

@@ -73,7 +73,7 @@ def _controller(options: Certify) -> LyapunovLaw:
     if name.endswith(SAVED):
         law: Any = load(name)
     else:
-        robot = load_robot(name)
+        robot = load_robot(name, **options.arm.given())
         stated = _friction(options.friction, robot) or JointFriction.of(robot)
         law = build_law(options.law, robot, friction=stated if options.feed_friction else None, **settings)
     if not isinstance(law, LyapunovLaw):
@@ -92,7 +92,7 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
     """The task that the options describe; raises OptionError if they do not fit each other."""
     _check_options(options)
     period = options.period or 0.001
-    truth = None if options.against is None else load_robot(options.against)
+    truth = None if options.against is None else load_robot(options.against, **options.arm.given())
     blank = Task(reference=_no_motion, truth=truth)
     robot = arm_of(controller, blank)
     if options.trajectories is not None and is_exact(controller.dynamics, robot):

@@ -31,7 +31,7 @@ _ENDED = {"held out": "no further progress on held-out data", "iterations": "all
 def run(options: Learn, console: Console, notes: Console) -> None:
     """Learn, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     with notes.status(f"loading {options.data}"):
-        data, robot = data_and_arm(options.data, options.robot)
+        data, robot = data_and_arm(options.data, options.robot, **options.arm.given())
     name = options.data.stem if robot is None else robot.name
     # Data are identified by their fingerprint, not by their path.
     results = Results.of(options, name, robot, data=None, data_sha256=sha256_of(options.data))
@@ -85,9 +85,9 @@ def arm_of(data: Dataset) -> Robot | None:
     return robot
 
 
-def data_and_arm(path: str | Path, arm: str | None) -> tuple[Dataset, Robot | None]:
+def data_and_arm(path: str | Path, arm: str | None, **load_options: Any) -> tuple[Dataset, Robot | None]:
     """The data in a file (`load_log`) and the arm of that name or path, or else the one that the data name."""
-    given = None if arm is None else load_robot(arm)
+    given = None if arm is None else load_robot(arm, **load_options)
     data = load_log(path, robot=given)
     return data, given or arm_of(data)
 

@@ -12,8 +12,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.catalogue import example_robot_share
+from nbs_pin.robots.packages import Packages
+from nbs_pin.robots.urdf_source import shorten
 
 SUFFIXES = (".stl", ".obj", ".dae")
 MAX_BYTES = 50_000_000
@@ -30,6 +33,10 @@ class MeshError(RobotError):
     """A mesh that cannot be drawn; names the reason and the remedy."""
 
 
+class PackageMissing(MeshError):
+    """The package of a mesh is not found, one cause for all its meshes."""
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """A triangle mesh of one colour; `color` is None if the file states none."""
@@ -39,30 +46,39 @@ class Part:
     color: Color | None
 
 
-def find_mesh(uri: str, urdf: Path, package_dirs: tuple[Path, ...] = ()) -> Path:
+def find_mesh(uri: str, packages: Packages) -> Path:
     """The mesh file that `uri` refers to in a URDF, restricted to the folders that belong to the robot.
 
-    These are the URDF's own folder, the ROS package around it (the nearest folder with a `package.xml`),
-    example-robot-data, and `package_dirs`. Raises MeshError for another scheme, suffix or folder, or a missing file.
+    These are the URDF's own folder, the ROS package around it, the package that a package:// address names
+    (`Packages.find`), example-robot-data, and the folders given with `package_dirs`. Backslashes count as slashes.
+
+    Raises:
+        MeshError: For another scheme, suffix or folder, or a missing file.
     """
-    scheme, _, rest = uri.rpartition("://")
-    package = next((folder for folder in urdf.parents if (folder / "package.xml").is_file()), urdf.parent)
-    roots = [folder.resolve() for folder in (urdf.parent, package, example_robot_share(), *package_dirs)]
+    scheme, _, rest = uri.replace("\\", "/").rpartition("://")
     if scheme not in ("", "file", "package"):
         raise MeshError(f"mesh '{uri}' is not a file on this machine: give a relative or package:// path.")
     if Path(rest).suffix.lower() not in SUFFIXES:
         raise MeshError(f"mesh '{uri}' is a file of unknown kind: give one of {', '.join(SUFFIXES)}.")
-    candidates = [urdf.parent / unquote(rest)]
+    own = packages.file.parent
+    roots = [own, packages.around, example_robot_share().resolve(), *packages.given]
+    path = own / unquote(rest)
     if scheme == "package":
         name, _, inner = unquote(rest).partition("/")
-        candidates = [root / name / inner for root in roots] + [root / inner for root in roots if root.name == name]
-    inside = [path.resolve() for path in candidates if any(path.resolve().is_relative_to(root) for root in roots)]
-    if not inside:
-        raise MeshError(f"mesh '{uri}' leaves the robot's folder {roots[0]}: name its folder in package_dirs.")
-    found = next((path for path in inside if path.is_file()), None)
-    if found is None:
-        raise MeshError(f"mesh '{uri}' was not found at {inside[0]}: check the path or give package_dirs.")
-    return found
+        folder = packages.find(name)
+        if folder is None:
+            raise PackageMissing(
+                f"package '{shorten(name)}' was not found near {packages.file} nor on ROS_PACKAGE_PATH or "
+                f"AMENT_PREFIX_PATH: give the folder it lies in, {option('package_dirs', BLANK)}."
+            )
+        roots, path = [folder.resolve(), *roots], folder / inner
+    resolved = path.resolve()
+    if not any(resolved.is_relative_to(root) for root in roots):
+        remedy = f"give the folder of its package, {option('package_dirs', BLANK)}"
+        raise MeshError(f"mesh '{uri}' leaves the robot's folder {roots[0]}: {remedy}.")
+    if not resolved.is_file():
+        raise MeshError(f"mesh '{uri}' was not found at {resolved}: check the path or {option('package_dirs', BLANK)}.")
+    return resolved
 
 
 def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:

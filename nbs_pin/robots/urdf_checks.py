@@ -1,17 +1,22 @@
-"""Checks of a URDF: unique names, one tree, physical inertias, valid axes and limits.
+"""Checks of a URDF: unique names, one tree, valid axes and limits; joints locked as asked.
 
 Pinocchio and MuJoCo each accept descriptions that silently give a wrong model (a mass "nan", a zero axis, a link with
 two parents). These checks run before either reads the file and raise RobotError with file, line and remedy.
 """
 
 import math
+import re
 import warnings
+import xml.etree.ElementTree as ET
 from collections import defaultdict
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
+from nbs_pin.base.doors import BLANK, option
+from nbs_pin.robots.urdf_options import ALL, LIMITS, UrdfOptions
 from nbs_pin.robots.urdf_source import Node, shorten
 
 MAX_JOINTS = 64
@@ -20,19 +25,17 @@ MAX_LINKS = 1000
 """Largest number of links of an arm, tool frames included."""
 MAX_NAME = 128
 """Largest length of the name of a link or joint."""
-ZeroLimits: TypeAlias = Literal["refuse", "unlimited"]
-"""How to treat a zero effort, a zero velocity or an empty range at zero."""
-ZERO_LIMITS: tuple[ZeroLimits, ...] = get_args(ZeroLimits)
 MOVING = ("revolute", "continuous", "prismatic")
 """Supported joint types with one degree of freedom."""
 
 _UNSUPPORTED = ("floating", "planar")
 _ROUNDING = 1e-6
 """Relative tolerance for numbers that were rounded when the file was written."""
-_POINT = 1e-9
-"""Radius of gyration below which a body counts as a point mass [m]."""
-_OPEN = ", or load it with zero_limits='unlimited' if 0 means no limit"
-_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_FARTHEST, _MOST_TURNED = 100.0, 1e6
+"""Largest distance [m] in an origin, and largest angle or position limit [rad, m], that an arm can have."""
+_WHEEL = re.compile(r"wheel|caster", re.IGNORECASE)
+_ENDLESS, _MOST = 1e9, 1e39
+"""Position limits between these are read as none: exporters write 1e16, or the largest number of single precision."""
 
 
 class Limits(NamedTuple):
@@ -60,46 +63,56 @@ class Joint:
         return self.kind != "fixed"
 
 
-def check_tree(robot: Node, lock: tuple[str, ...]) -> list[Joint]:
-    """The joints in file order, those in `lock` fixed; checks for unique names, known types and a single tree."""
+def check_tree(robot: Node, options: UrdfOptions) -> list[Joint]:
+    """The joints in file order, those to lock fixed; checks for unique names, known types and a single tree.
+
+    Joints that mimic another are locked where they stand at the other's zero, with a warning that names them.
+    """
     _check_name(robot, robot.text("name"))
     links = _unique(robot, "link")
     nodes = _unique(robot, "joint")
-    unknown = [name for name in lock if name not in nodes]
-    if unknown:
-        raise robot.refuse(f"no joint '{unknown[0]}' to lock", f"the joints are {', '.join(nodes)}")
-    joints = [_joint(node, name, name in lock) for name, node in nodes.items()]
-    mimics = [joint for joint in joints if joint.moves and joint.node.element.find("mimic") is not None]
-    if mimics:
-        remedy = f"lock them (lock={[joint.name for joint in mimics]}) or remove <mimic>"
-        raise mimics[0].node.need("mimic").refuse("mimic joints are not supported", remedy)
+    for argument, names in (("lock", list(options.lock)), ("limits", list(options.limits))):
+        unknown = [name for name in names if name not in nodes and (argument, name) != ("limits", ALL)]
+        if unknown:
+            raise robot.refuse(f"no joint '{unknown[0]}' for {argument}", f"the joints are {', '.join(nodes)}")
+    mimics = _mimics(nodes, options)
+    joints = [_joint(node, name, (mimics | dict(options.lock)).get(name)) for name, node in nodes.items()]
     _check_connected(links, joints)
     moving = sum(joint.moves for joint in joints)
     if moving == 0:
-        raise robot.refuse("0 movable joints", "give an arm (a file with xacro macros must be expanded first)")
+        raise robot.refuse("0 movable joints", "give an arm (a file with xacro macros must call them)")
     for what, count, most in (("moving joints", moving, MAX_JOINTS), ("links", len(links), MAX_LINKS)):
         if count > most:
-            raise robot.refuse(f"too large: {count} {what} (limit {most})", "give a smaller arm or fix joints")
+            names = [joint.name for joint in joints if joint.moves][most:]
+            remedy = f"lock some ({option('lock', names)})" if what == "moving joints" else "give a smaller arm"
+            raise robot.refuse(f"too large: {count} {what} (limit {most})", remedy)
+    wheels = [joint for joint in joints if joint.kind == "continuous" and _WHEEL.search(f"{joint.name} {joint.child}")]
+    if wheels:
+        names = [joint.name for joint in wheels]
+        text = f"{wheels[0].node.place}: joints {', '.join(map(repr, names))} look like wheels, and the base is fixed"
+        warnings.warn(f"{text}, so they spin in the air; lock them by {option('lock', names)}.", stacklevel=2)
     return joints
 
 
-def check_bodies(robot: Node, joints: list[Joint]) -> None:
-    """Check that every stated inertia is physical and that every moving joint carries mass.
+def _mimics(nodes: dict[str, Node], options: UrdfOptions) -> dict[str, float]:
+    """Where the joints that mimic another stand when the others are at zero, or where these are locked [rad, m]."""
+    coupled = {name: node.child("mimic") for name, node in nodes.items() if node.element.get("type") in MOVING}
+    mimics = {name: node for name, node in coupled.items() if node is not None and name not in options.lock}
+    places = dict(options.lock)
 
-    Links fixed to each other count as one body, so a tool frame or a flange of a massive link may have no mass.
-    """
-    above = {joint.child: joint for joint in joints}
-    mass: dict[str, float] = defaultdict(float)
-    for link in robot.named("link"):
-        name = link.text("name")
-        stated = _mass(link)
-        while name in above and not above[name].moves:
-            name = above[name].parent
-        mass[name] += stated
-    for joint in joints:
-        if joint.moves and mass[joint.child] == 0.0:
-            problem = f"moves link '{joint.child}', which has no mass (M would be singular)"
-            raise joint.node.refuse(problem, f"give link '{joint.child}' an <inertial> with mass > 0 or lock the joint")
+    def place(name: str, seen: tuple[str, ...] = ()) -> float:
+        if name not in mimics or name in seen:
+            return places.get(name, 0.0)
+        node = mimics[name]
+        return node.number("multiplier", 1.0) * place(node.text("joint"), (*seen, name)) + node.number("offset", 0.0)
+
+    found = {name: place(name) for name in mimics}
+    if found:
+        stated = ", ".join(f"'{name}' (of '{node.text('joint')}', at {found[name]:g})" for name, node in mimics.items())
+        place_text = next(iter(mimics.values())).place
+        text = f"{place_text}: joints that mimic another are locked: {stated}"
+        warnings.warn(f"{text}; lock them elsewhere by {option('lock', found)}.", stacklevel=2)
+    return found
 
 
 def check_axis(joint: Joint) -> None:
@@ -112,36 +125,65 @@ def check_axis(joint: Joint) -> None:
     if length < 1e-9:
         raise axis.refuse(f"axis xyz '{axis.text('xyz')}' has zero length", "fix <axis xyz=…>")
     if abs(length - 1.0) > _ROUNDING:
-        place = f"{axis.label}:{axis.lines[axis.element]}: {axis.owner}"
-        text = f"{place}: axis xyz '{axis.text('xyz')}' is not a unit vector; it was normalised."
+        text = f"{axis.place}: {axis.owner}: axis xyz '{axis.text('xyz')}' is not a unit vector; it was normalised."
         warnings.warn(text, stacklevel=2)
         axis.element.set("xyz", " ".join(repr(x / length) for x in xyz))
 
 
-def read_limits(joint: Joint, zero_limits: ZeroLimits) -> Limits:
-    """The limits that a joint states.
+def read_limits(joint: Joint, options: UrdfOptions) -> Limits:
+    """The limits of a joint: those given in `options.limits`, else those that it states.
 
     A continuous joint has no position limits and may omit the others; every other moving joint must state all four.
-    `zero_limits`: "refuse" a zero effort or velocity and an empty range, or read these zeros as "unlimited".
+    `zero_limits`: "refuse" a zero effort or velocity and an empty range at zero, or read these zeros as "unlimited".
+    URDF reads a lower or upper limit that is left out as 0.
     """
-    none = Limits(-math.inf, math.inf, math.inf, math.inf)
+    given = {key: options.limit(joint.name, key) for key in LIMITS}
     limit = joint.node.child("limit")
     if limit is None:
-        if joint.kind != "continuous":
-            remedy = "add <limit lower=… upper=… effort=… velocity=…/> or make the joint continuous"
+        if joint.kind == "continuous":
+            return _checked(joint.node, joint, given, Limits(-math.inf, math.inf, math.inf, math.inf), options)
+        if None in given.values():
+            remedy = f"add <limit …/>, give them ({_example(joint, dict.fromkeys(LIMITS))}) or make it continuous"
             raise joint.node.refuse(f"{joint.kind} joint without <limit>", remedy)
-        return none
-    strength = [_strength(limit, key, joint.kind, zero_limits) for key in ("effort", "velocity")]
+        return _checked(joint.node, joint, given, Limits(0.0, 0.0, 0.0, 0.0), options)
+    effort, velocity = (_strength(limit, key, joint, given[key], options) for key in ("effort", "velocity"))
     if joint.kind == "continuous":
-        return Limits(-math.inf, math.inf, *strength)
-    lower, upper = limit.number("lower"), limit.number("upper")
-    if zero_limits == "unlimited" and lower == upper == 0.0:
-        return Limits(-math.inf, math.inf, *strength)
+        return _checked(limit, joint, given, Limits(-math.inf, math.inf, effort, velocity), options)
+    lower, upper = (limit.number(key, 0.0) for key in ("lower", "upper"))
+    return _checked(limit, joint, given, Limits(lower, upper, effort, velocity), options)
+
+
+def _checked(node: Node, joint: Joint, given: dict[str, float | None], stated: Limits, options: UrdfOptions) -> Limits:
+    """The limits given, else stated; raises RobotError unless the range is one."""
+    limits = Limits(*(x if given[key] is None else given[key] for key, x in zip(LIMITS, stated, strict=True)))  # type: ignore[arg-type]
+    endless = -_MOST <= limits.lower <= -_ENDLESS and _ENDLESS <= limits.upper <= _MOST
+    lower, upper = (-math.inf, math.inf) if endless else (limits.lower, limits.upper)
+    if options.zero_limits == "unlimited" and lower == upper == 0.0:
+        return Limits(-math.inf, math.inf, limits.effort, limits.velocity)
     if lower >= upper:
+        absent = [key for key in ("lower", "upper") if key not in node.element.attrib]
         sign = ">" if lower > upper else "="
-        remedy = "give lower < upper or make the joint fixed" + (_OPEN if lower == upper == 0.0 else "")
-        raise limit.refuse(f"limit lower {lower:g} {sign} upper {upper:g}", remedy)
-    return Limits(lower, upper, *strength)
+        problem = f"limit lower {lower:g} {sign} upper {upper:g}"
+        problem += f" ({' and '.join(absent)} left out, which URDF reads as 0)" if absent else ""
+        remedy = f"give lower < upper ({_example(joint, {'lower': -3.14, 'upper': 3.14})}) or lock the joint"
+        raise node.refuse(problem, remedy + (_open() if lower == upper == 0.0 else ""))
+    for key, value in (("lower", lower), ("upper", upper)):
+        if key not in node.element.attrib and given[key] is None and math.isfinite(value):
+            text = f"{node.place}: {joint.node.owner}: <limit> states no {key}, which URDF reads as 0"
+            warnings.warn(f"{text}; if it is another, give it: {_example(joint, {key: None})}.", stacklevel=2)
+        if math.isfinite(value) and abs(value) > _MOST_TURNED:
+            remedy = f"state the joint's range ({_example(joint, {key: math.copysign(3.14, value)})})"
+            raise node.refuse(f"limit {key} {value:g} is beyond ±{_MOST_TURNED:g}", remedy)
+    return Limits(lower, upper, limits.effort, limits.velocity)
+
+
+def _example(joint: Joint, limits: dict[str, float | None]) -> str:
+    """`limits` as one would give them for a joint, with placeholders for those that are not known."""
+    return option("limits", {joint.name: {key: BLANK if x is None else x for key, x in limits.items()}})
+
+
+def _open() -> str:
+    return f", or {option('zero_limits', 'unlimited')} if 0 means no limit"
 
 
 def read_friction(joint: Joint) -> tuple[float, float]:
@@ -156,8 +198,12 @@ def check_origin(node: Node) -> None:
     """Check that the placement of a joint or inertia, where stated, is six finite numbers."""
     origin = node.child("origin")
     if origin is not None:
-        origin.numbers("xyz", 3, (0.0, 0.0, 0.0))
-        origin.numbers("rpy", 3, (0.0, 0.0, 0.0))
+        for key, most, unit in (("xyz", _FARTHEST, "m"), ("rpy", _MOST_TURNED, "rad")):
+            values = origin.numbers(key, 3, (0.0, 0.0, 0.0))
+            if max(map(abs, values)) > most:
+                raise origin.refuse(
+                    f"origin {key} '{origin.text(key)}' is beyond ±{most:g} {unit}", f"fix <origin {key}=…>"
+                )
 
 
 def _unique(robot: Node, tag: str) -> dict[str, Node]:
@@ -167,7 +213,7 @@ def _unique(robot: Node, tag: str) -> dict[str, Node]:
         name = node.text("name")
         _check_name(node, name)
         if name in nodes:
-            lines = f"lines {nodes[name].lines[nodes[name].element]} and {node.lines[node.element]}"
+            lines = node.lines(nodes[name].element)
             raise node.refuse(f"the name '{name}' is used twice ({lines})", f"rename one {tag}")
         nodes[name] = node
     return nodes
@@ -180,22 +226,44 @@ def _check_name(node: Node, name: str) -> None:
         raise node.refuse(problem, f"rename the {node.element.tag}")
 
 
-def _joint(node: Node, name: str, locked: bool) -> Joint:
-    """The joint of an element, fixed if `locked`; a fixed joint keeps only its parent, child and origin."""
+def _joint(node: Node, name: str, locked: float | None) -> Joint:
+    """The joint of an element, fixed if it is `locked` somewhere; a fixed one keeps only parent, child and origin."""
     kind = node.text("type")
-    allowed = (*MOVING, "fixed", *(_UNSUPPORTED if locked else ()))
+    allowed = (*MOVING, "fixed", *(_UNSUPPORTED if locked is not None else ()))
     if kind not in allowed:
         remedy = "use revolute, continuous, prismatic or fixed"
-        remedy += f", or lock it: lock=['{name}']" if kind in _UNSUPPORTED else ""
+        remedy += f", or lock it: {option('lock', [name])}" if kind in _UNSUPPORTED else ""
         raise node.refuse(f"type '{shorten(kind)}' is not supported", remedy)
-    kind = "fixed" if locked else kind
+    check_origin(node)
+    joint = Joint(node, name, kind, node.need("parent").text("link"), node.need("child").text("link"))
+    if locked and kind != "fixed":
+        _move(joint, locked)
+    kind = "fixed" if locked is not None else kind
     node.element.set("type", kind)
     if kind == "fixed":
         for child in list(node.element):
             if child.tag not in ("parent", "child", "origin"):
                 node.element.remove(child)
-    check_origin(node)
-    return Joint(node, name, kind, node.need("parent").text("link"), node.need("child").text("link"))
+    return replace(joint, kind=kind)
+
+
+def _move(joint: Joint, place: float) -> None:
+    """Turn or shift the origin of a joint to its position `place` [rad, m]."""
+    if joint.kind not in MOVING:
+        remedy = f"lock it at 0 ({option('lock', [joint.name])})"
+        raise joint.node.refuse(f"a joint of type '{joint.kind}' cannot be locked at {place:g}", remedy)
+    check_axis(joint)
+    axis = joint.node.child("axis")
+    direction = np.array([1.0, 0.0, 0.0] if axis is None else axis.numbers("xyz", 3))
+    origin = joint.node.child("origin")
+    xyz, rpy = (np.zeros(3) if origin is None else np.array(origin.numbers(k, 3, (0.0,) * 3)) for k in ("xyz", "rpy"))
+    frame = pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz)
+    slides = joint.kind == "prismatic"
+    shift = pin.SE3(np.eye(3), place * direction) if slides else pin.SE3(pin.exp3(place * direction), np.zeros(3))
+    moved = frame * shift
+    element = ET.SubElement(joint.node.element, "origin") if origin is None else origin.element
+    element.set("xyz", " ".join(map(repr, moved.translation.tolist())))
+    element.set("rpy", " ".join(map(repr, pin.rpy.matrixToRpy(moved.rotation).tolist())))
 
 
 def _check_connected(links: dict[str, Node], joints: list[Joint]) -> None:
@@ -224,40 +292,13 @@ def _check_connected(links: dict[str, Node], joints: list[Joint]) -> None:
         raise lost[0].node.refuse(f"not a tree: joints {names} form a cycle or follow one", "fix their <parent>")
 
 
-def _mass(link: Node) -> float:
-    """The mass of a link [kg], 0 if none is stated; raises RobotError unless a rigid body can have its inertia.
-
-    Principal moments of a rigid body are ≥ 0 and none exceeds the sum of the other two. Point masses (all zero) and
-    rods (one zero) are allowed; M(q) ≻ 0 is tested on the whole arm.
-    """
-    inertial = link.child("inertial")
-    if inertial is None:
-        return 0.0
-    check_origin(inertial)
-    mass = inertial.need("mass").number("value", least=0.0)
-    node = inertial.need("inertia")
-    xx, xy, xz, yy, yz, zz = (node.number(key) for key in _INERTIA)
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if mass == 0.0 and inertia.any():
-        raise inertial.need("mass").refuse("mass value '0' is not > 0 though inertia is stated", "fix <mass value=…>")
-    small, middle, large = moments = np.linalg.eigvalsh(inertia)
-    slack = _ROUNDING * large + _POINT**2 * mass
-    for wrong, problem in (
-        (small < -slack, "inertia is not positive definite"),
-        (small + middle < large - slack, "not a physical body, principal moments a + b < c"),
-    ):
-        if wrong:
-            stated = ", ".join(f"{moment:.4g}" for moment in moments)
-            raise node.refuse(f"{problem} ({stated} kg·m²)", "fix <inertia …>")
-    return mass
-
-
-def _strength(limit: Node, key: str, kind: str, zero_limits: ZeroLimits) -> float:
+def _strength(limit: Node, key: str, joint: Joint, given: float | None, options: UrdfOptions) -> float:
     """The effort or velocity limit: > 0, or inf if there is none."""
-    value = limit.number(key, math.inf if kind == "continuous" else None)
-    if value == 0.0 and zero_limits == "unlimited":
-        return math.inf
+    free = joint.kind == "continuous" or options.zero_limits == "unlimited" or given is not None
+    value = limit.number(key, math.inf if free else None)
+    if given is not None or (value == 0.0 and options.zero_limits == "unlimited"):
+        return math.inf if given is None else given
     if value <= 0.0:
-        remedy = f"state the drive's {key} in <limit {key}=…>" + (_OPEN if value == 0.0 else "")
-        raise limit.refuse(f"limit {key} '{value:g}' is not > 0", remedy)
+        remedy = f"state the drive's {key} ({_example(joint, {key: None})})"
+        raise limit.refuse(f"limit {key} '{value:g}' is not > 0", remedy + (_open() if value == 0.0 else ""))
     return value

@@ -19,6 +19,7 @@ from lxml import etree
 
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.meshes import Color, MeshError, Part, find_mesh, read_mesh, shaded
+from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.robot import Robot
 
 STEEL: Color = (0.35, 0.45, 0.60, 1.0)
@@ -95,16 +96,17 @@ def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple
         RobotError: If a visual, mimic or limit element is malformed.
     """
     description, _ = _parse(robot)
+    packages = Packages(robot.urdf.path, (*package_dirs, *robot.options.get("package_dirs", ())))
     materials = {material.name: material.color for material in description.robot.materials if material.color}
-    folders = tuple(Path(folder) for folder in package_dirs)
     visuals: list[Visual] = []
     bare: set[str] = set()
+    lost: dict[str, list[str]] = {}
     for link in description.robot.links:
         for visual in link.visuals:
             try:
-                parts = _parts(visual.geometry, robot.urdf.path, folders)
+                parts = _parts(visual.geometry, packages)
             except MeshError as error:
-                warnings.warn(f"link '{link.name}' is drawn as a capsule: {error}", stacklevel=2)
+                lost.setdefault(str(error), []).append(link.name)
                 bare.add(link.name)
                 continue
             placement = np.eye(4) if visual.origin is None else np.asarray(visual.origin, dtype=float)
@@ -112,6 +114,11 @@ def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple
             visuals += [
                 Visual(link.name, placement, part.vertices, part.faces, part.color or stated or GREY) for part in parts
             ]
+    for reason, links in lost.items():
+        several = f"links {', '.join(map(repr, links[:5]))}{' …' * (len(links) > 5)} are drawn as capsules"
+        warnings.warn(
+            f"{several if len(links) > 1 else f'link {links[0]!r} is drawn as a capsule'}: {reason}", stacklevel=2
+        )
     return (*visuals, *_capsules(robot, {visual.link for visual in visuals}, bare))
 
 
@@ -144,11 +151,11 @@ def _parse(robot: Robot) -> tuple[yourdfpy.URDF, Any]:
         raise RobotError(message) from error
 
 
-def _parts(geometry: Any, urdf: Path, package_dirs: tuple[Path, ...]) -> tuple[Part, ...]:
+def _parts(geometry: Any, packages: Packages) -> tuple[Part, ...]:
     """A URDF geometry as triangle meshes."""
     if geometry.mesh is not None:
         scale = np.ones(3) if geometry.mesh.scale is None else np.broadcast_to(geometry.mesh.scale, (3,)).astype(float)
-        return read_mesh(find_mesh(geometry.mesh.filename, urdf, package_dirs), scale)
+        return read_mesh(find_mesh(geometry.mesh.filename, packages), scale)
     if geometry.box is not None:
         return (shaded(trimesh.creation.box(geometry.box.size), None),)
     if geometry.cylinder is not None:
