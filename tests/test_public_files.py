@@ -68,6 +68,19 @@ def typed(path, text=""):
 REMEDIES = {
     "effort 0": ("".join(ARM).replace('effort="50"', 'effort="0"', 1), "--limits shoulder.effort=…", "9"),
     "effort 0, unlimited": ("".join(ARM).replace('effort="50"', 'effort="0"'), "--zero-limits unlimited", ""),
+    "effort -1 everywhere": ("".join(ARM).replace('effort="50"', 'effort="-1"'), "--zero-limits unlimited", ""),
+    "no limit": (re.sub(r"<limit.*?/>", "", "".join(ARM)), "--zero-limits unlimited", ""),
+    "equal": (
+        "".join(ARM) + link("c") + joint("hand", "b", "c", limit='lower="1" upper="1" effort="1" velocity="1"'),
+        "--lock hand=1",
+        "",
+    ),
+    "mass 0": ("".join(ARM) + link("c", mass=0) + joint("hand", "b", "c", "fixed"), "--repair", ""),
+    "two without mass": (
+        "".join(ARM) + '<link name="c"/><link name="d"/>' + joint("hand", "b", "c") + joint("tool", "b", "d"),
+        "--lock hand,tool",
+        "",
+    ),
     "velocity -1": ("".join(ARM).replace('velocity="3"', 'velocity="-1"', 1), "--limits shoulder.velocity=…", "2"),
     "no range": ("".join(ARM).replace('lower="-2" upper="2"', ""), "--zero-limits unlimited", ""),
     "no inertia": ("".join(ARM).replace('izz="0.04"', 'izz="0.9"', 1), "--repair", ""),
@@ -367,7 +380,7 @@ def test_a_missing_package_is_named_with_the_option_for_it(tmp_path):
                package_dirs=[tmp_path / "elsewhere"], xacro_args={"mass": 1})  # fmt: skip
     with at_the_shell(), pytest.raises(RobotError, match=r"--package-dir …"):
         load_robot(path)
-    with pytest.raises(ArgumentError, match="package_dirs names .*nowhere, which is no folder"):
+    with pytest.raises(ArgumentError, match=r"package_dirs names .*nowhere, which is no folder"):
         load_robot(path, package_dirs=[tmp_path / "nowhere"])
 
 
@@ -378,10 +391,9 @@ def test_a_package_that_only_meshes_need_does_not_stop_the_arm(tmp_path):
     )
     path = write(tmp_path, text.replace("<robot", f"<robot {XMLNS}"), "arm.xacro")
     arm = load_robot(path)
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning, match="links 'a', 'b' are drawn as capsules") as caught:
         link_visuals(arm)
     assert len(caught) == 1
-    assert "links 'a', 'b' are drawn as capsules" in str(caught[0].message)
 
 
 def test_options_of_the_wrong_type_are_refused_in_one_sentence():

@@ -1,9 +1,9 @@
 """Files of arms broken at random: `python tools/fuzz_descriptions.py --count 20000 --seed 0`.
 
-Mutants of the arms of the catalogue and of a few xacro files (bytes, numbers, attributes, elements, encodings). What
-`load_robot` accepts must have M(q) ≻ 0 in every pose found by a search of its own, and MuJoCo must build the same M from
-the same bytes, to 1e-9 relative. Prints the counts and ends with 1 if an error was not the package's own, a worker died,
-or an accepted arm was not sound.
+Mutants of the arms of the catalogue and of a xacro file (bytes, numbers, attributes, elements, encodings). What
+`load_robot` accepts must have M(q) ≻ 0 in every pose that a search finds, and MuJoCo must build the same M from the
+same bytes, to 1e-9 of its largest entry. Prints the counts and ends with 1 if an error was not the package's own, a
+worker died, or an accepted arm was not sound.
 """
 
 import argparse
@@ -174,7 +174,7 @@ def verdict(suffix: str, data: bytes, folder: str) -> str:
 
 
 def fault(robot: Robot) -> str:
-    """ "accepted", or why the arm is not sound."""
+    """Why the arm is not sound, or that it is accepted."""
     low, high = robot.one_turn_range
     rng = np.random.default_rng(0)
     data = robot.model.createData()

@@ -75,7 +75,7 @@ class ArmOptions:
     lock: Annotated[str | None, text("J1,J2=POSITION,…", _checked(_read_lock)), default("none")] = None
     """Joints to fix at 0, or at a position [rad, m]: --lock finger_left,finger_right=0.02."""
     zero_limits: Literal["refuse", "unlimited"] | None = None
-    """Zero effort, velocity or range in the file: refuse it, or read it as no limit."""
+    """Limits that are left out, not above 0, or an empty range at 0: refuse them, or read them as no limit."""
     limits: Annotated[str | None, text("J1.LIMIT=VALUE,…", _checked(_read_limits)), default("the file's")] = None
     """Limits in place of the file's, * for every joint, inf for none: --limits elbow.effort=50,*.velocity=2."""
     repair: bool = False

@@ -43,10 +43,11 @@ def check_bodies(robot: Node, joints: list[Joint], options: UrdfOptions, package
     if options.inertia_from == "shapes":
         _fill(empty, links, packages)
         empty = [joint for joint in empty if not any(link.child("inertial") for link in links[joint.child])]
-    for joint in empty:
+    if empty:
+        joint, names = empty[0], [joint.name for joint in empty]
         problem = f"moves link '{joint.child}', which has no mass (M would be singular)"
         remedy = (
-            f"give link '{joint.child}' an <inertial> with mass > 0, lock the joint ({option('lock', [joint.name])})"
+            f"give link '{joint.child}' an <inertial> with mass > 0, lock what moves none ({option('lock', names)})"
         )
         if options.inertia_from != "shapes":
             remedy += f", or take the inertia of its shapes as a guess ({option('inertia_from', 'shapes')})"
@@ -85,7 +86,13 @@ def _mass(link: Node, *, welded: bool, repair: bool) -> float:
         link.element.remove(inertial.element)
         return 0.0
     if mass == 0.0 and inertia.any():
-        raise inertial.need("mass").refuse("mass value '0' is not > 0 though inertia is stated", "fix <mass value=…>")
+        problem = "mass value '0' is not > 0 though inertia is stated"
+        if not repair:
+            remedy = f"fix <mass value=…>, or leave the inertia out ({option('repair', True)})"
+            raise inertial.need("mass").refuse(problem, remedy)
+        warnings.warn(f"{node.place}: {node.owner}: {problem}; the inertia is left out.", stacklevel=2)
+        link.element.remove(inertial.element)
+        return 0.0
     if 0.0 < mass < _NEGLECTED or mass > _HEAVIEST or np.abs(inertia).max() > _HEAVIEST * _FARTHEST**2:
         stated = f"mass {mass:g} kg with inertia up to {np.abs(inertia).max():g} kg·m² is none that an arm can have"
         raise inertial.need("mass").refuse(

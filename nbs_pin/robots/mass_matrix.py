@@ -18,8 +18,8 @@ _FEW = 6
 """Poses that are tested where no body can vanish."""
 
 
-def weak_joint(model: pin.Model, low: JointArray, high: JointArray) -> tuple[str, str] | None:
-    """A joint for which M(q) is not positive definite, and why; None if there is none.
+def weak_joints(model: pin.Model, low: JointArray, high: JointArray) -> tuple[list[str], str]:
+    """Joints for which M(q) is not positive definite, and why; none for an arm that can be.
 
     If every body has a positive definite spatial inertia, no velocity leaves all of them at rest, so that M(q) ≻ 0 in
     every pose; then only rounding is tested, at a few poses. Otherwise (point masses, rods) the least eigenvalue of M,
@@ -30,16 +30,16 @@ def weak_joint(model: pin.Model, low: JointArray, high: JointArray) -> tuple[str
         low: Least position of each joint [rad, m].
         high: Largest position of each joint [rad, m].
     """
-    still = _still_joint(model)
-    if still is not None:
-        return still
+    still, problem = _still_joints(model)
+    if still:
+        return still, problem
     data, draws = model.createData(), np.random.default_rng(0)
     poses = [np.clip(np.zeros(model.nv), low, high), *draws.uniform(low, high, (_STARTS, model.nv))]
     masses = [_mass(model, data, q) for q in poses]
     scale = np.sqrt(np.max([np.diag(mass) for mass in masses], axis=0))
     if not np.isfinite(masses).all() or not (scale > 0.0).all():
         weakest = int(np.argmin(np.where(np.isfinite(scale), scale, -1.0)))
-        return model.names[1 + weakest], f"M(q) is not finite and positive definite at q = {_shown(poses[0])}"
+        return [model.names[1 + weakest]], f"M(q) is not finite and positive definite at q = {_shown(poses[0])}"
 
     def least(q: JointArray) -> float:
         return float(np.linalg.eigvalsh(_mass(model, data, q) / scale / scale[:, None])[0])
@@ -50,10 +50,10 @@ def weak_joint(model: pin.Model, low: JointArray, high: JointArray) -> tuple[str
         tested = [_lowest(least, q, low, high) for q in poses]
     worst = min(tested, key=least)
     if least(worst) > _SINGULAR:
-        return None
+        return [], ""
     _, vectors = np.linalg.eigh(_mass(model, data, worst) / scale / scale[:, None])
     joint = int(np.argmax(np.abs(vectors[:, 0])))
-    return model.names[1 + joint], f"M(q) is not finite and positive definite at q = {_shown(worst)}"
+    return [model.names[1 + joint]], f"M(q) is not finite and positive definite at q = {_shown(worst)}"
 
 
 def _lowest(least: Callable[[JointArray], float], q: JointArray, low: JointArray, high: JointArray) -> JointArray:
@@ -64,8 +64,8 @@ def _lowest(least: Callable[[JointArray], float], q: JointArray, low: JointArray
     return np.asarray(minimize(least, q, method="L-BFGS-B", bounds=bounds, options=settings).x)
 
 
-def _still_joint(model: pin.Model) -> tuple[str, str] | None:
-    """A rotary joint about whose axis what it carries has next to no inertia, in whatever pose."""
+def _still_joints(model: pin.Model) -> tuple[list[str], str]:
+    """Rotary joints about whose axes what they carry has next to no inertia, in whatever pose."""
     data = model.createData()
     moments: list[list[float]] = [[] for _ in range(model.nv)]
     totals: list[list[float]] = [[] for _ in range(model.nv)]
@@ -76,10 +76,12 @@ def _still_joint(model: pin.Model) -> tuple[str, str] | None:
             inertia = data.Ycrb[joint].matrix()[3:, 3:]
             moments[joint - 1].append(float(axis @ inertia @ axis) if axis.any() else np.inf)
             totals[joint - 1].append(float(np.trace(inertia)))
-    for name, moment, total in zip(list(model.names)[1:], moments, totals, strict=True):
-        if all(x <= _STILL * y for x, y in zip(moment, total, strict=True)):
-            return name, f"moves no inertia ({max(moment):.2g} kg·m² about its axis)"
-    return None
+    about = {
+        name: max(moment)
+        for name, moment, total in zip(list(model.names)[1:], moments, totals, strict=True)
+        if all(x <= _STILL * y for x, y in zip(moment, total, strict=True))
+    }
+    return list(about), f"moves no inertia ({next(iter(about.values()), 0.0):.2g} kg·m² about its axis)"
 
 
 def _definite(inertia: pin.Inertia) -> bool:

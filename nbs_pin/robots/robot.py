@@ -19,7 +19,7 @@ from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError, RobotError
 from nbs_pin.base.storable import storable
 from nbs_pin.robots.catalogue import find
-from nbs_pin.robots.mass_matrix import weak_joint
+from nbs_pin.robots.mass_matrix import weak_joints
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
 from nbs_pin.robots.urdf_options import read_options
 
@@ -194,8 +194,8 @@ def load_robot(
         name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), or the path of a file.
         gravity: Downward acceleration [m/s²] or a vector in the base frame. None takes the catalogue's, else 9.81.
         lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. None takes the catalogue's list.
-        zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range at zero, or read these as
-            "unlimited", for files that do not state their limits. None takes the catalogue's, else "refuse".
+        zero_limits: "refuse" joints that state no limits, an effort or velocity that is not > 0, or an empty range at
+            zero, or read these as "unlimited". None takes the catalogue's, else "refuse".
         limits: Limits in place of the file's, by joint ("*" for all) and by "lower", "upper" [rad, m], "effort"
             [N·m, N] and "velocity" [rad/s, m/s]; None for no limit.
         repair: Take the nearest inertia that a rigid body can have where the file states one that none has.
@@ -273,11 +273,12 @@ def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
 
 def _check_inertia(robot: Robot) -> None:
     """Raise RobotError unless M(q) ≻ 0 in every pose within the limits."""
-    found = weak_joint(robot.model, *robot.sampling_range)
-    if found is None:
+    names, problem = weak_joints(robot.model, *robot.sampling_range)
+    if not names:
         return
-    name, problem = found
-    axis = ET.fromstring(robot.urdf.xml).find(f"joint[@name='{name}']/axis") if "'" not in name else None
-    own = "" if axis is not None else "; it states no <axis>, which URDF reads as 1 0 0"
-    remedy = f"give the links behind it inertia about its axis, or lock it ({option('lock', [name])})"
-    raise RobotError(f"{robot.urdf.path}: joint '{name}': {problem}{own}; {remedy}.")
+    joints = ET.fromstring(robot.urdf.xml).findall("joint")
+    own = next((joint for joint in joints if joint.get("name") == names[0]), None)
+    unsaid = own is not None and own.find("axis") is None
+    problem += "; it states no <axis>, which URDF reads as 1 0 0" if unsaid else ""
+    remedy = f"give the links behind it inertia about its axis, or lock it ({option('lock', names)})"
+    raise RobotError(f"{robot.urdf.path}: joint '{names[0]}': {problem}; {remedy}.")

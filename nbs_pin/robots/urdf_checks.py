@@ -134,17 +134,17 @@ def read_limits(joint: Joint, options: UrdfOptions) -> Limits:
     """The limits of a joint: those given in `options.limits`, else those that it states.
 
     A continuous joint has no position limits and may omit the others; every other moving joint must state all four.
-    `zero_limits`: "refuse" a zero effort or velocity and an empty range at zero, or read these zeros as "unlimited".
-    URDF reads a lower or upper limit that is left out as 0.
+    `zero_limits`: "refuse" no limits, an effort or velocity ≤ 0 and an empty range at zero, or read these as
+    "unlimited". URDF reads a lower or upper limit that is left out as 0.
     """
     given = {key: options.limit(joint.name, key) for key in LIMITS}
     limit = joint.node.child("limit")
     if limit is None:
-        if joint.kind == "continuous":
+        if joint.kind == "continuous" or options.zero_limits == "unlimited":
             return _checked(joint.node, joint, given, Limits(-math.inf, math.inf, math.inf, math.inf), options)
         if None in given.values():
-            remedy = f"add <limit …/>, give them ({_example(joint, dict.fromkeys(LIMITS))}) or make it continuous"
-            raise joint.node.refuse(f"{joint.kind} joint without <limit>", remedy)
+            remedy = f"add <limit …/>, or give them ({_example(joint, dict.fromkeys(LIMITS))})"
+            raise joint.node.refuse(f"{joint.kind} joint without <limit>", remedy + _open("it has none"))
         return _checked(joint.node, joint, given, Limits(0.0, 0.0, 0.0, 0.0), options)
     effort, velocity = (_strength(limit, key, joint, given[key], options) for key in ("effort", "velocity"))
     if joint.kind == "continuous":
@@ -165,8 +165,11 @@ def _checked(node: Node, joint: Joint, given: dict[str, float | None], stated: L
         sign = ">" if lower > upper else "="
         problem = f"limit lower {lower:g} {sign} upper {upper:g}"
         problem += f" ({' and '.join(absent)} left out, which URDF reads as 0)" if absent else ""
-        remedy = f"give lower < upper ({_example(joint, {'lower': -3.14, 'upper': 3.14})}) or lock the joint"
-        raise node.refuse(problem, remedy + (_open() if lower == upper == 0.0 else ""))
+        locked = option("lock", {joint.name: lower} if lower == upper != 0.0 else [joint.name])
+        remedy = (
+            f"give lower < upper ({_example(joint, {'lower': -3.14, 'upper': 3.14})}), or lock the joint ({locked})"
+        )
+        raise node.refuse(problem, remedy + (_open("0 means no limit") if lower == upper == 0.0 else ""))
     for key, value in (("lower", lower), ("upper", upper)):
         if key not in node.element.attrib and given[key] is None and math.isfinite(value):
             text = f"{node.place}: {joint.node.owner}: <limit> states no {key}, which URDF reads as 0"
@@ -182,8 +185,8 @@ def _example(joint: Joint, limits: dict[str, float | None]) -> str:
     return option("limits", {joint.name: {key: BLANK if x is None else x for key, x in limits.items()}})
 
 
-def _open() -> str:
-    return f", or {option('zero_limits', 'unlimited')} if 0 means no limit"
+def _open(because: str) -> str:
+    return f", or {option('zero_limits', 'unlimited')} if {because}"
 
 
 def read_friction(joint: Joint) -> tuple[float, float]:
@@ -296,9 +299,9 @@ def _strength(limit: Node, key: str, joint: Joint, given: float | None, options:
     """The effort or velocity limit: > 0, or inf if there is none."""
     free = joint.kind == "continuous" or options.zero_limits == "unlimited" or given is not None
     value = limit.number(key, math.inf if free else None)
-    if given is not None or (value == 0.0 and options.zero_limits == "unlimited"):
+    if given is not None or (value <= 0.0 and options.zero_limits == "unlimited"):
         return math.inf if given is None else given
     if value <= 0.0:
         remedy = f"state the drive's {key} ({_example(joint, {key: None})})"
-        raise limit.refuse(f"limit {key} '{value:g}' is not > 0", remedy + (_open() if value == 0.0 else ""))
+        raise limit.refuse(f"limit {key} '{value:g}' is not > 0", remedy + _open(f"{value:g} means no limit"))
     return value

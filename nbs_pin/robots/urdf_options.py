@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias, get_args
 from nbs_pin.base.exceptions import ArgumentError
 
 ZeroLimits: TypeAlias = Literal["refuse", "unlimited"]
-"""How to treat a zero effort, a zero velocity or an empty range at zero, stated or left out."""
+"""How to treat limits that are left out, an effort or velocity that is not > 0 and an empty range at zero."""
 ZERO_LIMITS: tuple[ZeroLimits, ...] = get_args(ZeroLimits)
 InertiaFrom: TypeAlias = Literal["file", "shapes"]
 """Whether bodies without mass are refused, or filled with material."""

@@ -21,6 +21,8 @@ MAX_DEPTH = 128
 """Deepest nesting of XML elements."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_LATE = re.compile(rb"(\s+)<\?xml[^>]*\?>")
+"""A declaration that is not at the start, which XML does not allow and readers of URDF pass over."""
 _FOREIGN = {"xacro": 'declare xmlns:xacro="http://www.ros.org/wiki/xacro"', "xinclude": "insert the included text"}
 
 
@@ -147,6 +149,8 @@ def parse(data: bytes, label: str, files: list[str] | None = None, *, expanded: 
     They must be UTF-8 without DTD, entity or (if `expanded`) xacro and XInclude, within MAX_BYTES and MAX_DEPTH.
     """
     _check_text(data, label)
+    late = _LATE.match(data)
+    data = late[1] + data[late.end() :] if late else data
     builder = _Builder(label, files)
     parser = DefusedXMLParser(target=builder, encoding="utf-8", forbid_dtd=True)
     builder.expat = parser.parser
