@@ -371,6 +371,35 @@ def test_packages_are_found_for_xacro_and_meshes_alike(where, tmp_path, monkeypa
     assert again.sha256 == arm.sha256
 
 
+def test_a_folder_without_a_name_is_taken_for_the_package_of_its_file(tmp_path):
+    folder = tmp_path / "src" / "repository" / "copied" / "urdf"
+    folder.mkdir(parents=True)
+    (folder / "body.xacro").write_text(BODY)
+    path = write(
+        folder, TOP.replace("$(find pieces)/", "$(find pieces)/urdf/").replace("$(arg mass)", "2"), "arm.xacro"
+    )
+    with pytest.warns(
+        UserWarning, match="package 'pieces' was not found and is taken to be .*copied, which has no pack"
+    ):
+        assert load_robot(path).nv == 1
+    (folder / "body.xacro").unlink()
+    with pytest.raises(RobotError, match=r"package 'pieces' was not found.*package_dirs=…"):
+        load_robot(path)
+
+
+def test_an_argument_whose_value_leads_nowhere_is_named(tmp_path):
+    text = TOP.replace("$(find pieces)/body.xacro", "config/$(arg kind)/body.xacro")
+    declared = '<xacro:arg name="kind" default="ur5x"/><xacro:arg name="other" default="1"/><xacro:include'
+    path = write(
+        tmp_path, text.replace("<xacro:include", declared).replace('name="two"', 'name="$(arg kind)"'), "arm.xacro"
+    )
+    with pytest.raises(RobotError, match=r"No such file.*arguments, kind = 'ur5x': set them by xacro_args=…"):
+        load_robot(path)
+    (tmp_path / "config" / "ur5e").mkdir(parents=True)
+    (tmp_path / "config" / "ur5e" / "body.xacro").write_text(BODY)
+    assert load_robot(path, xacro_args={"kind": "ur5e", "mass": 1}).name == "ur5e"
+
+
 def test_a_missing_package_is_named_with_the_option_for_it(tmp_path):
     path = package(tmp_path / "src" / "repository" / "nested" / "top", "top", arm__xacro=TOP) / "arm.xacro"
     for _ in range(2):

@@ -65,13 +65,15 @@ def find_mesh(uri: str, packages: Packages) -> Path:
     path = own / unquote(rest)
     if scheme == "package":
         name, _, inner = unquote(rest).partition("/")
-        folder = packages.find(name)
-        if folder is None:
+        found, assumed = packages.find(name), packages.assume()
+        if found is None and assumed is not None and (assumed / inner).is_file():
+            found = assumed
+        if found is None:
             raise PackageMissing(
                 f"package '{shorten(name)}' was not found near {packages.file} nor on ROS_PACKAGE_PATH or "
                 f"AMENT_PREFIX_PATH: give the folder it lies in, {option('package_dirs', BLANK)}."
             )
-        roots, path = [folder.resolve(), *roots], folder / inner
+        roots, path = [found.resolve(), *roots], found / inner
     resolved = path.resolve()
     if not any(resolved.is_relative_to(root) for root in roots):
         remedy = f"give the folder of its package, {option('package_dirs', BLANK)}"

@@ -44,6 +44,10 @@ class Packages:
             self._found[name] = next(self._candidates(name), None)
         return self._found[name]
 
+    def assume(self) -> Path | None:
+        """The folder of a package that is not found but may be the file's own: `around`, unless that has a name."""
+        return None if (self.around / "package.xml").is_file() else self.around
+
     def _candidates(self, name: str) -> Iterator[Path]:
         if not name or "/" in name or "\\" in name or name in (".", ".."):
             return

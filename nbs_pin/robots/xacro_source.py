@@ -5,6 +5,7 @@ xacro evaluates expressions and reads files and environment variables: expand on
 
 import re
 import threading
+import warnings
 import xml.dom.minidom
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from nbs_pin.base.doors import option
+from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import MissingExtra, RobotError
 from nbs_pin.robots.packages import Packages
 
@@ -44,6 +45,12 @@ def expand(path: Path, arguments: Mapping[str, str], packages: Packages) -> tupl
             document = xacro.process_file(str(path), mappings={**_of_root(path), **arguments})
         except Exception as error:  # xacro evaluates Python, which can raise any exception
             raise RobotError(_sentence(path, error, missing, packages, arguments)) from error
+    own = packages.assume()
+    if missing and own is not None and any(Path(file).is_relative_to(own) for file in files[1:]):
+        text = f"{path}: package {', '.join(map(repr, missing))} was not found and is taken to be {own}"
+        warnings.warn(
+            f"{text}, which has no package.xml; give another by {option('package_dirs', BLANK)}.", stacklevel=2
+        )
     expanded: str = document.documentElement.toxml()
     return expanded.encode(), files
 
@@ -68,7 +75,8 @@ def _hooks(xacro: Any, files: list[str], missing: list[str], packages: Packages)
         folder = packages.find(package)
         if folder is None and package not in missing:
             missing.append(package)
-        return _MISSING + package if folder is None else str(folder)
+        own = packages.assume()
+        return str(folder or own or _MISSING + package)
 
     xacro.parse, substitution._eval_find, substitution._eval_dict["find"] = marked, located, located
     try:
@@ -94,11 +102,11 @@ def _sentence(
     """What was wrong and what to do, in one sentence."""
     chain = list(_chain(error))
     reason = " ".join(str(chain[-1]).split()) or type(chain[-1]).__name__
-    lost = [name for name in missing if _MISSING + name in f"{error}"]
+    lost = [name for name in missing if str(packages.assume() or _MISSING + name) in f"{error}"]
     if lost:
         return (
             f"{path}: xacro cannot expand it: package '{lost[0]}' was not found in or beside {packages.around}, nor on "
-            f"ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; give the folder it lies in: {option('package_dirs', '…')}."
+            f"ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; give the folder it lies in: {option('package_dirs', BLANK)}."
         )
     stated = _arguments(path)
     if any(type(part).__name__ == "ArgException" for part in chain):
@@ -108,8 +116,11 @@ def _sentence(
         plural, listed = "arguments" if len(names) > 1 else "argument", ", ".join(f"'{name}'" for name in names)
         values = dict.fromkeys(names, "VALUE")
         return f"{path}: xacro needs the {plural} {listed}; give a value: {option('xacro_args', values)}."
-    settable = ", ".join(f"{name} = '{default}'" for name, default in stated.items())
-    remedy = f"; its arguments are {settable}: set them by {option('xacro_args', '…')}" if stated else "; fix the file"
+    guilty = {name: text for name, text in stated.items() if text in re.split(r"[/'\s]", reason)} or stated
+    settable = ", ".join(f"{name} = '{text}'" for name, text in list(guilty.items())[:6])
+    remedy = (
+        f"; it has arguments, {settable}: set them by {option('xacro_args', BLANK)}" if stated else "; fix the file"
+    )
     return f"{path}: xacro cannot expand it ({reason}){remedy}."
 
 
