@@ -3,13 +3,23 @@
 An error of the library reaches its reader at one of two doors, and its remedy must be one that can be typed there.
 """
 
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 _FLAGS = {"xacro_args": "--arg", "package_dirs": "--package-dir"}
 """Flags that are not called like the argument: they are given once for each value."""
-BLANK = "…"
+
+
+class _Blank(str):
+    """Three dots, without quotation marks wherever they stand."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+BLANK = _Blank("…")
 """A value that the reader knows."""
 _doors = ["python"]
 
@@ -21,12 +31,15 @@ def option(name: str, value: Any) -> str:
     as in elbow.effort=50 for limits.
     """
     if _doors[-1] == "python":
-        return f"{name}={value if value == BLANK else repr(value)}"
+        return f"{name}={value!r}"
     flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")
     if name == "xacro_args":
         values = {"NAME": "VALUE"} if value == BLANK else value
-        return " ".join(f"{flag} {key}:={item}" for key, item in values.items())
-    return flag if value is True else f"{flag} {_typed(value)}"
+        return " ".join(f"{flag} {_quoted(f'{key}:={item}')}" for key, item in values.items())
+    if value is True:
+        return flag
+    typed = _quoted(_typed(value))
+    return f"{flag}={typed}" if typed.startswith("-") else f"{flag} {typed}"
 
 
 @contextmanager
@@ -39,6 +52,12 @@ def at_the_shell() -> Iterator[None]:
         _doors.pop()
 
 
+def _quoted(text: str) -> str:
+    """The text as one word of the shell; dots that stand for a value are left as they are."""
+    plain = text.replace(BLANK, "x").replace("*", "x" if BLANK in text else "*")
+    return text if shlex.quote(plain) == plain else shlex.quote(text)
+
+
 def _typed(value: Any) -> str:
     if isinstance(value, Mapping):
         parts: list[str] = []
@@ -46,6 +65,6 @@ def _typed(value: Any) -> str:
             if isinstance(item, Mapping):
                 parts += [f"{name}.{key}={x}" for key, x in item.items()]
             else:
-                parts.append(f"{name}={item:g}" if item else name)
+                parts.append(f"{name}={item}" if item else name)
         return ",".join(parts)
     return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

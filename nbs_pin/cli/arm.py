@@ -8,6 +8,7 @@ import tyro
 
 from nbs_pin.cli.values import OptionError, default, plain_number, plain_numbers, text
 
+_FLAGS = {"xacro_args": "arg", "package_dirs": "package-dir"}
 _LIMITS = ("lower", "upper", "effort", "velocity")
 
 
@@ -72,12 +73,19 @@ def _checked(read: Callable[[str], Any]) -> Callable[[list[str]], str]:
 class ArmOptions:
     """How the description of an arm is read where it leaves something open."""
 
-    lock: Annotated[str | None, text("J1,J2=POSITION,…", _checked(_read_lock)), default("none")] = None
-    """Joints to fix at 0, or at a position [rad, m]: --lock finger_left,finger_right=0.02."""
+    lock: Annotated[
+        tyro.conf.UseAppendAction[tuple[Annotated[str, text("J1,J2=POSITION,…", _checked(_read_lock))], ...]],
+        default("the catalogue's"),
+    ] = ()
+    """Joints to fix at 0, or at a position [rad, m]: --lock finger_left,finger_right=0.02; may be repeated."""
     zero_limits: Literal["refuse", "unlimited"] | None = None
     """Limits that are left out, not above 0, or an empty range at 0: refuse them, or read them as no limit."""
-    limits: Annotated[str | None, text("J1.LIMIT=VALUE,…", _checked(_read_limits)), default("the file's")] = None
-    """Limits in place of the file's, * for every joint, inf for none: --limits elbow.effort=50,*.velocity=2."""
+    limits: Annotated[
+        tyro.conf.UseAppendAction[tuple[Annotated[str, text("J1.LIMIT=VALUE,…", _checked(_read_limits))], ...]],
+        default("the file's"),
+    ] = ()
+    """Limits in place of the file's, * for every joint, inf for none: --limits elbow.effort=50,*.velocity=2; may be
+    repeated."""
     repair: bool = False
     """Take the nearest inertia of a rigid body where the file states one that no body has."""
     inertia_from: Literal["file", "shapes"] = "file"
@@ -91,12 +99,18 @@ class ArmOptions:
     )
     """Gravity [m/s²], downward or as a vector in the base frame: --gravity=0,0,9.81 for an arm on the ceiling."""
 
+    def refuse_without_arm(self, remedy: str) -> None:
+        """Raise OptionError if any of them was given to a command that loads no arm."""
+        if self.given():
+            flags = " and ".join(f"--{_FLAGS.get(name, name).replace('_', '-')}" for name in self.given())
+            raise OptionError(f"{flags} was given, but no arm is loaded here; {remedy}.")
+
     def given(self) -> dict[str, Any]:
         """The arguments of `load_robot` that were given."""
         given = {
-            "lock": None if self.lock is None else _read_lock(self.lock),
+            "lock": _read_lock(",".join(self.lock)) if self.lock else None,
             "zero_limits": self.zero_limits,
-            "limits": None if self.limits is None else _read_limits(self.limits),
+            "limits": _read_limits(",".join(self.limits)) if self.limits else None,
             "repair": self.repair or None,
             "inertia_from": None if self.inertia_from == "file" else self.inertia_from,
             "xacro_args": dict(map(_read_argument, self.arg)) or None,

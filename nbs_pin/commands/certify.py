@@ -71,6 +71,8 @@ def _controller(options: Certify) -> LyapunovLaw:
     if name.endswith(SAVED) and options.feed_friction:
         raise OptionError(f"--feed-friction is for a law built here, and '{name}' holds one; omit it.")
     if name.endswith(SAVED):
+        if options.against is None:
+            options.arm.refuse_without_arm(f"'{name}' names its arm; omit it")
         law: Any = load(name)
     else:
         robot = load_robot(name, **options.arm.given())

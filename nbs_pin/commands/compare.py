@@ -43,6 +43,8 @@ _PRINTED = {"mass_matrix": "M", "coriolis": "C v", "gravity": "G", "inverse": "t
 def run(options: Compare, console: Console, notes: Console) -> None:
     """Compare, write and print; raises NbsPinError or OSError."""
     with notes.status(f"loading {options.model}"):
+        if options.model.endswith(SAVED) and options.against is None:
+            options.arm.refuse_without_arm(f"'{options.model}' names its arm; give it with --against")
         model = model_of(options.model, **options.arm.given())
         robot = _arm(options, model)
         region = _region(options, robot)

@@ -21,6 +21,8 @@ def arm_of(options: Track | Train) -> Robot:
     given = options.arm.given()
     if options.no_effort_limit or options.effort_limit is not None:
         limits = given.get("limits", {})
+        if any("effort" in stated for stated in limits.values()):
+            raise OptionError("--limits states an effort, and --effort-limit or --no-effort-limit another; choose one.")
         effort = {"effort": options.effort_limit or math.inf}
         given["limits"] = {**limits, ALL: {**limits.get(ALL, {}), **effort}}
     return load_robot(options.robot, **given)

@@ -31,6 +31,8 @@ _ENDED = {"held out": "no further progress on held-out data", "iterations": "all
 def run(options: Learn, console: Console, notes: Console) -> None:
     """Learn, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     with notes.status(f"loading {options.data}"):
+        if options.robot is None:
+            options.arm.refuse_without_arm("give the arm with --robot")
         data, robot = data_and_arm(options.data, options.robot, **options.arm.given())
     name = options.data.stem if robot is None else robot.name
     # Data are identified by their fingerprint, not by their path.

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.doors import option
+from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.packages import Packages
-from nbs_pin.robots.urdf_checks import Joint, check_origin
+from nbs_pin.robots.urdf_checks import Joint, check_origin, lock_too
 from nbs_pin.robots.urdf_options import UrdfOptions
 from nbs_pin.robots.urdf_source import Node
 
@@ -41,14 +42,13 @@ def check_bodies(robot: Node, joints: list[Joint], options: UrdfOptions, package
         links[name].append(link)
     empty = [joint for joint in joints if joint.moves and mass[joint.child] == 0.0]
     if options.inertia_from == "shapes":
-        _fill(empty, links, packages)
-        empty = [joint for joint in empty if not any(link.child("inertial") for link in links[joint.child])]
+        empty = _fill(empty, links, packages)
     if empty:
         joint, names = empty[0], [joint.name for joint in empty]
         problem = f"moves link '{joint.child}', which has no mass (M would be singular)"
-        remedy = (
-            f"give link '{joint.child}' an <inertial> with mass > 0, lock what moves none ({option('lock', names)})"
-        )
+        remedy = f"give link '{joint.child}' an <inertial> with mass > 0"
+        if len(names) < sum(joint.moves for joint in joints):
+            remedy += f", lock what moves none ({lock_too(options, names)})"
         if options.inertia_from != "shapes":
             remedy += f", or take the inertia of its shapes as a guess ({option('inertia_from', 'shapes')})"
         raise joint.node.refuse(problem, remedy)
@@ -59,11 +59,11 @@ def nearest_body(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
 
     A body has an inertia I exactly if its second moments Σ = ½ tr(I)·1 − I are positive semidefinite: this is the
     condition on its pseudo-inertia for a given mass and centre. Σ is projected to the nearest positive semidefinite
-    matrix in the Frobenius norm, and kept off the boundary by a millionth of its largest eigenvalue.
+    matrix in the Frobenius norm, and kept off the boundary by 3e-5 of its largest eigenvalue: six digits suffice.
     """
     second = 0.5 * np.trace(inertia) * np.eye(3) - inertia
     values, vectors = np.linalg.eigh(second)
-    second = (vectors * np.maximum(values, 1e-6 * max(values[-1], 0.0))) @ vectors.T
+    second = (vectors * np.maximum(values, 3e-5 * max(values[-1], 0.0))) @ vectors.T
     return np.asarray(np.trace(second) * np.eye(3) - second)
 
 
@@ -76,15 +76,11 @@ def _mass(link: Node, *, welded: bool, repair: bool) -> float:
     inertial = link.child("inertial")
     if inertial is None:
         return 0.0
-    check_origin(inertial)
-    mass = inertial.need("mass").number("value", least=0.0)
-    node = inertial.need("inertia")
-    xx, xy, xz, yy, yz, zz = (node.number(key) for key in _INERTIA)
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    problem = _fault(mass, inertia)
-    if welded and (problem or 0.0 < mass < _NEGLECTED or (mass == 0.0 and inertia.any())):
+    if welded and not _sound(inertial):
         link.element.remove(inertial.element)
         return 0.0
+    mass, inertia = _stated(inertial)
+    node, problem = inertial.need("inertia"), _fault(mass, inertia)
     if mass == 0.0 and inertia.any():
         problem = "mass value '0' is not > 0 though inertia is stated"
         if not repair:
@@ -100,15 +96,32 @@ def _mass(link: Node, *, welded: bool, repair: bool) -> float:
         )
     if problem:
         nearest = nearest_body(inertia)
-        numbers = dict(zip(_INERTIA, nearest[np.triu_indices(3)].tolist(), strict=True))
-        listed = " ".join(f'{key}="{value:.6g}"' for key, value in numbers.items())
+        digits = [f"{value:.6g}" for value in nearest[np.triu_indices(3)]]
+        listed = " ".join(f'{key}="{text}"' for key, text in zip(_INERTIA, digits, strict=True))
         if not repair or not nearest.any():
             remedy = f"the nearest body has <inertia {listed}/>: write it, or take it ({option('repair', True)})"
             raise node.refuse(problem, remedy if nearest.any() else "fix <inertia …>")
         warnings.warn(f"{node.place}: {node.owner}: {problem}; taken as <inertia {listed}/>.", stacklevel=2)
-        for key, value in numbers.items():
-            node.element.set(key, repr(value))
+        for key, text in zip(_INERTIA, digits, strict=True):
+            node.element.set(key, repr(float(text)))
     return mass
+
+
+def _stated(inertial: Node) -> tuple[float, Float[np.ndarray, "3 3"]]:
+    """Mass [kg] and inertia [kg·m²] of an <inertial>."""
+    check_origin(inertial)
+    mass, node = inertial.need("mass").number("value", least=0.0), inertial.need("inertia")
+    xx, xy, xz, yy, yz, zz = (node.number(key) for key in _INERTIA)
+    return mass, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _sound(inertial: Node) -> bool:
+    """Whether engines take an inertia."""
+    try:
+        mass, inertia = _stated(inertial)
+    except RobotError:
+        return False
+    return not _fault(mass, inertia) and (mass >= _NEGLECTED or not (mass or inertia.any())) and mass <= _HEAVIEST
 
 
 def _fault(mass: float, inertia: Float[np.ndarray, "3 3"]) -> str:
@@ -124,18 +137,23 @@ def _fault(mass: float, inertia: Float[np.ndarray, "3 3"]) -> str:
     return ""
 
 
-def _fill(empty: Iterable[Joint], links: dict[str, list[Node]], packages: Packages) -> None:
-    """Give the links of bodies without mass the inertia of their shapes."""
+def _fill(empty: Iterable[Joint], links: dict[str, list[Node]], packages: Packages) -> list[Joint]:
+    """Give the links of bodies without mass the inertia of their shapes; returns the joints that still move none."""
     from nbs_pin.robots.shape_inertia import DENSITY, solid  # trimesh is slow to import, and few arms need it
 
-    guessed = []
+    guessed, left = [], []
     for joint in empty:
-        for link in links[joint.child]:
-            found = solid(link, packages)
-            if found is not None and link.child("inertial") is None:
-                link.element.append(found)
+        found = [(link, solid(link, packages)) for link in links[joint.child]]
+        left += [] if any(inertial is not None for _, inertial in found) else [joint]
+        for link, inertial in found:
+            stated = link.child("inertial")
+            if inertial is not None:
+                if stated is not None:
+                    link.element.remove(stated.element)
+                link.element.append(inertial)
                 guessed.append(link.text("name"))
     if guessed:
         names = ", ".join(f"'{name}'" for name in guessed)
         text = f"the inertias of links {names} are guessed from their shapes, filled with {DENSITY:g} kg/m³"
         warnings.warn(f"{text}; a tracking error or a bound is as good as this guess.", stacklevel=2)
+    return left

@@ -13,17 +13,20 @@ _SINGULAR = 1e-10
 """Smallest eigenvalue of M, relative to the joints' largest inertias, that counts as positive."""
 _STILL = 1e-9
 """Least inertia about a joint's axis, relative to that about its other axes, that counts as one."""
-_STARTS = 12
+_NEGLIGIBLE = 1e-7
+"""A body below this share of what it carries may leave M singular up to rounding."""
+_STARTS = 32
 _FEW = 6
-"""Poses that are tested where no body can vanish."""
+"""Poses that are tested where no body can vanish, and from which one is sought where one can."""
 
 
 def weak_joints(model: pin.Model, low: JointArray, high: JointArray) -> tuple[list[str], str]:
     """Joints for which M(q) is not positive definite, and why; none for an arm that can be.
 
     If every body has a positive definite spatial inertia, no velocity leaves all of them at rest, so that M(q) ≻ 0 in
-    every pose; then only rounding is tested, at a few poses. Otherwise (point masses, rods) the least eigenvalue of M,
-    scaled by the largest inertia of each joint, is minimised over the poses from several starts.
+    every pose; where none is negligible beside what lies behind it, a few poses test the rounding. Otherwise (point
+    masses, rods, dummies) the least eigenvalue of M, scaled by the largest inertia of each joint, is minimised over the
+    poses from several starts; joints without a range are searched over one turn, or 100 m.
 
     Args:
         model: The arm.
@@ -33,7 +36,9 @@ def weak_joints(model: pin.Model, low: JointArray, high: JointArray) -> tuple[li
     still, problem = _still_joints(model)
     if still:
         return still, problem
-    data, draws = model.createData(), np.random.default_rng(0)
+    data, draws, reach = model.createData(), np.random.default_rng(0), _reach(model)
+    low, high = np.where(np.isfinite(low), low, -reach), np.where(np.isfinite(high), high, reach)
+    low, high = np.minimum(low, high - 1e-9), np.maximum(high, low + 1e-9)
     poses = [np.clip(np.zeros(model.nv), low, high), *draws.uniform(low, high, (_STARTS, model.nv))]
     masses = [_mass(model, data, q) for q in poses]
     scale = np.sqrt(np.max([np.diag(mass) for mass in masses], axis=0))
@@ -44,10 +49,10 @@ def weak_joints(model: pin.Model, low: JointArray, high: JointArray) -> tuple[li
     def least(q: JointArray) -> float:
         return float(np.linalg.eigvalsh(_mass(model, data, q) / scale / scale[:, None])[0])
 
-    if all(_definite(inertia) for inertia in list(model.inertias)[1:]):
+    if _definite(model, low, high):
         tested = poses[:_FEW]
     else:
-        tested = [_lowest(least, q, low, high) for q in poses]
+        tested = [_lowest(least, q, low, high) for q in sorted(poses, key=least)[:_FEW]]
     worst = min(tested, key=least)
     if least(worst) > _SINGULAR:
         return [], ""
@@ -84,10 +89,32 @@ def _still_joints(model: pin.Model) -> tuple[list[str], str]:
     return list(about), f"moves no inertia ({next(iter(about.values()), 0.0):.2g} kg·m² about its axis)"
 
 
-def _definite(inertia: pin.Inertia) -> bool:
-    """Whether a body at rest is the only one without kinetic energy."""
-    moments = np.linalg.eigvalsh(inertia.inertia)
-    return bool(inertia.mass > 0.0 and moments[0] > 1e-9 * (moments[-1] + inertia.mass * (inertia.lever**2).sum()))
+def _reach(model: pin.Model) -> JointArray:
+    """How far joints without a range are searched: half a turn, or 100 m [rad, m]."""
+    data = model.createData()
+    return np.array(
+        [np.pi if np.asarray(data.joints[k].S).ravel()[3:].any() else 100.0 for k in range(1, model.njoints)]
+    )
+
+
+def _definite(model: pin.Model, low: JointArray, high: JointArray) -> bool:
+    """Whether every body is positive definite beside what it carries: its inertia beside m·r² of everything behind it.
+
+    r is the largest distance that the bodies behind can have, from the lengths of the links.
+    """
+    mass, reach = np.zeros(model.njoints), np.zeros(model.njoints)
+    slides = _reach(model) > np.pi
+    way = np.where(slides, np.maximum(np.abs(low), np.abs(high)), 0.0)
+    for k in range(model.njoints - 1, 0, -1):
+        body, parent = model.inertias[k], model.parents[k]
+        mass[k] += body.mass
+        reach[k] = max(reach[k], float(np.linalg.norm(body.lever)))
+        least = np.linalg.eigvalsh(body.inertia)[0]
+        if not (body.mass > _NEGLIGIBLE * mass[k] and least > _NEGLIGIBLE * mass[k] * reach[k] ** 2):
+            return False
+        mass[parent] += mass[k]
+        reach[parent] = max(reach[parent], reach[k] + way[k - 1] + np.linalg.norm(model.jointPlacements[k].translation))
+    return True
 
 
 def _mass(model: pin.Model, data: Any, q: JointArray) -> Float[np.ndarray, "n n"]:

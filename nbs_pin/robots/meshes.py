@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.catalogue import example_robot_share
-from nbs_pin.robots.packages import Packages
+from nbs_pin.robots.packages import MISSING, Packages, is_file
 from nbs_pin.robots.urdf_source import shorten
 
 SUFFIXES = (".stl", ".obj", ".dae")
@@ -31,10 +31,6 @@ Color = tuple[float, float, float, float]
 
 class MeshError(RobotError):
     """A mesh that cannot be drawn; names the reason and the remedy."""
-
-
-class PackageMissing(MeshError):
-    """The package of a mesh is not found, one cause for all its meshes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +52,8 @@ def find_mesh(uri: str, packages: Packages) -> Path:
         MeshError: For another scheme, suffix or folder, or a missing file.
     """
     scheme, _, rest = uri.replace("\\", "/").rpartition("://")
+    if MISSING in rest:
+        scheme, rest = "package", rest.partition(MISSING)[2]
     if scheme not in ("", "file", "package"):
         raise MeshError(f"mesh '{uri}' is not a file on this machine: give a relative or package:// path.")
     if Path(rest).suffix.lower() not in SUFFIXES:
@@ -66,19 +64,22 @@ def find_mesh(uri: str, packages: Packages) -> Path:
     if scheme == "package":
         name, _, inner = unquote(rest).partition("/")
         found, assumed = packages.find(name), packages.assume()
-        if found is None and assumed is not None and (assumed / inner).is_file():
+        if found is None and assumed is not None and is_file(assumed / inner):
             found = assumed
         if found is None:
-            raise PackageMissing(
+            raise MeshError(
                 f"package '{shorten(name)}' was not found near {packages.file} nor on ROS_PACKAGE_PATH or "
                 f"AMENT_PREFIX_PATH: give the folder it lies in, {option('package_dirs', BLANK)}."
             )
         roots, path = [found.resolve(), *roots], found / inner
-    resolved = path.resolve()
-    if not any(resolved.is_relative_to(root) for root in roots):
+    try:
+        resolved = path.resolve()
+    except (OSError, ValueError) as error:
+        raise MeshError(f"mesh '{shorten(uri)}' has no usable name ({error}): correct it.") from error
+    if not any(resolved.is_relative_to(root) for root in roots) and not packages.holds(resolved):
         remedy = f"give the folder of its package, {option('package_dirs', BLANK)}"
         raise MeshError(f"mesh '{uri}' leaves the robot's folder {roots[0]}: {remedy}.")
-    if not resolved.is_file():
+    if not is_file(resolved):
         raise MeshError(f"mesh '{uri}' was not found at {resolved}: check the path or {option('package_dirs', BLANK)}.")
     return resolved
 

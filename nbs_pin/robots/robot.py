@@ -92,7 +92,8 @@ class Robot:
     def sampling_range(self) -> tuple[JointArray, JointArray]:
         """(lower, upper) for sampling configurations [rad, m]: the position limits, ∓π where there is none."""
         lower, upper = self.lower, self.upper
-        return np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
+        low = np.where(np.isfinite(lower), lower, np.minimum(-np.pi, upper - 2.0 * np.pi))
+        return low, np.where(np.isfinite(upper), upper, np.maximum(np.pi, lower + 2.0 * np.pi))
 
     @property
     def one_turn_range(self) -> tuple[JointArray, JointArray]:
@@ -273,12 +274,14 @@ def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
 
 def _check_inertia(robot: Robot) -> None:
     """Raise RobotError unless M(q) ≻ 0 in every pose within the limits."""
-    names, problem = weak_joints(robot.model, *robot.sampling_range)
+    names, problem = weak_joints(robot.model, robot.lower, robot.upper)
     if not names:
         return
     joints = ET.fromstring(robot.urdf.xml).findall("joint")
     own = next((joint for joint in joints if joint.get("name") == names[0]), None)
     unsaid = own is not None and own.find("axis") is None
     problem += "; it states no <axis>, which URDF reads as 1 0 0" if unsaid else ""
-    remedy = f"give the links behind it inertia about its axis, or lock it ({option('lock', names)})"
-    raise RobotError(f"{robot.urdf.path}: joint '{names[0]}': {problem}; {remedy}.")
+    remedy = f"{'add <axis xyz=…>, ' if unsaid else ''}give the links behind it inertia about its axis"
+    raise RobotError(
+        f"{robot.urdf.path}: joint '{names[0]}': {problem}; {remedy}, or lock it ({option('lock', names)})."
+    )

@@ -11,6 +11,8 @@ from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.urdf_checks import check_origin
 from nbs_pin.robots.urdf_source import Node
 
+LONGEST = 100.0
+"""Longest extent of a shape [m]."""
 DENSITY = 1000.0
 """Density that MuJoCo fills shapes with as well [kg/m³]."""
 
@@ -35,19 +37,19 @@ def _bodies(shape: Node, packages: Packages) -> list[pin.Inertia]:
     zero = (0.0, 0.0, 0.0)
     xyz, rpy = (zero if origin is None else origin.numbers(key, 3, zero) for key in ("xyz", "rpy"))
     frame = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
-    return [frame.act(_inertia(mesh)) for mesh in _meshes(geometry, packages) if mesh.volume > 0.0]
+    return [frame.act(_inertia(mesh)) for mesh in _meshes(geometry, packages)]
 
 
 def _meshes(geometry: Node, packages: Packages) -> list[trimesh.Trimesh]:
     """The shapes of a <geometry>; those of a mesh file with its scale."""
     box, cylinder, sphere, mesh = (geometry.child(tag) for tag in ("box", "cylinder", "sphere", "mesh"))
     if box is not None:
-        return [trimesh.creation.box(box.numbers("size", 3))]
+        return [trimesh.creation.box([_size(box, "size", x) for x in box.numbers("size", 3)])]
     if cylinder is not None:
-        radius, length = (cylinder.number(key, least=0.0) for key in ("radius", "length"))
+        radius, length = (_size(cylinder, key, cylinder.number(key)) for key in ("radius", "length"))
         return [trimesh.creation.cylinder(radius, length, sections=96)]
     if sphere is not None:
-        return [trimesh.creation.icosphere(subdivisions=5, radius=sphere.number("radius", least=0.0))]
+        return [trimesh.creation.icosphere(subdivisions=5, radius=_size(sphere, "radius", sphere.number("radius")))]
     if mesh is None:
         return []
     scale = np.array(mesh.numbers("scale", 3, (1.0, 1.0, 1.0)))
@@ -60,7 +62,19 @@ def _meshes(geometry: Node, packages: Packages) -> list[trimesh.Trimesh]:
     counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + first for part, first in zip(parts, counts, strict=False)])
     whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), faces)
-    return [whole if whole.is_watertight else whole.convex_hull]
+    if (
+        not np.abs(whole.vertices).max() <= LONGEST
+        or np.linalg.matrix_rank(np.ptp(whole.vertices, axis=0) * np.eye(3)) < 3
+    ):
+        raise mesh.refuse("its inertia cannot be guessed: it is flat or too large", "give the link an <inertial>")
+    return [whole if whole.is_volume else whole.convex_hull]
+
+
+def _size(shape: Node, key: str, value: float) -> float:
+    """The size of a shape; raises RobotError unless it encloses a volume that an arm can have."""
+    if not 0.0 < value <= LONGEST:
+        raise shape.refuse(f"{key} {value:g} m encloses no volume of an arm", "give the link an <inertial>")
+    return value
 
 
 def _inertia(mesh: trimesh.Trimesh) -> pin.Inertia:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from nbs_pin.robots.bodies import check_bodies
 from nbs_pin.robots.packages import Packages
-from nbs_pin.robots.urdf_checks import Joint, check_axis, check_tree, read_friction, read_limits
+from nbs_pin.robots.urdf_checks import Joint, check_axis, check_tree
+from nbs_pin.robots.urdf_limits import Limits, read_friction, read_limits
 from nbs_pin.robots.urdf_options import LIMITS, UrdfOptions
 from nbs_pin.robots.urdf_source import read_source
 
@@ -71,18 +72,18 @@ def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
     robot.element.set("name", robot.element.get("name", path.stem))
     joints = check_tree(robot, options)
     check_bodies(robot, joints, options, packages)
-    moving = tuple(_settle(joint, options) for joint in joints if joint.moves)
+    limits = read_limits(joints, options)
+    moving = tuple(_settle(joint, limits[joint.name], options) for joint in joints if joint.moves)
     return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving)
 
 
-def _settle(joint: Joint, options: UrdfOptions) -> JointData:
+def _settle(joint: Joint, limits: Limits, options: UrdfOptions) -> JointData:
     """The data of a moving joint; its element becomes a revolute or prismatic joint that states all limits.
 
     An effort or velocity limit given in place of the file's is not written into it: the description, and with it
     `Robot.sha256`, stays that of the file.
     """
     check_axis(joint)
-    limits = read_limits(joint, options)
     damping, friction = read_friction(joint)
     element = joint.node.element
     stated = element.find("limit")
@@ -92,7 +93,8 @@ def _settle(joint: Joint, options: UrdfOptions) -> JointData:
         if not replaced or not float(stated.get(key, "0")) > 0.0:
             stated.set(key, repr(value if math.isfinite(value) else math.copysign(_UNLIMITED, value)))
     element.set("type", "prismatic" if joint.kind == "prismatic" else "revolute")
-    return JointData(joint.name, joint.kind == "continuous", joint.kind == "prismatic", *limits, damping, friction)
+    wrapped = joint.kind == "continuous" and math.isinf(limits.lower) and math.isinf(limits.upper)
+    return JointData(joint.name, wrapped, joint.kind == "prismatic", *limits, damping, friction)
 
 
 def _bare(element: ET.Element) -> ET.Element:

@@ -9,14 +9,14 @@ import re
 import warnings
 import xml.etree.ElementTree as ET
 from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from nbs_pin.base.doors import BLANK, option
-from nbs_pin.robots.urdf_options import ALL, LIMITS, UrdfOptions
+from nbs_pin.robots.urdf_options import ALL, UrdfOptions
 from nbs_pin.robots.urdf_source import Node, shorten
 
 MAX_JOINTS = 64
@@ -31,20 +31,9 @@ MOVING = ("revolute", "continuous", "prismatic")
 _UNSUPPORTED = ("floating", "planar")
 _ROUNDING = 1e-6
 """Relative tolerance for numbers that were rounded when the file was written."""
-_FARTHEST, _MOST_TURNED = 100.0, 1e6
-"""Largest distance [m] in an origin, and largest angle or position limit [rad, m], that an arm can have."""
+LONGEST_WAY, MOST_TURNED = 100.0, 1e6
+"""Largest distance [m] and angle [rad] in an origin or a position that an arm can have."""
 _WHEEL = re.compile(r"wheel|caster", re.IGNORECASE)
-_ENDLESS, _MOST = 1e9, 1e39
-"""Position limits between these are read as none: exporters write 1e16, or the largest number of single precision."""
-
-
-class Limits(NamedTuple):
-    """Position [rad, m], effort [N·m, N] and velocity [rad/s, m/s] limits of a joint, inf where none is stated."""
-
-    lower: float
-    upper: float
-    effort: float
-    velocity: float
 
 
 @dataclass(frozen=True)
@@ -75,44 +64,73 @@ def check_tree(robot: Node, options: UrdfOptions) -> list[Joint]:
         unknown = [name for name in names if name not in nodes and (argument, name) != ("limits", ALL)]
         if unknown:
             raise robot.refuse(f"no joint '{unknown[0]}' for {argument}", f"the joints are {', '.join(nodes)}")
+    if len(links) > MAX_LINKS:
+        raise robot.refuse(f"too large: {len(links)} links (limit {MAX_LINKS})", "give a smaller arm")
     mimics = _mimics(nodes, options)
+    _check_kinds(nodes, options)
     joints = [_joint(node, name, (mimics | dict(options.lock)).get(name)) for name, node in nodes.items()]
     _check_connected(links, joints)
-    moving = sum(joint.moves for joint in joints)
-    if moving == 0:
+    moving = [joint.name for joint in joints if joint.moves]
+    if not moving:
         raise robot.refuse("0 movable joints", "give an arm (a file with xacro macros must call them)")
-    for what, count, most in (("moving joints", moving, MAX_JOINTS), ("links", len(links), MAX_LINKS)):
-        if count > most:
-            names = [joint.name for joint in joints if joint.moves][most:]
-            remedy = f"lock some ({option('lock', names)})" if what == "moving joints" else "give a smaller arm"
-            raise robot.refuse(f"too large: {count} {what} (limit {most})", remedy)
+    if len(moving) > MAX_JOINTS:
+        problem = f"too large: {len(moving)} moving joints (limit {MAX_JOINTS})"
+        raise robot.refuse(problem, f"lock {len(moving) - MAX_JOINTS} of them ({option('lock', [moving[-1], BLANK])})")
     wheels = [joint for joint in joints if joint.kind == "continuous" and _WHEEL.search(f"{joint.name} {joint.child}")]
     if wheels:
         names = [joint.name for joint in wheels]
         text = f"{wheels[0].node.place}: joints {', '.join(map(repr, names))} look like wheels, and the base is fixed"
-        warnings.warn(f"{text}, so they spin in the air; lock them by {option('lock', names)}.", stacklevel=2)
+        warnings.warn(f"{text}, so they spin in the air; lock them by {lock_too(options, names)}.", stacklevel=2)
     return joints
 
 
+def lock_too(options: UrdfOptions, names: Iterable[str] | Mapping[str, float]) -> str:
+    """`lock` as one gives it to lock further joints than those that are locked already."""
+    places = {**options.lock, **(names if isinstance(names, Mapping) else dict.fromkeys(names, 0.0))}
+    return option("lock", places if any(places.values()) else list(places))
+
+
 def _mimics(nodes: dict[str, Node], options: UrdfOptions) -> dict[str, float]:
-    """Where the joints that mimic another stand when the others are at zero, or where these are locked [rad, m]."""
+    """Where the joints that mimic another stand when the others are at zero, or where these are locked [rad, m].
+
+    A joint whose range excludes zero counts as being at the nearer end.
+    """
     coupled = {name: node.child("mimic") for name, node in nodes.items() if node.element.get("type") in MOVING}
     mimics = {name: node for name, node in coupled.items() if node is not None and name not in options.lock}
-    places = dict(options.lock)
-
-    def place(name: str, seen: tuple[str, ...] = ()) -> float:
-        if name not in mimics or name in seen:
-            return places.get(name, 0.0)
-        node = mimics[name]
-        return node.number("multiplier", 1.0) * place(node.text("joint"), (*seen, name)) + node.number("offset", 0.0)
-
-    found = {name: place(name) for name in mimics}
+    found: dict[str, float] = {}
+    for name, node in mimics.items():
+        factor, place, seen = 1.0, 0.0, {name}
+        while True:
+            source, place = node.text("joint"), place + factor * node.number("offset", 0.0)
+            factor *= node.number("multiplier", 1.0)
+            if source not in nodes:
+                raise node.refuse(f"mimics joint '{shorten(source)}', which is not defined", "fix <mimic joint=…>")
+            if source not in mimics or source in seen:
+                break
+            seen.add(source)
+            node = mimics[source]
+        at = 0.0 if source in seen else options.lock.get(source, _nearest_to_zero(nodes[source]))
+        found[name] = place + factor * at
     if found:
-        stated = ", ".join(f"'{name}' (of '{node.text('joint')}', at {found[name]:g})" for name, node in mimics.items())
-        place_text = next(iter(mimics.values())).place
-        text = f"{place_text}: joints that mimic another are locked: {stated}"
-        warnings.warn(f"{text}; lock them elsewhere by {option('lock', found)}.", stacklevel=2)
+        stated = ", ".join(f"'{name}' (of '{mimics[name].text('joint')}', at {x:g})" for name, x in found.items())
+        text = f"{next(iter(mimics.values())).place}: joints that mimic another are locked: {stated}"
+        remedy = lock_too(options, dict.fromkeys(found, BLANK))
+        warnings.warn(f"{text}; lock them elsewhere by {remedy}.", stacklevel=2)
     return found
+
+
+def _stated_range(node: Node) -> tuple[float, float]:
+    """The position limits in a joint's element [rad, m], none where it states no range."""
+    limit = node.child("limit")
+    if limit is None or node.element.get("type") == "continuous":
+        return -math.inf, math.inf
+    lower, upper = limit.number("lower", 0.0), limit.number("upper", 0.0)
+    return (lower, upper) if lower < upper else (-math.inf, math.inf)
+
+
+def _nearest_to_zero(node: Node) -> float:
+    lower, upper = _stated_range(node)
+    return min(max(0.0, lower), upper)
 
 
 def check_axis(joint: Joint) -> None:
@@ -130,78 +148,11 @@ def check_axis(joint: Joint) -> None:
         axis.element.set("xyz", " ".join(repr(x / length) for x in xyz))
 
 
-def read_limits(joint: Joint, options: UrdfOptions) -> Limits:
-    """The limits of a joint: those given in `options.limits`, else those that it states.
-
-    A continuous joint has no position limits and may omit the others; every other moving joint must state all four.
-    `zero_limits`: "refuse" no limits, an effort or velocity ≤ 0 and an empty range at zero, or read these as
-    "unlimited". URDF reads a lower or upper limit that is left out as 0.
-    """
-    given = {key: options.limit(joint.name, key) for key in LIMITS}
-    limit = joint.node.child("limit")
-    if limit is None:
-        if joint.kind == "continuous" or options.zero_limits == "unlimited":
-            return _checked(joint.node, joint, given, Limits(-math.inf, math.inf, math.inf, math.inf), options)
-        if None in given.values():
-            remedy = f"add <limit …/>, or give them ({_example(joint, dict.fromkeys(LIMITS))})"
-            raise joint.node.refuse(f"{joint.kind} joint without <limit>", remedy + _open("it has none"))
-        return _checked(joint.node, joint, given, Limits(0.0, 0.0, 0.0, 0.0), options)
-    effort, velocity = (_strength(limit, key, joint, given[key], options) for key in ("effort", "velocity"))
-    if joint.kind == "continuous":
-        return _checked(limit, joint, given, Limits(-math.inf, math.inf, effort, velocity), options)
-    lower, upper = (limit.number(key, 0.0) for key in ("lower", "upper"))
-    return _checked(limit, joint, given, Limits(lower, upper, effort, velocity), options)
-
-
-def _checked(node: Node, joint: Joint, given: dict[str, float | None], stated: Limits, options: UrdfOptions) -> Limits:
-    """The limits given, else stated; raises RobotError unless the range is one."""
-    limits = Limits(*(x if given[key] is None else given[key] for key, x in zip(LIMITS, stated, strict=True)))  # type: ignore[arg-type]
-    endless = -_MOST <= limits.lower <= -_ENDLESS and _ENDLESS <= limits.upper <= _MOST
-    lower, upper = (-math.inf, math.inf) if endless else (limits.lower, limits.upper)
-    if options.zero_limits == "unlimited" and lower == upper == 0.0:
-        return Limits(-math.inf, math.inf, limits.effort, limits.velocity)
-    if lower >= upper:
-        absent = [key for key in ("lower", "upper") if key not in node.element.attrib]
-        sign = ">" if lower > upper else "="
-        problem = f"limit lower {lower:g} {sign} upper {upper:g}"
-        problem += f" ({' and '.join(absent)} left out, which URDF reads as 0)" if absent else ""
-        locked = option("lock", {joint.name: lower} if lower == upper != 0.0 else [joint.name])
-        remedy = (
-            f"give lower < upper ({_example(joint, {'lower': -3.14, 'upper': 3.14})}), or lock the joint ({locked})"
-        )
-        raise node.refuse(problem, remedy + (_open("0 means no limit") if lower == upper == 0.0 else ""))
-    for key, value in (("lower", lower), ("upper", upper)):
-        if key not in node.element.attrib and given[key] is None and math.isfinite(value):
-            text = f"{node.place}: {joint.node.owner}: <limit> states no {key}, which URDF reads as 0"
-            warnings.warn(f"{text}; if it is another, give it: {_example(joint, {key: None})}.", stacklevel=2)
-        if math.isfinite(value) and abs(value) > _MOST_TURNED:
-            remedy = f"state the joint's range ({_example(joint, {key: math.copysign(3.14, value)})})"
-            raise node.refuse(f"limit {key} {value:g} is beyond ±{_MOST_TURNED:g}", remedy)
-    return Limits(lower, upper, limits.effort, limits.velocity)
-
-
-def _example(joint: Joint, limits: dict[str, float | None]) -> str:
-    """`limits` as one would give them for a joint, with placeholders for those that are not known."""
-    return option("limits", {joint.name: {key: BLANK if x is None else x for key, x in limits.items()}})
-
-
-def _open(because: str) -> str:
-    return f", or {option('zero_limits', 'unlimited')} if {because}"
-
-
-def read_friction(joint: Joint) -> tuple[float, float]:
-    """Viscous damping [N·m·s/rad] and Coulomb friction [N·m] of the joint, zero where not stated."""
-    dynamics = joint.node.child("dynamics")
-    if dynamics is None:
-        return 0.0, 0.0
-    return dynamics.number("damping", 0.0, least=0.0), dynamics.number("friction", 0.0, least=0.0)
-
-
 def check_origin(node: Node) -> None:
     """Check that the placement of a joint or inertia, where stated, is six finite numbers."""
     origin = node.child("origin")
     if origin is not None:
-        for key, most, unit in (("xyz", _FARTHEST, "m"), ("rpy", _MOST_TURNED, "rad")):
+        for key, most, unit in (("xyz", LONGEST_WAY, "m"), ("rpy", MOST_TURNED, "rad")):
             values = origin.numbers(key, 3, (0.0, 0.0, 0.0))
             if max(map(abs, values)) > most:
                 raise origin.refuse(
@@ -229,17 +180,23 @@ def _check_name(node: Node, name: str) -> None:
         raise node.refuse(problem, f"rename the {node.element.tag}")
 
 
+def _check_kinds(nodes: dict[str, Node], options: UrdfOptions) -> None:
+    """Raise RobotError for joints of other types than those supported, unless they are locked."""
+    kinds = {name: node.text("type") for name, node in nodes.items()}
+    other = [name for name, kind in kinds.items() if kind in _UNSUPPORTED and name not in options.lock]
+    for name, kind in kinds.items():
+        if kind not in (*MOVING, "fixed", *_UNSUPPORTED) or name in other:
+            remedy = "use revolute, continuous, prismatic or fixed"
+            remedy += f", or lock it: {lock_too(options, other)}" if name in other else ""
+            raise nodes[name].refuse(f"type '{shorten(kind)}' is not supported", remedy)
+
+
 def _joint(node: Node, name: str, locked: float | None) -> Joint:
     """The joint of an element, fixed if it is `locked` somewhere; a fixed one keeps only parent, child and origin."""
     kind = node.text("type")
-    allowed = (*MOVING, "fixed", *(_UNSUPPORTED if locked is not None else ()))
-    if kind not in allowed:
-        remedy = "use revolute, continuous, prismatic or fixed"
-        remedy += f", or lock it: {option('lock', [name])}" if kind in _UNSUPPORTED else ""
-        raise node.refuse(f"type '{shorten(kind)}' is not supported", remedy)
     check_origin(node)
     joint = Joint(node, name, kind, node.need("parent").text("link"), node.need("child").text("link"))
-    if locked and kind != "fixed":
+    if locked:
         _move(joint, locked)
     kind = "fixed" if locked is not None else kind
     node.element.set("type", kind)
@@ -255,9 +212,17 @@ def _move(joint: Joint, place: float) -> None:
     if joint.kind not in MOVING:
         remedy = f"lock it at 0 ({option('lock', [joint.name])})"
         raise joint.node.refuse(f"a joint of type '{joint.kind}' cannot be locked at {place:g}", remedy)
+    lower, upper = _stated_range(joint.node)
+    most = LONGEST_WAY if joint.kind == "prismatic" else MOST_TURNED
+    if not abs(place) <= most:
+        raise joint.node.refuse(f"it is locked at {place:g}", f"lock it within ±{most:g}")
+    if not lower <= place <= upper:
+        text = f"{joint.node.place}: {joint.node.owner}: it is locked at {place:g}"
+        warnings.warn(f"{text}, outside its range of [{lower:g}, {upper:g}].", stacklevel=2)
     check_axis(joint)
     axis = joint.node.child("axis")
     direction = np.array([1.0, 0.0, 0.0] if axis is None else axis.numbers("xyz", 3))
+    direction /= np.linalg.norm(direction)
     origin = joint.node.child("origin")
     xyz, rpy = (np.zeros(3) if origin is None else np.array(origin.numbers(k, 3, (0.0,) * 3)) for k in ("xyz", "rpy"))
     frame = pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz)
@@ -293,15 +258,3 @@ def _check_connected(links: dict[str, Node], joints: list[Joint]) -> None:
     if lost:
         names = ", ".join(f"'{joint.name}'" for joint in lost[:5])
         raise lost[0].node.refuse(f"not a tree: joints {names} form a cycle or follow one", "fix their <parent>")
-
-
-def _strength(limit: Node, key: str, joint: Joint, given: float | None, options: UrdfOptions) -> float:
-    """The effort or velocity limit: > 0, or inf if there is none."""
-    free = joint.kind == "continuous" or options.zero_limits == "unlimited" or given is not None
-    value = limit.number(key, math.inf if free else None)
-    if given is not None or (value <= 0.0 and options.zero_limits == "unlimited"):
-        return math.inf if given is None else given
-    if value <= 0.0:
-        remedy = f"state the drive's {key} ({_example(joint, {key: None})})"
-        raise limit.refuse(f"limit {key} '{value:g}' is not > 0", remedy + _open(f"{value:g} means no limit"))
-    return value

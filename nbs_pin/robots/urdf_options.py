@@ -1,8 +1,10 @@
 """How a description is read where it leaves something open: locked joints, limits, packages, inertias."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -65,7 +67,7 @@ def read_options(told: Mapping[str, Any]) -> UrdfOptions:
     """
     given = {name: value for name, value in told.items() if value is not None}
     for name, known in (("zero_limits", ZERO_LIMITS), ("inertia_from", INERTIA_FROM)):
-        if given.get(name, known[0]) not in known:
+        if not isinstance(given.get(name, known[0]), str) or given.get(name, known[0]) not in known:
             raise ArgumentError(f"{name} is {given[name]!r}; give {' or '.join(map(repr, known))}.")
     if not isinstance(given.get("repair", False), bool):
         raise ArgumentError(f"repair is {given['repair']!r}; give True or False.")
@@ -76,19 +78,14 @@ def read_options(told: Mapping[str, Any]) -> UrdfOptions:
 
 
 def _locked(value: Any) -> dict[str, float]:
-    names = (value,) if isinstance(value, str) else value
-    if isinstance(names, Mapping):
-        locked = dict(names)
-    elif isinstance(names, Iterable):
-        locked = dict.fromkeys(names, 0.0)
-    else:
-        locked = {None: 0.0}
-    if not all(isinstance(name, str) and _finite(place) for name, place in locked.items()):
+    names = [value] if isinstance(value, str) else list(value) if isinstance(value, Iterable) else [value]
+    places = list(value.values()) if isinstance(value, Mapping) else [0.0] * len(names)
+    if not all(isinstance(name, str) and _finite(place) for name, place in zip(names, places, strict=True)):
         raise ArgumentError(
             f"lock is {value!r}, expected names of joints, or a dict from names to finite positions; give for instance "
             "lock=['finger'] or lock={'finger': 0.02}."
         )
-    return {name: float(place) for name, place in locked.items()}
+    return {name: float(place) for name, place in zip(names, places, strict=True)}
 
 
 def _limits(value: Any) -> dict[str, dict[str, float | None]]:
@@ -112,22 +109,28 @@ def _arguments(value: Any) -> dict[str, str]:
         raise ArgumentError(
             f"xacro_args is {value!r}, expected a dict; give for instance xacro_args={{'name': 'ur5e'}}."
         )
-    return {name: text if isinstance(text, str) else str(text).lower() for name, text in value.items()}
+    return {name: str(text).lower() if isinstance(text, bool) else str(text) for name, text in value.items()}
 
 
 def _folders(value: Any) -> tuple[Path, ...]:
     names = (value,) if isinstance(value, str | Path) else value
     if not isinstance(names, Iterable) or not all(isinstance(name, str | Path) for name in names):
         raise ArgumentError(f"package_dirs is {value!r}, expected folders; give for instance package_dirs=['ws/src'].")
-    folders = tuple(Path(name).expanduser().resolve() for name in names)
-    missing = next((folder for folder in folders if not folder.is_dir()), None)
-    if missing is not None:
-        raise ArgumentError(f"package_dirs names {missing}, which is no folder; correct it.")
+    try:
+        folders = tuple(Path(name).expanduser().resolve() for name in names)
+        missing = [folder for folder in folders if not folder.is_dir()]
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ArgumentError(f"package_dirs is {value!r}, which names no folders ({error}); correct it.") from error
+    if missing:
+        warnings.warn(f"package_dirs names {missing[0]}, which is no folder.", stacklevel=2)
     return folders
 
 
 def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+    """Whether it is a number, infinite ones included."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    return abs(value) <= 1e300 or value in (math.inf, -math.inf)  # type: ignore[operator]
 
 
 def _finite(value: Any) -> bool:

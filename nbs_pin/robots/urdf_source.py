@@ -136,8 +136,10 @@ def read_source(path: Path, xacro_args: Mapping[str, str], packages: Packages) -
     label, data = str(path), _read_bytes(path)
     source = parse(data, label, expanded=False)
     if path.suffix != ".xacro" and not any(_foreign(element) == "xacro" for element in source.element.iter()):
+        if xacro_args:
+            raise RobotError(f"{label}: it has nothing of xacro, which could take {', '.join(xacro_args)}; omit that.")
         return parse(data, label)
-    expanded, files = expand(path, xacro_args, packages)
+    expanded, files = expand(path, source.element, xacro_args, packages)
     robot = parse(expanded, label, files)
     robot.element.set("name", robot.element.get("name") or source.element.get("name") or path.stem)
     return robot
@@ -197,7 +199,8 @@ class _Builder(ET.TreeBuilder):
         place = Place(self.label, line)
         if self.files is not None:
             file, _, there = attrs.pop(LINE, "").partition(":")
-            place = Place(self.files[int(file)], int(there)) if there else Place(self.label, 1)
+            marked = file.isdecimal() and there.isdecimal() and int(file) < len(self.files)
+            place = Place(self.files[int(file)], int(there)) if marked else Place(self.label, 1)
         element = super().start(tag, attrs)
         self.places[element] = place
         return element

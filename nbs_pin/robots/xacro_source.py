@@ -3,31 +3,67 @@
 xacro evaluates expressions and reads files and environment variables: expand only files that you trust.
 """
 
+import difflib
 import re
 import threading
 import warnings
 import xml.dom.minidom
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
 from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import MissingExtra, RobotError
-from nbs_pin.robots.packages import Packages
+from nbs_pin.robots.packages import MISSING, Packages
 
 LINE = "nbs_pin_line"
 """Attribute that carries the number of the file and the line, as in 3:17, through the expansion."""
-_MISSING = "/package-not-found/"
-"""Where the files of a package lie that is not found: meshes may be missing, included files may not."""
-_USED = re.compile(r"\$\(arg ([^()]+)\)")
+_USED = re.compile(r"\$\(\s*arg\s+([^()\s]+)\s*\)")
+_DECLARED = re.compile(r"""<xacro:arg\b[^>]*?\bname\s*=\s*["']([^"']+)""")
 _lock = threading.RLock()
 
 
-def expand(path: Path, arguments: Mapping[str, str], packages: Packages) -> tuple[bytes, list[str]]:
-    """The URDF that a xacro file expands to, and the files that `LINE` counts.
+@dataclass
+class _Expansion:
+    """What is met while a file is expanded."""
+
+    path: Path
+    root: Element
+    given: Mapping[str, str]
+    packages: Packages
+    files: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    """Packages that are not found."""
+
+    @property
+    def declared(self) -> dict[str, str]:
+        """The arguments that the file declares, with their defaults."""
+        elements = (element for element in self.root.iter() if str(element.tag).endswith("}arg"))
+        return {element.get("name", ""): element.get("default", "") for element in elements}
+
+    @property
+    def of_root(self) -> dict[str, str]:
+        """Defaults of the arguments in the root element, which xacro evaluates before it reads the declarations."""
+        used = _USED.findall(" ".join(self.root.attrib.values()))
+        return {name: text for name, text in self.declared.items() if name in used and "$" not in text}
+
+    def check_arguments(self) -> None:
+        """Raise RobotError for an argument that no file declares or uses."""
+        texts = [Path(file).read_text(errors="replace") for file in self.files]
+        known = {name for text in texts for name in (*_USED.findall(text), *_DECLARED.findall(text))}
+        for name in self.given:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1) or sorted(known)[:6]
+                names = ", ".join(map(repr, near)) or "no argument at all"
+                raise RobotError(f"{self.path}: it takes no argument '{name}'; give {names}.")
+
+
+def expand(path: Path, root: Element, arguments: Mapping[str, str], packages: Packages) -> tuple[bytes, list[str]]:
+    """The URDF that a xacro file with this root element expands to, and the files that `LINE` counts.
 
     Raises:
         RobotError: If it cannot be expanded; names the missing package or argument and how to give it.
@@ -38,25 +74,25 @@ def expand(path: Path, arguments: Mapping[str, str], packages: Packages) -> tupl
         import xacro.substitution_args
     except ModuleNotFoundError as error:
         raise MissingExtra(f"{path} needs xacro: pip install 'nbs-pin[xacro]'.") from error
-    files: list[str] = []
-    missing: list[str] = []
-    with _lock, _hooks(xacro, files, missing, packages):
+    task = _Expansion(path, root, arguments, packages)
+    with _lock, _hooks(xacro, task):
         try:
-            document = xacro.process_file(str(path), mappings={**_of_root(path), **arguments})
+            document = xacro.process_file(str(path), mappings={**task.of_root, **arguments})
         except Exception as error:  # xacro evaluates Python, which can raise any exception
-            raise RobotError(_sentence(path, error, missing, packages, arguments)) from error
+            where = next((name for name in reversed(xacro.filestack or []) if name), str(path))
+            raise RobotError(_sentence(task, where, error)) from error
+    task.check_arguments()
     own = packages.assume()
-    if missing and own is not None and any(Path(file).is_relative_to(own) for file in files[1:]):
-        text = f"{path}: package {', '.join(map(repr, missing))} was not found and is taken to be {own}"
-        warnings.warn(
-            f"{text}, which has no package.xml; give another by {option('package_dirs', BLANK)}.", stacklevel=2
-        )
+    if task.missing and own is not None and any(Path(file).is_relative_to(own) for file in task.files[1:]):
+        text = f"{path}: package {', '.join(map(repr, task.missing))} was not found and is taken to be {own}"
+        remedy = f"give another by {option('package_dirs', BLANK)}"
+        warnings.warn(f"{text}, which has no package.xml; {remedy}.", stacklevel=2)
     expanded: str = document.documentElement.toxml()
-    return expanded.encode(), files
+    return expanded.encode(), task.files
 
 
 @contextmanager
-def _hooks(xacro: Any, files: list[str], missing: list[str], packages: Packages) -> Iterator[None]:
+def _hooks(xacro: Any, task: _Expansion) -> Iterator[None]:
     """Let xacro find packages as meshes are found, and mark every element that it parses with its line.
 
     xacro keeps its state in modules, so that only one file can be expanded at a time.
@@ -67,16 +103,15 @@ def _hooks(xacro: Any, files: list[str], missing: list[str], packages: Packages)
     def marked(source: Any, filename: str | None = None) -> Any:
         document = parse(source, filename)
         if filename is not None:
-            files.append(str(filename))
-            _mark(document, Path(filename).read_bytes(), len(files) - 1)
+            task.files.append(str(filename))
+            _mark(document, Path(filename).read_bytes(), len(task.files) - 1)
         return document
 
     def located(package: str) -> str:
-        folder = packages.find(package)
-        if folder is None and package not in missing:
-            missing.append(package)
-        own = packages.assume()
-        return str(folder or own or _MISSING + package)
+        folder = task.packages.find(package)
+        if folder is None and package not in task.missing:
+            task.missing.append(package)
+        return str(folder or task.packages.assume() or MISSING + package)
 
     xacro.parse, substitution._eval_find, substitution._eval_dict["find"] = marked, located, located
     try:
@@ -96,32 +131,29 @@ def _mark(document: xml.dom.minidom.Document, data: bytes, file: int) -> None:
             element.setAttribute(LINE, f"{file}:{line}")
 
 
-def _sentence(
-    path: Path, error: BaseException, missing: list[str], packages: Packages, given: Mapping[str, str]
-) -> str:
+def _sentence(task: _Expansion, where: str, error: BaseException) -> str:
     """What was wrong and what to do, in one sentence."""
     chain = list(_chain(error))
     reason = " ".join(str(chain[-1]).split()) or type(chain[-1]).__name__
-    lost = [name for name in missing if str(packages.assume() or _MISSING + name) in f"{error}"]
+    lost = [name for name in task.missing if str(task.packages.assume() or MISSING + name) in f"{error}"]
     if lost:
+        packages, near = ", ".join(map(repr, lost)), task.packages.around
         return (
-            f"{path}: xacro cannot expand it: package '{lost[0]}' was not found in or beside {packages.around}, nor on "
+            f"{where}: xacro cannot expand it ({reason}): package {packages} was not found in or beside {near}, nor on "
             f"ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; give the folder it lies in: {option('package_dirs', BLANK)}."
         )
-    stated = _arguments(path)
+    declared = task.declared
     if any(type(part).__name__ == "ArgException" for part in chain):
-        used = _USED.findall(path.read_text(errors="replace"))
+        used = _USED.findall(task.path.read_text(errors="replace"))
         first = reason.rsplit(" ", 1)[-1]
-        names = [first, *(name for name in dict.fromkeys(used) if name not in {first, *stated, *given})]
+        names = [first, *(name for name in dict.fromkeys(used) if name not in {first, *declared, *task.given})]
         plural, listed = "arguments" if len(names) > 1 else "argument", ", ".join(f"'{name}'" for name in names)
         values = dict.fromkeys(names, "VALUE")
-        return f"{path}: xacro needs the {plural} {listed}; give a value: {option('xacro_args', values)}."
-    guilty = {name: text for name, text in stated.items() if text in re.split(r"[/'\s]", reason)} or stated
-    settable = ", ".join(f"{name} = '{text}'" for name, text in list(guilty.items())[:6])
-    remedy = (
-        f"; it has arguments, {settable}: set them by {option('xacro_args', BLANK)}" if stated else "; fix the file"
-    )
-    return f"{path}: xacro cannot expand it ({reason}){remedy}."
+        return f"{where}: xacro needs the {plural} {listed}; give a value: {option('xacro_args', values)}."
+    words = re.split(r"[/'\s]", reason)
+    guilty = ", ".join(f"{name} = '{text}'" for name, text in declared.items() if text in words)
+    guilty = f"it has the argument {guilty}: set it by {option('xacro_args', BLANK)}" if guilty else "fix the file"
+    return f"{where}: xacro cannot expand it ({reason}); {guilty}."
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
@@ -130,16 +162,3 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
     while found is not None:
         yield found
         found = getattr(found, "exc", None) or found.__cause__
-
-
-def _of_root(path: Path) -> dict[str, str]:
-    """Defaults of the arguments that the root element uses: xacro evaluates it before it reads their declarations."""
-    used = _USED.findall(" ".join(ElementTree.fromstring(path.read_bytes()).attrib.values()))
-    return {name: text for name, text in _arguments(path).items() if name in used and text is not None}
-
-
-def _arguments(path: Path) -> dict[str, str | None]:
-    """The arguments that a file declares, with their defaults."""
-    root = ElementTree.fromstring(path.read_bytes())
-    declared = (element for element in root.iter() if str(element.tag).endswith("}arg"))
-    return {element.get("name", ""): element.get("default") for element in declared}
