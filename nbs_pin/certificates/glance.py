@@ -51,5 +51,7 @@ def labels(certificate: Certificate) -> tuple[str, ...]:
 
 def bound(certificate: Certificate, initial: float, t: float) -> float:
     """`Certificate.storage_bound` at one time."""
-    level = certificate.level
+    held, level = certificate.held_storage(initial), certificate.level
+    if math.isfinite(held):
+        return held
     return min(initial * math.exp(-level.c * max(t, 0.0)) + level.storage, max(initial, level.storage))

@@ -44,7 +44,9 @@ class WatchMemory(NamedTuple):
     broken: tuple[Assumption, ...] = ()
     """Assumptions that have failed so far."""
     has_gap: bool = False
-    """Whether an instant was not finite, so that what torques did since the last one is not known."""
+    """Whether an instant was not finite, so that what torques did then is not known."""
+    is_lost: bool = False
+    """Whether the last instant was."""
 
 
 class PeriodWatch:
@@ -65,7 +67,7 @@ class PeriodWatch:
     def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WatchMemory]:
         """What the first instant shows, and the memory after it."""
         initial, certificate = self.model.storage(sample), self.certificate
-        largest = max(initial, certificate.storage) or 1.0
+        largest = bound(certificate, initial, 0.0) or 1.0
         (size, joints), (most, mosts) = certificate.from_start(initial), certificate.from_start(largest)
         bounds, widest = np.array([size, *joints]), np.array([most, *mosts])
         memory = WatchMemory(t, t, initial, bounds, widest, sample, initial)
@@ -78,6 +80,10 @@ class PeriodWatch:
         if not h > 0.0:
             raise ArgumentError(f"the instant t = {t} s is not after the last one, {memory.t} s; give them in order.")
         z1, found = np.empty(n), np.empty(periods.FINDINGS)
+        if memory.is_lost:  # torques are compared again from here on
+            memory = memory._replace(t=t, last=sample, storage=self.model.storage(sample), is_lost=False)
+            z1 = np.asarray(self.certificate.controller.dynamics.difference(sample[at.Q], sample[at.Q_REF]))
+            return self._glance(memory, z1, None, False), memory
         bits = verdicts.instant(before, sample, z1, h, self.limits.rows)
         terms, vectors = self.model.period(before, sample, h, memory.storage)
         periods.judge_period(terms, vectors.copy(), before, sample, h, *self.limits, found)
@@ -104,12 +110,12 @@ class PeriodWatch:
 
     def lost(self, memory: WatchMemory) -> WatchMemory:
         """The memory after an instant that is not finite."""
-        return memory._replace(has_gap=True)
+        return memory._replace(has_gap=True, is_lost=True)
 
     def _glance(
         self, memory: WatchMemory, z1: Float[np.ndarray, " n"], flow: Balance | None, lag_is_greatest: bool
     ) -> Glance:
-        certificate, largest = self.certificate, max(memory.initial, self.certificate.storage)
+        certificate, largest = self.certificate, bound(self.certificate, memory.initial, 0.0)
         promise = bound(certificate, memory.initial, memory.t - memory.began)
         bounds = (math.sqrt(promise / largest) if largest > 0.0 else 1.0) * memory.bounds
         values = np.array([memory.storage, math.sqrt(z1 @ z1), *np.abs(z1)])
