@@ -34,7 +34,9 @@ COMPARED = "> largest torque of the law"
 class Arm(Protocol):
     """An arm as `load_robot` gives it, as far as a file states it."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What it is called."""
 
     @property
     def sha256(self) -> str:
