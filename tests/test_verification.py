@@ -5,6 +5,7 @@ import copy
 import importlib
 import json
 import sys
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from nbs_pin.inertia import multipliers
 from nbs_pin.robots.catalogue import find
 from nbs_pin.verification import verify as checker
 from nbs_pin.verification.balls import arb, balls, ctx, positive_definite
+from nbs_pin.verification.document import read_document
 from nbs_pin.verification.stated import FALSE, OPEN, TAKEN, VERIFIED
 from nbs_pin.verification.trees import differences, stated_tree, urdf_tree
 from nbs_pin.verification.verify import energy_form, verify
@@ -344,11 +346,43 @@ def changed(document, path, change):
     return new
 
 
+@lru_cache(maxsize=64)
+def tree_of(arm):
+    with ctx.workprec(checker.BITS):
+        return checker._arm(json.loads(arm), None)
+
+
 def is_refused(document, path):
+    """Whether `verify` does not confirm the document: its parts up to the first that fails, the longest last."""
     try:
-        return not verify(written(document, path)).confirmed
+        document = read_document(written(document, path))
+        if document["label"] != "PROVED":
+            return True
+        with ctx.workprec(checker.BITS):
+            for part in (checker.stated, checker._constants, checker._levels, checker._errors):
+                if any(check.status in (OPEN, FALSE) for check in part(document)):
+                    return True
+            tree, checks = tree_of(json.dumps(document["arm"]))
+            return any(check.status in (OPEN, FALSE) for check in (*checks, *checker._inertias(document, tree)))
     except FileFormatError:
         return True
+
+
+def test_what_is_refused_part_by_part_is_what_verify_refuses(rubbing, tmp_path):
+    """Of one edit in every part, and of none."""
+    file = tmp_path / "c.json"
+    for path in (
+        ("constants", "rho"),
+        ("level", "storage"),
+        ("bounds", "error"),
+        ("inertia", 1, "value"),
+        ("arm", "joints", 1, "mass"),
+        ("conditions", 0, "right"),
+        ("disturbance", "box", 0),
+    ):
+        for factor in (0.9, 1.0, 1.1):
+            new = changed(rubbing, path, lambda x, by=factor: by * x)
+            assert is_refused(new, file) is not verify(written(new, file)).confirmed
 
 
 @pytest.mark.parametrize("fixture", DOCUMENTS)
