@@ -230,7 +230,7 @@ def _read(
         is_recorded=False,
         is_wrong=any(x.is_wrong for x in seen),
         compared=np.array([np.isfinite(x.storage) for x in seen]),
-        basis="" if memory is None else in_which_time(certificate, memory.initial),
+        basis="" if memory is None else memory.basis,
         suspects=suspects[-1] if suspects else (),
     )
 

@@ -10,16 +10,7 @@ import numpy as np
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
-from nbs_pin.certificates.assumptions import (
-    JUMPS,
-    LARGEST,
-    check_certificate,
-    in_which_time,
-    listed,
-    looks_like,
-    not_finite,
-    sentence,
-)
+from nbs_pin.certificates.assumptions import JUMPS, LARGEST, check_certificate, listed, looks_like, not_finite, sentence
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders
@@ -124,7 +115,7 @@ class Watch:
             _, what = not_finite(LoopSamples(np.zeros(1), *sample[:, None]), self.certificate.joint_names)
             return self._lost(memory, what, t), None if memory is None else way.lost(memory)
         glance, memory = way.begin(t, sample) if memory is None else way.step(memory, t, sample)
-        return _said(glance, memory, self.certificate), memory
+        return _said(glance, memory), memory
 
     def _lost(self, memory: WatchMemory | WindowMemory | None, what: str, t: float) -> Watched:
         """The result at an instant with a number that is not finite."""
@@ -152,16 +143,18 @@ def _blind(memory: WatchMemory | WindowMemory, t: float) -> float:
     return t - (memory.began if math.isnan(memory.compared) else memory.compared)
 
 
-def _said(glance: Glance, memory: WatchMemory | WindowMemory, certificate: Certificate) -> Watched:
+def _said(glance: Glance, memory: WatchMemory | WindowMemory) -> Watched:
     broken, blind = memory.broken, _blind(memory, memory.t)
     is_wrong = glance.is_wrong and not any(name in JUMPS for name in broken)
     if glance.excesses and not broken and not is_wrong:
         broken = glance.cause
-    is_unseen = math.isnan(glance.storage)
-    unseen = f"V and torques have not been compared for {blind:.4g} s" if is_unseen else ""
-    at, failed = f" by {listed(glance.excesses)}", dict.fromkeys(broken, "")
-    verdict = sentence(at, not glance.excesses, is_wrong, failed, is_recorded=False, unseen=unseen)
-    verdict += looks_like(glance.suspects) + in_which_time(certificate, memory.initial)
+    verdict = "promise kept"
+    if glance.excesses or broken or math.isnan(glance.storage):
+        unseen = f"V and torques have not been compared for {blind:.4g} s" if math.isnan(glance.storage) else ""
+        at, failed = f" by {listed(glance.excesses)}", dict.fromkeys(broken, "")
+        verdict = sentence(at, not glance.excesses, is_wrong, failed, is_recorded=False, unseen=unseen)
+        verdict += looks_like(glance.suspects)
+    verdict += memory.basis
     return Watched(
         storage=glance.storage,
         promise=glance.promise,

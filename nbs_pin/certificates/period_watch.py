@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.certificates.assumptions import DIFFERENCES, EPS, ROUNDING, decayed, noticeable
+from nbs_pin.certificates.assumptions import DIFFERENCES, EPS, ROUNDING, decayed, in_which_time, noticeable
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Limits
@@ -27,6 +27,10 @@ class WatchMemory(NamedTuple):
     """Time of the last instant [s]."""
     initial: float
     """V at the first instant [J]."""
+    proved: float
+    """Bound of V that is proved for held torques from there [J]; inf if none is."""
+    basis: str
+    """What else a verdict has to say of the bounds from there."""
     bounds: Float[np.ndarray, " errors"]
     """Bounds of ‖z1‖ and each |z1_i| at the first instant [rad]."""
     widest: Float[np.ndarray, " errors"]
@@ -67,10 +71,11 @@ class PeriodWatch:
     def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WatchMemory]:
         """What the first instant shows, and the memory after it."""
         initial, certificate = self.model.storage(sample), self.certificate
-        largest = bound(certificate, initial, 0.0) or 1.0
+        proved, basis = certificate.held_storage(initial), in_which_time(certificate, initial)
+        largest = bound(certificate, initial, proved, 0.0) or 1.0
         (size, joints), (most, mosts) = certificate.from_start(initial), certificate.from_start(largest)
         bounds, widest = np.array([size, *joints]), np.array([most, *mosts])
-        memory = WatchMemory(t, t, initial, bounds, widest, sample, initial)
+        memory = WatchMemory(t, t, initial, proved, basis, bounds, widest, sample, initial)
         z1 = certificate.controller.dynamics.difference(sample[at.Q], sample[at.Q_REF])
         return self._glance(memory, np.asarray(z1), None, False), memory
 
@@ -115,8 +120,8 @@ class PeriodWatch:
     def _glance(
         self, memory: WatchMemory, z1: Float[np.ndarray, " n"], flow: Balance | None, lag_is_greatest: bool
     ) -> Glance:
-        certificate, largest = self.certificate, bound(self.certificate, memory.initial, 0.0)
-        promise = bound(certificate, memory.initial, memory.t - memory.began)
+        certificate, start = self.certificate, (memory.initial, memory.proved)
+        largest, promise = bound(certificate, *start, 0.0), bound(certificate, *start, memory.t - memory.began)
         bounds = (math.sqrt(promise / largest) if largest > 0.0 else 1.0) * memory.bounds
         values = np.array([memory.storage, math.sqrt(z1 @ z1), *np.abs(z1)])
         promised = np.array([promise, *bounds])

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.certificates.assumptions import ROUNDING
+from nbs_pin.certificates.assumptions import ROUNDING, in_which_time
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders, Limits
@@ -35,6 +35,10 @@ class WindowMemory(NamedTuple):
     """Time of the last instant [s]."""
     initial: float
     """Upper bound of V at the first instant [J]."""
+    proved: float
+    """Bound of V that is proved for held torques from there [J]; inf if none is."""
+    basis: str
+    """What else a verdict has to say of the bounds from there."""
     bounds: Float[np.ndarray, " errors"]
     """Bounds of ‖z1‖ and each |z1_i| at the first instant [rad]."""
     samples: Float[np.ndarray, "last 7 n"]
@@ -76,7 +80,7 @@ class WindowWatch:
 
     def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WindowMemory]:
         """What the first instant shows, and the memory after it."""
-        memory = WindowMemory(t, t, 0.0, np.zeros(0), sample[None])
+        memory = WindowMemory(t, t, 0.0, math.inf, "", np.zeros(0), sample[None])
         memory = self._promising(memory, sample, math.inf)
         return self._first(memory), memory
 
@@ -123,7 +127,8 @@ class WindowWatch:
         (phi, more, kinetic, slack), _ = self.model.centre(mean, sample[at.Q], self.resolution, period)
         initial = float(phi + more) + (math.sqrt(kinetic) + math.sqrt(slack)) ** 2
         size, joints = self.certificate.from_start(initial)
-        return memory._replace(initial=initial, bounds=np.array([size, *joints]))
+        proved, basis = self.certificate.held_storage(initial), in_which_time(self.certificate, initial)
+        return memory._replace(initial=initial, proved=proved, basis=basis, bounds=np.array([size, *joints]))
 
     def _in_time(self, memory: WindowMemory, period: float) -> WindowMemory:
         """The memory with a window for this period [s]; it begins anew where instants are not evenly spaced."""
@@ -185,12 +190,13 @@ class WindowWatch:
     def _glance(
         self, memory: WindowMemory, z1: JointArray, told: "_Told | None", failed: tuple[Assumption, ...]
     ) -> Glance:
-        certificate, t, first = self.certificate, memory.t - memory.began, bound(self.certificate, memory.initial, 0.0)
-        fallen = math.sqrt(bound(certificate, memory.initial, t) / first) if first > 0.0 else 1.0
+        certificate, t, start = self.certificate, memory.t - memory.began, (memory.initial, memory.proved)
+        first = bound(certificate, *start, 0.0)
+        fallen = math.sqrt(bound(certificate, *start, t) / first) if first > 0.0 else 1.0
         errors, bounds = np.array([math.sqrt(z1 @ z1), *np.abs(z1)]), fallen * memory.bounds
         over = (errors - self._reach > bounds * (1.0 + ROUNDING)).nonzero()[0].tolist()
         excesses = [self._labels[k + 1] for k in over]
-        promise = bound(certificate, memory.initial, t - (0.0 if told is None else 2.0 * memory.half * memory.period))
+        promise = bound(certificate, *start, t - (0.0 if told is None else 2.0 * memory.half * memory.period))
         if told is not None and not told.least <= promise * (1.0 + ROUNDING):
             excesses.insert(0, "V")
         failed = failed if told is None else (*failed, *told.failed)
