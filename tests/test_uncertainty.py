@@ -249,8 +249,8 @@ def test_what_cannot_be_bounded_is_refused_in_one_sentence():
     law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
     with pytest.raises(nbs.ArgumentError, match="give the reference too"):
         nbs.certify(law, [1.0, 1.0], uncertainty=nbs.Uncertainty(inertia=0.01))
+    heavy = nbs.Uncertainty(payload=nbs.Payload(20.0))
     with pytest.raises(nbs.CertificateRefused, match="state smaller shares"):
-        heavy = nbs.Uncertainty(payload=nbs.Payload(20.0))
         nbs.certify(law, [0.0, 0.0], reference=reference, duration=1.0, uncertainty=heavy)
     for wrong in ({"inertia": 1.0}, {"viscous": -0.1}):
         with pytest.raises(nbs.ArgumentError, match="give a share"):
