@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from nbs_pin import __version__
+from nbs_pin.base.doors import at_the_shell
 from nbs_pin.base.exceptions import CertificateRefused, NbsPinError
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.certify import Certify
@@ -72,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? for them
     notes = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
     arguments = sys.argv[1:] if argv is None else list(argv)
-    with _stops() as stops, _warnings_to(notes):
+    with _stops() as stops, _warnings_to(notes), at_the_shell():
         try:
             return _run(arguments, notes, stops)
         except BaseException as error:
