@@ -83,6 +83,7 @@ def collect(
     """
     noise = noise or Noise()
     _check(recipe, samples, speed, noise, acceleration)
+    samples = int(samples)
     acting = JointFriction.of(robot) if friction is True else friction or None
     interval = _interval(recipe, samples, sampling, duration)
     stride = whole(interval, RECORD_STEP, "sampling", "step of the record")

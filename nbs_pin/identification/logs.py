@@ -40,8 +40,10 @@ def load_log(
 
     CSV: a header with `t` [s], per joint `q_NAME` [rad], `tau_NAME` [N·m] and, if logged, `v_NAME` [rad/s] and
     `a_NAME` [rad/s²] (NAME a joint's name; or q1 … qn, tau1 … taun in the arm's order), and `trajectory`, a whole
-    number, if there are several; position_NAME, velocity_NAME and effort_NAME are understood too. NPZ: arrays `t` (rows,), `q`, `tau`, `v`, `a` (rows, n), `trajectory` (rows,) and
-    `joint_names` (n,) likewise; a recorded run and a dataset are such files.
+    number, if there are several. The names of ROS, position_NAME, velocity_NAME and effort_NAME, are understood too.
+    NPZ: arrays `t` (rows,), `q`, `tau`, `v`, `a` (rows, n), `trajectory` (rows,) and `joint_names` (n,) likewise; a
+    recorded run and a dataset are such files.
+
     Quantities not logged are computed by differentiation (Savitzky–Golay); samples must then be evenly spaced, and half
     a window is dropped at both ends of each trajectory. Joints that turn without limit are unwrapped where they jump by
     a turn. Warns of that, of a log with only one trajectory, and of one without torque, from which no model can be
@@ -145,8 +147,8 @@ def _in_units(
     """The columns with every angle in radians and time in seconds from the first row of its trajectory."""
     fault = degrees_fault(columns.q, joints, robot, turning=False) if degrees is None else ""
     if degrees:
-        q, v, a = (x if x is None else in_radians(x, joints.prismatic) for x in (columns.q, columns.v, columns.a))
-        columns = columns._replace(q=q, v=v, a=a)
+        v, a = (x if x is None else in_radians(x, joints.prismatic) for x in (columns.v, columns.a))
+        columns = columns._replace(q=in_radians(columns.q, joints.prismatic), v=v, a=a)
     if not fault and time_unit is None:
         fault = time_fault(columns.t, columns.q, columns.v, trajectory_slices(columns.trajectory))
     if fault:
@@ -185,7 +187,7 @@ class _Stretch(NamedTuple):
         step = float(np.median(steps)) if steps.size else 1.0
         if np.abs(steps - step).max(initial=0.0) > _EVEN * step:
             raise FileFormatError(
-                f"{at}, samples to differentiate are not evenly spaced, {steps.min():.4g} to {steps.max():.4g} s apart; "
+                f"{at}, samples to differentiate are not evenly spaced ({steps.min():.4g} to {steps.max():.4g} s); "
                 f"give {option('resample', float(f'{step:.3g}'))}, or log v and a."
             )
         half = max(round(0.5 * window / step), ORDER // 2 + 1)

@@ -83,7 +83,7 @@ def time_fault(
         unit = next((u for u in _CALLED if abs(ratio / TIME_UNITS[u] - 1.0) < _LIKE_A_RATIO), "")
         why = f"in which q changes as v states; give {option('time_unit', unit)}"
     if not unit and step > _LONG_STEP:
-        speed = float((np.abs(moved) / steps[:, None]).max(initial=0.0))
+        speed = float((np.where(np.abs(moved) > np.pi, 0.0, np.abs(moved)) / steps[:, None]).max(initial=0.0))
         unit = _unit_of_speed(speed, step)
         why = (
             f"since in seconds its rows are {step:.4g} s apart and no joint is faster than {speed:.3g} rad/s; give "

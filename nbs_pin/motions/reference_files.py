@@ -116,7 +116,8 @@ def load_reference(
     fault = _fault(t, q, names)
     if not fault and degrees is None:
         fault = degrees_fault(q, joints, robot if isinstance(robot, Robot) else None, turning=True)
-    q, v = (x if x is None or not degrees else in_radians(x, joints.prismatic) for x in (q, v))
+    if degrees:
+        q, v = in_radians(q, joints.prismatic), None if v is None else in_radians(v, joints.prismatic)
     first, t = t[0] if len(t) else 0.0, (t - t[:1]) * seconds
     if not fault and time_unit is None:
         fault = time_fault(t, q, v, [slice(0, len(t))])
@@ -156,7 +157,7 @@ def _jump(motion: Sampled, columns: list[str]) -> str:
     jumps = _jumps(motion)
     if not jumps.any():
         return ""
-    row, joint = np.unravel_index(np.argmax(jumps), jumps.shape)
+    row, joint = (int(k) for k in np.unravel_index(np.argmax(jumps), jumps.shape))
     at = f"velocity jump {jumps[row, joint]:.3g} rad/s of {columns[joint]} at t = {t[row]:.6g} s"
     if row in (0, len(t) - 1):
         return f"{at}, where the motion {'ends' if row else 'starts'} and q is held; add samples at rest there"
