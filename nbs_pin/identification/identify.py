@@ -46,6 +46,8 @@ _ROUNDS = 6
 """Iterations of the reweighted least squares that estimate the noise."""
 _UNPHYSICAL, _MUCH = 3.0, 0.1
 """Residual of physical bodies that contradicts the estimated noise, in units of it and of the torque's size."""
+_WORSE = 1.1
+"""Residual in units of the torque's size that is worse than that of no bodies at all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +203,8 @@ def sign_fault(data: Dataset, robot: Robot) -> str:
     wrong = [name for name, sign in zip(robot.joint_names, signs, strict=True) if sign < 0.0]
     which = "every joint" if len(wrong) == n else " and ".join(wrong)
     return (
-        f"sign of tau of {which}? {_percent(stated)} of the torque's variance is unexplained, and {_percent(best)} with "
-        "the sign reversed; reverse it"
+        f"sign of tau of {which}? {_percent(stated)} of the torque's variance is unexplained, and with the sign "
+        f"reversed {_percent(best)}; reverse it"
     )
 
 
@@ -262,7 +264,8 @@ def _physical(
     """
     design, target = _weighted(equations, noise)
     fit, size = consistent_fit(design, target, data.nv, strength), torque_size(equations, len(data))
-    if (np.sqrt(_squares(equations, fit, len(data))) > np.maximum(_UNPHYSICAL * noise, _MUCH * size)).any():
+    left = np.sqrt(_squares(equations, fit, len(data)))
+    if (left > np.maximum(_UNPHYSICAL * noise, _MUCH * size)).any() or (left > _WORSE * size).any():
         noise = np.maximum(noise, size)
         design, target = _weighted(equations, noise)
         fit = consistent_fit(design, target, data.nv, strength)

@@ -53,6 +53,18 @@ def seconds_in(time_unit: str | None) -> float:
     return 1.0 if time_unit is None else TIME_UNITS[time_unit]
 
 
+def from_first_row(t: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+    """Times from the first row on; even where they are so but for the rounding of large stamps.
+
+    Seconds since 1970 are rounded to 2e-7 s, which would make steps of accelerations.
+    """
+    if not len(t) or t[0] == 0.0:
+        return t
+    passed = t - t[0]
+    even = np.linspace(0.0, passed[-1], len(t))
+    return even if (np.abs(passed - even) <= 2.0 * np.spacing(np.abs(t).max())).all() else passed
+
+
 def in_radians(x: Float[np.ndarray, "rows n"], prismatic: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "rows n"]:
     """Angles, or their derivatives, converted from degrees; prismatic joints are not changed."""
     return x * np.where(prismatic, 1.0, np.pi / 180.0)

@@ -15,7 +15,15 @@ from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
-from nbs_pin.motions.recordings import Joints, degrees_fault, in_radians, seconds_in, time_fault, unwrapped
+from nbs_pin.motions.recordings import (
+    Joints,
+    degrees_fault,
+    from_first_row,
+    in_radians,
+    seconds_in,
+    time_fault,
+    unwrapped,
+)
 from nbs_pin.robots.robot import Robot
 
 FEWEST_SAMPLES = 4
@@ -118,7 +126,7 @@ def load_reference(
         fault = degrees_fault(q, joints, robot if isinstance(robot, Robot) else None, turning=True)
     if degrees:
         q, v = in_radians(q, joints.prismatic), None if v is None else in_radians(v, joints.prismatic)
-    first, t = t[0] if len(t) else 0.0, (t - t[:1]) * seconds
+    first, t = t[0] if len(t) else 0.0, from_first_row(t) * seconds
     if not fault and time_unit is None:
         fault = time_fault(t, q, v, [slice(0, len(t))])
     if fault:
