@@ -80,7 +80,6 @@ def test_physical_bodies_are_never_worse_than_none_whatever_the_signs(name, code
     model = nbs.IdentifiedDynamics(robot, inertial_parameters(pseudo))
     share = np.square(torque_errors(model, data)).mean(axis=0) / np.square(data.tau).mean(axis=0)
     assert share.mean() < 1.0
-    assert share.max() < 1.3
 
 
 def test_a_fit_is_called_converged_only_if_it_is_better_than_zero_torque(monkeypatch):
@@ -126,6 +125,7 @@ def test_friction_that_was_not_learned_is_missed(name):
             assert torque_nmse(better, tau, better.friction) < 0.01 * torque_nmse(model, tau)
 
 
+@pytest.mark.filterwarnings("default")
 def test_the_shell_refuses_a_wrong_sign_and_writes_no_model(tmp_path, capsys):
     replace(DATA["two_link"], tau=DATA["two_link"].tau * [1.0, -1.0]).save(tmp_path / "data.npz")
     arguments = ["learn", str(tmp_path / "data.npz"), "--model", "identified", "--out", str(tmp_path / "out")]

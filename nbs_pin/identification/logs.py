@@ -88,19 +88,11 @@ def load_log(
     else:
         raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv or .npz; convert it.")
     tree = _serial(columns.q.shape[1], prismatic) if robot is None else (robot.parents, robot.prismatic)
-    joints = _joints(columns, tree[1], robot)
-    columns = _in_units(path, columns, joints, degrees, time_unit, robot)
-    about = "" if robot is None else robot.name
-    _dataset(path, columns._replace(v=columns.q, a=columns.q), tree, 1.0, about)  # refuses what is no table of numbers
-    even = unwrapped(columns.q, joints, trajectory_slices(columns.trajectory), degrees)
-    if even.fault:
-        raise FileFormatError(f"{path}: {even.fault}.")
-    for note in even.notes:
-        warnings.warn(f"{path}: {note}.", stacklevel=2)
-    columns = columns._replace(q=even.q)
-    if resample is not None:
-        columns = resampled(path, columns, resample)
-    data = _dataset(path, columns, tree, _WINDOW if window is None else window, about)
+    columns = _in_units(path, columns, _joints(columns, tree[1], robot), degrees, time_unit, robot)
+    name = "" if robot is None else robot.name
+    _dataset(path, columns._replace(v=columns.q, a=columns.q), tree, 1.0, name)  # refuses what is no table of numbers
+    columns = _even(path, columns, _joints(columns, tree[1], robot), degrees, resample)
+    data = _dataset(path, columns, tree, _WINDOW if window is None else window, name)
     _check_derivatives(path, data)
     _warn(path, data)
     return data
@@ -154,6 +146,17 @@ def _in_units(
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
     return columns if time_unit is None else columns._replace(t=columns.t * seconds_in(time_unit))
+
+
+def _even(path: Path, columns: Columns, joints: Joints, degrees: bool | None, resample: float | None) -> Columns:
+    """The columns without wraps, and with rows `resample` [s] apart unless it is None."""
+    found = unwrapped(columns.q, joints, trajectory_slices(columns.trajectory), degrees)
+    if found.fault:
+        raise FileFormatError(f"{path}: {found.fault}.")
+    for note in found.notes:
+        warnings.warn(f"{path}: {note}.", stacklevel=3)
+    columns = columns._replace(q=found.q)
+    return columns if resample is None else resampled(path, columns, resample)
 
 
 def _dataset(path: Path, columns: Columns, tree: tuple[np.ndarray, np.ndarray], window: float, robot: str) -> Dataset:
