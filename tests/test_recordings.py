@@ -191,6 +191,16 @@ def test_a_single_outlier_is_named_as_such(tmp_path, row, size, stated):
             load(write(tmp_path, T, spoilt, v), robot=TWO, degrees=False)
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_two_recordings_in_one_are_told_apart(tmp_path, stated):
+    q = np.concatenate([smooth(T, 0.5), smooth(T, 0.5) + 0.4])
+    t = np.arange(len(q)) * T[1]
+    v = np.gradient(q, t, axis=0) if stated else None
+    words = r"to 0\.4 between rows 401 and 402: does another recording begin there\? number .* 'trajectory'"
+    with pytest.raises(FileFormatError, match=words):
+        load_log(log_file(tmp_path, t, q, v), robot=TWO)
+
+
 def test_degrees_are_converted_when_said_and_named_when_they_wrap(tmp_path, turning):
     q = smooth(T, 5.0)
     wrapped = np.degrees(np.mod(q + np.pi, 2.0 * np.pi) - np.pi)
@@ -315,7 +325,7 @@ def test_a_velocity_that_is_zero_is_what_is_wrong(load):
 
 @pytest.mark.parametrize("setting", [{"degrees": True}, {"window": 0.2}, {"time_unit": "ms"}, {"resample": 0.01}])
 def test_a_saved_dataset_takes_no_settings_of_a_log(tmp_path, setting):
-    nbs.collect(TWO, "uniform", samples=10.0).save(tmp_path / "data.npz")
+    nbs.collect(TWO, "uniform", samples=10).save(tmp_path / "data.npz")
     (name,) = setting
     with pytest.raises(ArgumentError, match=f"is a saved dataset, .* takes no {name}=.*; leave that out"):
         load_log(tmp_path / "data.npz", robot=TWO, **setting)

@@ -82,7 +82,7 @@ def collect(
         Dataset(100 samples of two_link, 100 trajectories, 2 joints)
     """
     noise = noise or Noise()
-    samples = _check(recipe, samples, speed, noise, acceleration)
+    _check(recipe, samples, speed, noise, acceleration)
     acting = JointFriction.of(robot) if friction is True else friction or None
     interval = _interval(recipe, samples, sampling, duration)
     stride = whole(interval, RECORD_STEP, "sampling", "step of the record")
@@ -229,8 +229,7 @@ def _shares(samples: int, longest: int) -> list[int]:
     return np.diff(np.linspace(0, samples, count + 1).astype(int)).tolist()
 
 
-def _check(recipe: str, samples: int, speed: float, noise: Noise, acceleration: str | None) -> int:
-    """The number of samples as an int; raises ArgumentError if an argument does not fit."""
+def _check(recipe: str, samples: int, speed: float, noise: Noise, acceleration: str | None) -> None:
     if recipe not in get_args(Recipe):
         raise ArgumentError(f"recipe '{recipe}' is unknown; give one of {', '.join(get_args(Recipe))}.")
     if acceleration is not None and acceleration not in get_args(Acceleration):
@@ -244,4 +243,3 @@ def _check(recipe: str, samples: int, speed: float, noise: Noise, acceleration: 
         raise ArgumentError(
             "recipe 'uniform' has single states and nothing to differentiate; give another recipe or only torque noise."
         )
-    return int(samples)

@@ -89,7 +89,8 @@ def identify(
 
     Geometry and gravity are the robot's; its inertias are not used. Least squares weighted by each joint's noise, which
     is estimated from the residual, is followed by the same over physically consistent bodies (`consistent_fit`). Clean
-    data give M, C and G to rounding.
+    data give M, C and G to rounding. Where physical bodies leave far more than that noise, joints are weighted by their
+    torque, so that the model is never worse than none on the data it is fitted to, in the mean over joints.
 
     Args:
         data: Samples with torque, at least two equations per base parameter.
@@ -201,10 +202,11 @@ def sign_fault(data: Dataset, robot: Robot) -> str:
     if best > 0.1 * stated or (signs > 0.0).all():
         return ""
     wrong = [name for name, sign in zip(robot.joint_names, signs, strict=True) if sign < 0.0]
-    which = "every joint" if len(wrong) == n else " and ".join(wrong)
+    all_wrong = len(wrong) == n
+    which = "every joint" if all_wrong else " and ".join(wrong)
     return (
         f"sign of tau of {which}? {_percent(stated)} of the torque's variance is unexplained, and with the sign "
-        f"reversed {_percent(best)}; reverse it"
+        f"reversed {_percent(best)}; reverse it{', or gravity if the arm hangs' if all_wrong else ''}"
     )
 
 

@@ -16,7 +16,7 @@ from nbs_pin.identification.datasets import DATASET_FORMAT, Dataset, load_datase
 from nbs_pin.identification.log_files import Columns, columns_of_arrays, columns_of_csv
 from nbs_pin.identification.measurement import ORDER, derivative
 from nbs_pin.identification.resampling import resampled
-from nbs_pin.motions.recordings import Joints, degrees_fault, in_radians, seconds_in, time_fault, unwrapped
+from nbs_pin.motions.recordings import Joints, degrees_fault, in_radians, seam_fault, seconds_in, time_fault, unwrapped
 from nbs_pin.robots.robot import Robot
 
 _SPAN = 0.05  # [s]; interval over which derivatives are integrated for comparison, to average sensor noise
@@ -150,9 +150,11 @@ def _in_units(
 
 def _even(path: Path, columns: Columns, joints: Joints, degrees: bool | None, resample: float | None) -> Columns:
     """The columns without wraps, and with rows `resample` [s] apart unless it is None."""
-    found = unwrapped(columns.q, joints, trajectory_slices(columns.trajectory), degrees)
-    if found.fault:
-        raise FileFormatError(f"{path}: {found.fault}.")
+    stretches = trajectory_slices(columns.trajectory)
+    found = unwrapped(columns.q, joints, stretches, degrees)
+    fault = found.fault or seam_fault(columns.t, found.q, joints, stretches)
+    if fault:
+        raise FileFormatError(f"{path}: {fault}.")
     for note in found.notes:
         warnings.warn(f"{path}: {note}.", stacklevel=3)
     columns = columns._replace(q=found.q)

@@ -25,6 +25,7 @@ _BEYOND_A_TURN = 1.02  # share of a turn that wrapped angles span at most
 _NEAR_A_TURN = 0.1  # [rad]; least tolerance of a jump by a turn
 _WINDOW = 7  # rows of the median that tells what is usual
 _OUTLIER, _LEAST_OUTLIER = 10.0, 0.1  # times the usual step; [rad, m]
+_SEAM, _NO_MOTOR = 20.0, 30.0  # times the usual speed; [rad/s, m/s]
 _TURNS = 4.0 * np.pi  # [rad]; rarely reached by angles in radians, soon by degrees
 _OFTEN = 0.05  # share of samples that distinguishes degrees from outliers
 
@@ -195,6 +196,25 @@ def _degree_wrap_fault(x: Float[np.ndarray, " rows"], start: int, name: str) -> 
         f"{name} jumps by {x[k + 1] - x[k]:.4g} between rows {start + k + 1} and {start + k + 2}: a wrap in degrees? "
         f"give {option('degrees', True)}"
     )
+
+
+def seam_fault(
+    t: Float[np.ndarray, " rows"], q: Float[np.ndarray, "rows n"], joints: Joints, stretches: Sequence[slice]
+) -> str:
+    """Where one recording seems to end and another to begin: a jump that no motor makes, and no return."""
+    for rows in stretches:
+        speed = np.abs(np.diff(q[rows], axis=0)) / np.diff(t[rows])[:, None]
+        if len(speed) < _WINDOW:
+            continue
+        jumps = speed > np.maximum(_SEAM * np.percentile(speed, 80, axis=0), _NO_MOTOR)
+        if jumps.any():
+            k, i = np.argwhere(jumps)[0]
+            x, row = q[rows, i], rows.start + int(k) + 1
+            return (
+                f"q of {joints.names[i]} jumps from {x[k]:.4g} to {x[k + 1]:.4g} between rows {row} and {row + 1}: does "
+                "another recording begin there? number the recordings in a column 'trajectory'"
+            )
+    return ""
 
 
 def _outlier_fault(x: Float[np.ndarray, " rows"], start: int, name: str) -> str:
