@@ -211,8 +211,8 @@ def seam_fault(
             k, i = np.argwhere(jumps)[0]
             x, row = q[rows, i], rows.start + int(k) + 1
             return (
-                f"q of {joints.names[i]} jumps from {x[k]:.4g} to {x[k + 1]:.4g} between rows {row} and {row + 1}: does "
-                "another recording begin there? number the recordings in a column 'trajectory'"
+                f"q of {joints.names[i]} jumps from {x[k]:.4g} to {x[k + 1]:.4g} between rows {row} and {row + 1}: "
+                "does another recording begin there? number the recordings in a column 'trajectory'"
             )
     return ""
 
