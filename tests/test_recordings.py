@@ -384,6 +384,7 @@ def test_friction_beyond_the_effort_limit_is_named_if_it_is_kept(rubbing):
     words = r"Coulomb friction 200 N·m of joint 'joint1' is not below its effort limit 150 .*\(joint_friction='drop'\)"
     with pytest.raises(ArgumentError, match=words):
         nbs.check_reference(motion, robot, 5.0, joint_friction="keep")
+    nbs.check_reference(nbs.Hold(motion(0.0).q), robot, 5.0, joint_friction="keep")
     with pytest.raises(ArgumentError, match="give 'drop' or 'keep'"):
         nbs.check_reference(motion, robot, 5.0, joint_friction="some")
 

@@ -215,7 +215,7 @@ def _check_torque(robot: Robot, t: np.ndarray, desired: Reference, friction: boo
     data, effort = robot.model.createData(), robot.effort_limit
     drag = np.zeros(robot.nv)
     if friction:
-        _check_friction(robot)
+        _check_friction(robot, desired.v)
         drag = robot.damping * desired.v + robot.friction * np.tanh(desired.v / _TRANSITION)
     tau = np.array([pin.rnea(robot.model, data, *row) for row in zip(*desired, strict=True)]) + drag
     beyond = np.argwhere(~(np.abs(tau) <= effort))
@@ -223,8 +223,8 @@ def _check_torque(robot: Robot, t: np.ndarray, desired: Reference, friction: boo
         return
     k, i = beyond[0]
     weight = abs(pin.computeGeneralizedGravity(robot.model, data, desired.q[k])[i])
-    needed = np.abs(tau).max(axis=0)[i]
-    remedy = f"slow it down, choose another posture or raise the limit: {option('effort_limit', _rounded_up(needed))}"
+    enough = option("effort_limit", _rounded_up(float(np.abs(tau).max())))  # for every joint
+    remedy = f"slow it down, choose another posture or raise the limit: {enough}"
     if weight > effort[i]:
         remedy = remedy.replace("slow it down, choose", f"its weight alone takes {weight:.4g}, so choose")
     elif friction and abs(drag[k, i]) > 0.5 * abs(tau[k, i]):
@@ -232,9 +232,9 @@ def _check_torque(robot: Robot, t: np.ndarray, desired: Reference, friction: boo
     _check_range(robot, t, "torque", tau, -effort, effort, remedy)
 
 
-def _check_friction(robot: Robot) -> None:
-    """Raise ArgumentError if a joint cannot move because its friction takes all of its effort."""
-    stuck = robot.friction >= robot.effort_limit
+def _check_friction(robot: Robot, v: np.ndarray) -> None:
+    """Raise ArgumentError if a joint that is to move cannot, because its friction takes all of its effort."""
+    stuck = (robot.friction >= robot.effort_limit) & v.any(axis=0)
     if stuck.any():
         joint = robot.joints[int(np.argmax(stuck))]
         unit = _UNITS["torque"][joint.prismatic]
