@@ -162,8 +162,9 @@ def unwrapped(
                 x[1:] -= _TURN * np.cumsum(turns)  # a view of q
             fault = fault or ("" if degrees is not None else _degree_wrap_fault(x, rows.start, name))
         if found and joints.continuous[i]:
+            often = "once," if len(found) == 1 else f"{len(found)} times, first"
             notes.append(
-                f"{name} jumps by a turn {len(found)} times, first between rows {found[0] + 1} and {found[0] + 2}; it "
+                f"{name} jumps by a turn {often} between rows {found[0] + 1} and {found[0] + 2}; it "
                 "turns without limit, so it was unwrapped"
             )
         elif found:
