@@ -9,6 +9,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.file_units import FileUnits
 from nbs_pin.cli.values import (
     OptionError,
     choice,
@@ -55,7 +56,7 @@ def friction_text() -> PrimitiveConstructorSpec[str]:
 
 
 @dataclass(frozen=True)
-class Certify:
+class Certify(FileUnits):
     """Certify a controller: bound its tracking error under any bounded disturbance, and say how each bound is known.
 
     Print every constant, condition and bound with its label PROVED, VERIFIED, PROBABILISTIC or EMPIRICAL, and write

@@ -102,7 +102,9 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
             f"--trajectories applies to a model that is not exact, and this one is exact for {robot.name}; "
             "omit it, or give the true arm with --against."
         )
-    motion, duration = motion_of(options.reference, robot, frequency=options.frequency, period=period)
+    motion, duration = motion_of(
+        options.reference, robot, frequency=options.frequency, period=period, **options.units()
+    )
     numbers = None if options.disturbance is None else plain_numbers(options.disturbance) or []
     return dataclasses.replace(
         blank,

@@ -1,6 +1,7 @@
 """`nbs-pin learn`: a model of an arm from data, and its error on held-out motions."""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,8 @@ def run(options: Learn, console: Console, notes: Console) -> None:
     with notes.status(f"loading {options.data}"):
         if options.robot is None:
             options.arm.refuse_without_arm("give the arm with --robot")
-        data, robot = data_and_arm(options.data, options.robot, **options.arm.given())
+        read = options.units() | {"resample": options.resample, "window": options.window}
+        data, robot = data_and_arm(options.data, options.robot, read, options.arm.given())
     name = options.data.stem if robot is None else robot.name
     # Data are identified by their fingerprint, not by their path.
     results = Results.of(options, name, robot, data=None, data_sha256=sha256_of(options.data))
@@ -87,10 +89,15 @@ def arm_of(data: Dataset) -> Robot | None:
     return robot
 
 
-def data_and_arm(path: str | Path, arm: str | None, **load_options: Any) -> tuple[Dataset, Robot | None]:
-    """The data in a file (`load_log`) and the arm of that name or path, or else the one that the data name."""
-    given = None if arm is None else load_robot(arm, **load_options)
-    data = load_log(path, robot=given)
+def data_and_arm(
+    path: str | Path, arm: str | None, read: Mapping[str, Any], load: Mapping[str, Any] | None = None
+) -> tuple[Dataset, Robot | None]:
+    """The data in a file and the arm of that name or path, or else the one that the data name.
+
+    `read` has further arguments of `load_log`, `load` of `load_robot`.
+    """
+    given = None if arm is None else load_robot(arm, **(load or {}))
+    data = load_log(path, robot=given, **read)
     return data, given or arm_of(data)
 
 
