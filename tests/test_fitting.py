@@ -271,8 +271,8 @@ def test_whole_trajectories_are_held_out():
     ("settings", "words"),
     [
         ({"model": "wavelets"}, r"'wavelets' is unknown; choose one of .*cholesky"),
-        ({"model": "identified"}, r"robot=nbs\.load_robot"),
-        ({"model": "residual"}, r"robot=nbs\.load_robot"),
+        ({"model": "identified"}, "needs the arm's URDF; give robot="),
+        ({"model": "residual"}, "needs the arm's URDF; give robot="),
         ({"robot": nbs.load_robot("three_link")}, r"2 joints and three_link 3"),
         ({"held_out": 1.5}, r"share is 1\.5"),
         ({"width": 3}, r"no setting width = 3; it takes loss, optimiser"),

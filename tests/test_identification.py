@@ -256,7 +256,6 @@ def test_few_noisy_samples_give_bodies_that_exist():
 # Refusals.
 
 
-OTHER = "number, kinds or order of the joints differ"
 LIGHT = load_robot("two_link", gravity=0.0)
 
 
@@ -273,8 +272,9 @@ def without_torque(robot: Robot) -> Dataset:
 @pytest.mark.parametrize(
     ("data", "robot", "settings", "words"),
     [
-        (clean(load_robot("two_link")), load_robot("three_link"), {}, OTHER),
-        (clean(load_robot("three_link")), load_robot(GANTRY), {}, OTHER),
+        (clean(load_robot("two_link")), load_robot("three_link"), {}, "2 joints and three_link 3"),
+        (clean(load_robot("three_link")), load_robot(GANTRY), {}, "the joints of the data are .* and those of"),
+        (collect(load_robot("panda"), "uniform", 40), load_robot("xarm7"), {}, "the data are of panda, not of xarm7"),
         (without_torque(LIGHT), LIGHT, {}, "inertias of every scale explain such a motion"),
         (still(LIGHT), LIGHT, {}, "neither moves nor carries weight"),
         (clean(LIGHT), LIGHT, {"transition": 0.0}, "transition is 0"),

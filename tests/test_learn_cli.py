@@ -78,7 +78,7 @@ def test_a_log_needs_a_named_arm(path, tmp_path, capsys):
     data = load_dataset(path)
     log = tmp_path / "log.npz"
     np.savez(log, t=data.t, q=data.q, v=data.v, a=data.a, tau=data.tau, trajectory=data.trajectory)
-    assert "robot=nbs.load_robot" in refusal(run(log, tmp_path / "a", "--model", "identified"), capsys)
+    assert "give --robot" in refusal(run(log, tmp_path / "a", "--model", "identified"), capsys)
     assert not (tmp_path / "a").exists()
     assert run(log, tmp_path / "b", "--model", "identified", "--robot", "two_link") == 0
     assert nbs.load(tmp_path / "b" / "model.nbs").robot.name == "two_link"

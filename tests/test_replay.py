@@ -15,6 +15,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.reports.replay import body_poses, replay
 from nbs_pin.robots.meshes import MeshError, find_mesh, read_mesh
+from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.robots.visuals import STEEL, Transmission, link_visuals, read_couplings, tip
 from tests.browser import Browser, find_chromium
@@ -202,7 +203,7 @@ def test_the_chosen_start_of_a_batch_is_shown(tmp_path):
         ({"robot_sha256": "0" * 64}, "not the arm that ran"),
         ({"robot": "three_link"}, "not the arm that ran"),
         ({"robot_options": {"gravity": 1.62}}, "not the arm that ran"),
-        ({"robot_options": {"spin": 1}}, "options that this version does not know .spin: 1"),
+        ({"robot_options": {"spin": 1}}, "options that this version does not know .spin"),
         ({"joint_names": ("a", "b")}, "moves joints a, b"),
         ({"q": np.full((501, 2), np.nan)}, "not finite"),
     ],
@@ -306,7 +307,7 @@ endsolid x
     [
         ("gone.stl", None, "not found"),
         ("../outside.stl", STL, "leaves the robot's folder"),
-        ("package://other/../../outside.stl", STL, "leaves the robot's folder"),
+        ("package://other/../../outside.stl", STL, "package 'other' was not found"),
         ("file:///etc/outside.stl", None, "leaves the robot's folder"),
         ("http://example.org/a.stl", None, "not a file on this machine"),
         ("package://file:///etc/a.stl", None, "not a file"),
@@ -334,22 +335,24 @@ def test_u22_meshes_stay_inside_their_roots(tmp_path):
     (tmp_path / "outside.stl").touch()
     (folder / "a.STL").touch()
     (folder / "link.stl").symlink_to(tmp_path / "outside.stl")
-    urdf = folder / "x.urdf"
-    assert find_mesh("a.STL", urdf) == find_mesh("package://pkg/a.STL", urdf) == (folder / "a.STL").resolve()
-    for uri in ("package://../outside.stl", "link.stl", f"{tmp_path}/outside.stl"):
+    packages = Packages(folder / "x.urdf")
+    assert find_mesh("a.STL", packages) == find_mesh("package://pkg/a.STL", packages) == (folder / "a.STL").resolve()
+    for uri in ("package://pkg/../outside.stl", "link.stl", f"{tmp_path}/outside.stl"):
         with pytest.raises(MeshError, match="leaves the robot's folder"):
-            find_mesh(uri, urdf)
+            find_mesh(uri, packages)
+    with pytest.raises(MeshError, match=r"package '\.\.' was not found"):
+        find_mesh("package://../outside.stl", packages)
 
 
 def test_meshes_are_scaled_and_found_where_they_may_be(tmp_path):
     (tmp_path / "pkg" / "urdf").mkdir(parents=True)
     (tmp_path / "pkg" / "package.xml").write_text("<package/>")
     (tmp_path / "pkg" / "a.stl").write_bytes(STL)
-    urdf = tmp_path / "pkg" / "urdf" / "x.urdf"
-    for uri in ("../a.stl", "package://pkg/a.stl", f"file://{tmp_path}/pkg/a.stl"):
-        assert find_mesh(uri, urdf) == (tmp_path / "pkg" / "a.stl").resolve()
+    packages = Packages(tmp_path / "pkg" / "urdf" / "x.urdf")
+    for uri in ("../a.stl", "..\\a.stl", "package://pkg/a.stl", f"file://{tmp_path}/pkg/a.stl"):
+        assert find_mesh(uri, packages) == (tmp_path / "pkg" / "a.stl").resolve()
     with pytest.raises(MeshError, match="package_dirs"):
-        find_mesh("package://elsewhere/a.stl", tmp_path / "lone" / "x.urdf")
+        find_mesh("package://elsewhere/a.stl", Packages(tmp_path / "lone" / "x.urdf"))
     (part,) = read_mesh(tmp_path / "pkg" / "a.stl", np.array([2.0, 3.0, -1.0]))
     np.testing.assert_allclose(np.ptp(part.vertices, axis=0), [2.0, 3.0, 0.0])
     a, b, c = part.vertices[part.faces[0]]

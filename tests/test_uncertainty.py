@@ -249,8 +249,9 @@ def test_what_cannot_be_bounded_is_refused_in_one_sentence():
     law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
     with pytest.raises(nbs.ArgumentError, match="give the reference too"):
         nbs.certify(law, [1.0, 1.0], uncertainty=nbs.Uncertainty(inertia=0.01))
+    heavy = nbs.Uncertainty(payload=nbs.Payload(20.0))
     with pytest.raises(nbs.CertificateRefused, match="state smaller shares"):
-        nbs.certify(law, [0.0, 0.0], reference=reference, uncertainty=nbs.Uncertainty(payload=nbs.Payload(20.0)))
+        nbs.certify(law, [0.0, 0.0], reference=reference, duration=1.0, uncertainty=heavy)
     for wrong in ({"inertia": 1.0}, {"viscous": -0.1}):
         with pytest.raises(nbs.ArgumentError, match="give a share"):
             nbs.Uncertainty(**wrong)
@@ -271,7 +272,7 @@ def test_shares_that_may_leave_no_positive_inertia_are_refused():
     for payload in (None, nbs.Payload(0.01)):
         wide = nbs.Uncertainty(inertia=0.4, payload=payload)
         with pytest.raises(nbs.CertificateRefused, match="not shown to be positive definite"):
-            nbs.certify(law, np.zeros(2), reference=reference, uncertainty=wide)
+            nbs.certify(law, np.zeros(2), reference=reference, duration=1.0, uncertainty=wide)
 
 
 def test_between_instants_accelerations_may_change_by_all_that_separates_two_of_them():

@@ -5,6 +5,7 @@ import copy
 import importlib
 import json
 import sys
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -22,8 +23,10 @@ from nbs_pin.inertia import multipliers
 from nbs_pin.robots.catalogue import find
 from nbs_pin.verification import verify as checker
 from nbs_pin.verification.balls import arb, balls, ctx, positive_definite
+from nbs_pin.verification.document import read_document
+from nbs_pin.verification.stated import FALSE, OPEN, TAKEN, VERIFIED
 from nbs_pin.verification.trees import differences, stated_tree, urdf_tree
-from nbs_pin.verification.verify import FALSE, OPEN, TAKEN, energy_form, verify
+from nbs_pin.verification.verify import energy_form, verify
 from tests.test_certificates import CONSTANTS
 from tests.test_certify_cli import GANTRY
 
@@ -343,11 +346,43 @@ def changed(document, path, change):
     return new
 
 
+@lru_cache(maxsize=64)
+def tree_of(arm):
+    with ctx.workprec(checker.BITS):
+        return checker._arm(json.loads(arm), None)
+
+
 def is_refused(document, path):
+    """Whether `verify` does not confirm the document: its parts up to the first that fails, the longest last."""
     try:
-        return not verify(written(document, path)).confirmed
+        document = read_document(written(document, path))
+        if document["label"] != "PROVED":
+            return True
+        with ctx.workprec(checker.BITS):
+            for part in (checker.stated, checker._constants, checker._levels, checker._errors):
+                if any(check.status in (OPEN, FALSE) for check in part(document)):
+                    return True
+            tree, checks = tree_of(json.dumps(document["arm"]))
+            return any(check.status in (OPEN, FALSE) for check in (*checks, *checker._inertias(document, tree)))
     except FileFormatError:
         return True
+
+
+def test_what_is_refused_part_by_part_is_what_verify_refuses(rubbing, tmp_path):
+    """Of one edit in every part, and of none."""
+    file = tmp_path / "c.json"
+    for path in (
+        ("constants", "rho"),
+        ("level", "storage"),
+        ("bounds", "error"),
+        ("inertia", 1, "value"),
+        ("arm", "joints", 1, "mass"),
+        ("conditions", 0, "right"),
+        ("disturbance", "box", 0),
+    ):
+        for factor in (0.9, 1.0, 1.1):
+            new = changed(rubbing, path, lambda x, by=factor: by * x)
+            assert is_refused(new, file) is not verify(written(new, file)).confirmed
 
 
 @pytest.mark.parametrize("fixture", DOCUMENTS)
@@ -521,6 +556,74 @@ def test_premises_are_listed(rubbing, tmp_path):
     assert {x["assumption"] for x in rubbing["assumptions"]} <= set(taken)
 
 
+def test_the_robot_that_is_given_must_be_the_one_that_was_certified(panda, tmp_path):
+    """Its numbers, its gravity and its locked joints."""
+    file = written(panda, tmp_path / "c.json")
+    found = verify(file, robot=nbs.load_robot("panda"))
+    assert found.confirmed
+    (held,) = [check for check in found.checks if check.name == "joints held at zero"]
+    assert held.status == TAKEN
+    assert all(name in held.because for name in find("panda").lock)
+    for robot, words in (
+        (
+            nbs.load_robot("panda", lock=(*find("panda").lock, "panda_joint7")),
+            r"that move are .* same joints locked\.$",
+        ),
+        (nbs.load_robot("panda", gravity=[0.0, 0.0, 9.81]), r"with the sha256 .*, with its gravity\.$"),
+        (nbs.load_robot("ur5"), "same joints locked"),
+    ):
+        with pytest.raises(FileFormatError, match=words):
+            verify(file, robot=robot)
+    nobody = written({**panda, "arm": {**panda["arm"], "sha256": None}}, tmp_path / "c.json")
+    with pytest.raises(FileFormatError, match="names no arm"):
+        verify(nobody, robot=nbs.load_robot("panda"))
+
+
+@pytest.mark.parametrize("name", ["mass", "inertia", "armature"])
+def test_an_inertia_that_is_not_positive_in_every_pose_is_refused(panda, name, tmp_path):
+    """A law with ωM in its damping needs no bound of M, but V ≥ Φ needs M ⪰ 0."""
+    document = copy.deepcopy(panda)
+    for line in document["inertia"]:
+        line |= {"value": 0.0, "label": "EMPIRICAL", "multipliers": None}
+    document["constants"] |= {"kappa": 0.0, "nu": None}
+    whole = document["arm"]["joints"][-1]
+    less = {"mass": -0.1, "inertia": (-np.eye(3)).tolist(), "armature": -0.1}[name]
+    with ctx.workprec(192):
+        for joint, wanted in ((whole, VERIFIED), (whole | {name: less}, FALSE)):
+            joints = [*document["arm"]["joints"][:-1], joint]
+            (found,) = list(checker._inertias(document, stated_tree(joints)))
+            assert (found.name, found.status) == ("M ≻ 0 in every pose", wanted)
+
+
+def test_conditions_along_a_reference_are_not_checked_and_say_so(rubbing, tmp_path):
+    file = tmp_path / "c.json"
+    found = {check.name: check for check in verify(written(rubbing, file)).checks}
+    along = [x for x in rubbing["conditions"] if x["checks"] is not None and x["role"] != "comparison"]
+    assert {"no joint reaches its stop", "torques stay within the effort limits"} <= {x["checks"] for x in along}
+    assert all(found[x["name"]].because.endswith("not checked") for x in along)
+
+
+def test_the_room_to_the_stops_is_held_against_the_bound_of_the_file(rubbing, tmp_path):
+    """A smaller error in the condition than in the bounds leaves room that there is not."""
+    (i,) = [i for i, x in enumerate(rubbing["conditions"]) if x["name"].startswith("room of")]
+    assert verify(written(rubbing, tmp_path / "c.json")).confirmed
+    for change in (
+        changed(rubbing, ("conditions", i, "right"), lambda x: 0.999 * x),
+        changed(rubbing, ("conditions", i, "name"), lambda x: x.replace("joint", "link")),
+    ):
+        found = verify(written(change, tmp_path / "c.json"))
+        assert f"{change['conditions'][i]['name']}: right side" in statuses(found, FALSE)
+
+
+def test_no_assumption_is_checked_without_its_conditions(rubbing, tmp_path):
+    dropped = copy.deepcopy(rubbing)
+    dropped["conditions"] = [x for x in rubbing["conditions"] if x["checks"] != "no joint reaches its stop"]
+    assert statuses(verify(written(dropped, tmp_path / "c.json")), FALSE) == ["no joint reaches its stop"]
+    i = [x["assumption"] for x in rubbing["assumptions"]].index("no joint reaches its stop")
+    honest = changed(dropped, ("assumptions", i, "checked"), lambda _: "not checked")
+    assert verify(written(honest, tmp_path / "c.json")).confirmed
+
+
 # Files that are no certificates, and the shell
 
 FAULTS = {
@@ -613,7 +716,11 @@ def test_the_shell_writes_and_verifies(tmp_path, capsys, monkeypatch):
     capsys.readouterr()
     assert cli.main(["verify", str(file)]) == 0
     printed = capsys.readouterr().out
-    assert "PROVED, and re-verified in 17 checks" in printed
+    assert "PROVED, and re-verified in 19 checks" in printed
+    assert "not checked" in printed
+    assert cli.main(["verify", str(file), "--robot", "two_link"]) == 0
+    assert cli.main(["verify", str(file), "--robot", "ur5"]) == 2
+    assert "give the robot with the same joints locked" in capsys.readouterr().err
     assert "4 multipliers, §6" in printed
     document = json.loads(file.read_text())
     file.write_text(json.dumps(changed(document, ("constants", "rho"), lambda x: 1.01 * x)))

@@ -279,7 +279,7 @@ def watched(certificate: nbs.Certificate, run: nbs.Run, bits: int) -> list[Watch
 
 def alarm(said: list[Watched]) -> int | None:
     """The row of the first alarm."""
-    return next((k for k, one in enumerate(said) if one.verdict != "promise kept"), None)
+    return next((k for k, one in enumerate(said) if one.excesses or one.broken), None)
 
 
 def naming(fault: str, said: list[Watched]) -> int | None:

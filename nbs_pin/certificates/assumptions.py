@@ -21,6 +21,8 @@ from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 
 WRONG = "the certificate is wrong"
 """The verdict if no violated assumption accounts for an exceeded bound."""
+LARGEST = 1e30
+"""Largest size of a sample: products of larger ones overflow."""
 ROUNDING, DIFFERENCES = 1e-9, 1e-3
 """Relative tolerances of a bound: for V itself, and for energies summed over periods."""
 EPS = float(np.finfo(float).eps)
@@ -40,11 +42,13 @@ def check_certificate(certificate: Any) -> None:
         )
 
 
-def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption, str], *, is_recorded: bool) -> str:
+def sentence(
+    at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption, str], *, is_recorded: bool, unseen: str = ""
+) -> str:
     """The verdict. at: the exceeded bounds and the time. failed: the violated assumptions with their times.
 
     is_recorded: whether the disturbance is recorded, so that it can be distinguished from a model error; from readings
-    of encoders neither can be told from a false measurement.
+    of encoders neither can be told from a false measurement. unseen: what was not compared with its bound, and when.
     """
     said = {name: name + when for name, when in failed.items()}
     if not is_recorded and Assumption.MODEL in said and Assumption.DISTURBANCE in said:
@@ -52,7 +56,8 @@ def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption,
         said[Assumption.MODEL] = ", or ".join([Assumption.MODEL, *like])
     named = "; ".join(said.values())
     if is_kept:
-        return "promise kept" + (f", though assumptions failed: {named}" if named else "")
+        kept = f"no bound was exceeded, but {unseen}" if unseen else "promise kept"
+        return kept + (f"{';' if unseen else ', though'} assumptions failed: {named}" if named else "")
     if not is_wrong:
         return f"promise broken{at}" + (f"; assumptions that failed: {named}" if named else "")
     why = f"for which the failed assumptions do not account ({named})" if named else "though no assumption failed"
@@ -62,6 +67,14 @@ def sentence(at: str, is_kept: bool, is_wrong: bool, failed: Mapping[Assumption,
 def looks_like(suspects: Sequence[str]) -> str:
     """The end of a verdict that names simple faults, each of which would explain the torques."""
     return f"; this looks like {' or '.join(suspects)}" if suspects else ""
+
+
+def in_which_time(certificate: Certificate, initial: float) -> str:
+    """The end of a verdict by bounds of continuous time, where a start with V(0) = `initial` [J] has no others."""
+    if not certificate.is_continuous_from(initial):
+        return ""
+    from_here = f"; from V(0) = {initial:.3g} J nothing is proved for held torques"
+    return f"{from_here}, and the bounds are those of continuous time"
 
 
 def listed(excesses: Sequence[str]) -> str:
@@ -118,7 +131,7 @@ class Promise(NamedTuple):
     @property
     def _largest(self) -> float:
         """The largest value that V can take [J]."""
-        return max(self.initial, self.certificate.storage)
+        return float(self.certificate.storage_bound(np.zeros(1), self.initial)[0])
 
 
 def quantities(
@@ -131,16 +144,20 @@ def quantities(
 def not_finite(
     at: LoopSamples, joint_names: Sequence[str], recorded: Float[np.ndarray, "rows n"] | None = None
 ) -> tuple[Bool[np.ndarray, " rows"], str]:
-    """Which rows hold a number that is not finite, and a name for the first of these, empty if there is none."""
+    """Which rows hold a number that is not finite or beyond `LARGEST`, and a name for the first; empty if none does."""
     named = [("q", at.q), ("v", at.v), ("q_d", at.q_ref), ("v_d", at.v_ref), ("a_d", at.a_ref)]
     named += [("the torque", at.tau), ("the command", at.tau_command)]
     named += [] if recorded is None else [("the recorded disturbance", recorded)]
-    bad = ~np.isfinite(np.stack([x for _, x in named]))
+    numbers = np.stack([x for _, x in named])
+    bad = ~(np.abs(numbers) <= LARGEST)
     rows = bad.any(axis=(0, 2))
     if not rows.any():
         return rows, ""
-    which, joint = np.argwhere(bad[:, int(rows.argmax())])[0]
-    return rows, f"{named[which][0]} of {joint_names[joint]}, which is not finite"
+    row = int(rows.argmax())
+    which, joint = np.argwhere(bad[:, row])[0]
+    value = float(numbers[which, row, joint])
+    why = f"is {value:.3g}, too large for any arm" if math.isfinite(value) else "is not finite"
+    return rows, f"{named[which][0]} of {joint_names[joint]}, which {why}"
 
 
 def noticeable(certificate: Certificate, step: Float[np.ndarray, "*periods"] | float) -> Float[np.ndarray, "*periods"]:
@@ -266,11 +283,11 @@ JUMPS = (Assumption.WRAP, Assumption.REFERENCE)
 def jumps(controller: LyapunovLaw, at: LoopSamples) -> dict[Assumption, Bool[np.ndarray, " periods"]]:
     """When the error of a continuous joint wrapped around, and when the reference contradicts its own derivatives."""
     z1, robot = controller.dynamics.difference(at.q, at.q_ref), controller.dynamics.robot
-    wrapped = np.zeros(len(z1) - 1, dtype=bool)
-    if robot is not None:
-        wrapped = (np.abs(np.diff(z1, axis=0)) > np.pi)[:, robot.continuous].any(axis=-1)
+    wrapped, continuous = np.zeros(len(z1) - 1, dtype=bool), None if robot is None else robot.continuous
+    if continuous is not None:
+        wrapped = (np.abs(np.diff(z1, axis=0)) > np.pi)[:, continuous].any(axis=-1)
     broken = wrapped & False
-    for rest, allowed in unexplained_steps(at.t, at.q_ref, at.v_ref, at.a_ref):
+    for rest, allowed in unexplained_steps(at.t, at.q_ref, at.v_ref, at.a_ref, continuous):
         broken = broken | (rest > allowed).any(axis=-1)
     return {Assumption.WRAP: np.asarray(wrapped), Assumption.REFERENCE: np.asarray(broken)}
 

@@ -52,7 +52,6 @@ def bounds_for_all(
         refuse(f"joint {int(tree.endless[0]) + 1} slides without position limits", "give it limits")
     errors = uncertainty.errors(robot, model)
     regressor = BodyRegressor(robot, model, errors)
-    along = AlongReference.of(regressor, law, reference, float(motion.t[-1]), constants)
     bounds = BodyBounds.of(robot, tree, errors, constants)
     # A payload only adds to M, the shares may take from it.
     own = (
@@ -62,6 +61,7 @@ def bounds_for_all(
     )
     if uncertainty.inertia > 0.0 and not math.isfinite(own.nu):
         refuse("within these shares M is not shown to be positive definite in every pose", "give smaller ones")
+    along = AlongReference.of(regressor, law, reference, float(motion.t[-1]), constants)
     rates = BodyRates.of(bounds, constants, motion)
     terms = Terms(law, constants, bounds, along, rates, friction)
     return body_error(terms, base, 0.0 if start is None else _first(law, regressor, start))

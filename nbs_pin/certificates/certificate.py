@@ -188,20 +188,35 @@ class Certificate:
         return self.level.storage
 
     def storage_bound(self, t: Float[np.ndarray, "*rows"], initial: float) -> Float[np.ndarray, "*rows"]:
-        """Bound of V(t) from V(0) = `initial` [J]: the lesser of e^{−ct}V(0) + V∞ and max(V(0), V∞), t in [s]."""
+        """Bound of V(t) from V(0) = `initial` [J]: the lesser of e^{−ct}V(0) + V∞ and max(V(0), V∞), t in [s].
+
+        Where bounds with held torques are proved from such a start, it is theirs, at the control instants.
+        """
         if self.bodies is not None:
             return np.full(t.shape, self.storage if initial <= self.bodies.start else np.inf)
+        if math.isfinite(held := self.held_storage(initial)):
+            return np.full(t.shape, held)
         return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
 
+    def held_storage(self, initial: float) -> float:
+        """Bound of V at the control instants with held torques, from V(0) = `initial` [J]; inf if none is proved."""
+        return math.inf if self.held is None else self.held.storage(initial, self.constants.nu)
+
+    def is_continuous_from(self, initial: float) -> bool:
+        """Whether bounds with held torques are proved from other starts, but not from V(0) = `initial` [J]."""
+        return self.held is not None and self.held.is_proved and not math.isfinite(self.held_storage(initial))
+
     def from_start(self, initial: float) -> tuple[float, JointArray]:
-        """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞)."""
+        """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞).
+
+        With held torques where they are proved from such a start, else in continuous time (`is_continuous_from`).
+        """
         if initial <= (0.0 if self.bodies is None else self.bodies.start):
             return self.error, self.joint_errors
         if self.bodies is not None:
             return math.inf, np.full(len(self.joint_errors), np.inf)
-        held, start = self.held, self.start
-        if held is not None and held.is_proved and start is not None and initial <= start.storage:
-            initial = max(initial, held.potential_from_start)
+        if self.held is not None and math.isfinite(proved := self.held.after(initial)[1]):
+            initial = max(initial, proved)
         return radians(self.stiffness, max(initial, self.potential))
 
     def summary(self) -> dict[str, Any]:

@@ -13,16 +13,19 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.rounding import SLACK, least_eigenvalue
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
 from nbs_pin.inertia.bounds import largest_diagonal, largest_inertia_bound, least_inertia_bound
-from nbs_pin.inertia.derivatives import inertia_derivatives, rate_bound
+from nbs_pin.inertia.derivatives import inertia_derivatives, rate_bound, single_rates
 from nbs_pin.robots.robot import Robot
 
 MOST_JOINTS = 8
 """Arms with more joints take too long."""
+_SHAPE = 1e-6
+"""Share of D₀ by which it may differ from a multiple of another one."""
 
 
 class MotionBounds(NamedTuple):
@@ -126,36 +129,65 @@ class _Key:
         return isinstance(other, _Key) and self._state == other._state
 
 
+class _Arm(NamedTuple):
+    """What does not depend on D₀, with names as in `CoriolisBounds`."""
+
+    relative: JointArray
+    single: JointArray
+    turn: float
+    sum_m: float
+    diagonal: JointArray
+
+
 @lru_cache(maxsize=8)
-def _relative(key: _Key) -> JointArray:
-    return inertia_derivatives(key.robot)
+def _arm(key: _Key) -> _Arm:
+    tree, n = RigidTree.of(key.robot), key.robot.nv
+    relative, single = inertia_derivatives(tree), single_rates(tree)
+    turn, sum_m = (rate_bound(tree, weights, single) for weights in (relative, np.ones(n)))
+    return _Arm(relative, single, turn, sum_m, largest_diagonal(tree))
+
+
+@lru_cache(maxsize=8)
+def _of_shape(key: _Key, shape_bytes: bytes, n: int) -> JointArray:
+    return inertia_derivatives(key.robot, np.frombuffer(shape_bytes).reshape(n, n))
+
+
+def _by_floor(key: _Key, floor: Float[np.ndarray, "n n"]) -> JointArray:
+    """γ', from that of the same floor in other units: designs of one arm differ by a factor, and a search takes long.
+
+    ±∂_iM ⪯ γ'F and F ⪯ D₀/s(1 − ε) give γ'/s(1 − ε) for D₀.
+    """
+    size = float(floor[0, 0])
+    shape = np.round(floor / size, 10)
+    if least_eigenvalue(floor / size - (1.0 - _SHAPE) * shape) <= 0.0:
+        return inertia_derivatives(key.robot, floor)
+    return np.asarray(_of_shape(key, shape.tobytes(), len(floor)) / (size * (1.0 - _SHAPE)) * (1.0 + SLACK))
 
 
 @lru_cache(maxsize=8)
 def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> CoriolisBounds:
     floor, rate = np.frombuffer(floor_bytes).reshape(n, n), np.frombuffer(rate_bytes)
     tree, inverse = RigidTree.of(key.robot), np.abs(np.linalg.inv(floor))
-    relative = _relative(key)
+    relative, single, turn, sum_m, diagonal = _arm(key)
     heaviest = largest_inertia_bound(tree, floor).value
-    by_floor = np.minimum(inertia_derivatives(tree, floor), relative * heaviest)
+    by_floor = np.minimum(_by_floor(key, floor), relative * heaviest)
 
     def largest(weights: JointArray) -> float:
         return math.sqrt(weights @ inverse @ weights)
 
-    diagonal = largest_diagonal(tree)
     weight = np.linalg.norm(key.robot.model.gravity.linear) * np.sqrt(_carried(tree) * diagonal)
     slowness = np.diag(1.0 / rate)
     return CoriolisBounds(
         relative=relative,
         by_floor=by_floor,
-        turn=rate_bound(tree, relative),
-        turn_d=rate_bound(tree, by_floor),
-        sum_m=rate_bound(tree, np.ones(n)),
+        turn=turn,
+        turn_d=rate_bound(tree, by_floor, single),
+        sum_m=sum_m,
         sum=largest(np.ones(n)),
         spread=largest(relative),
         spread_d=largest(by_floor),
         diagonal=diagonal,
-        single=np.array([rate_bound(tree, unit) for unit in np.eye(n)]),
+        single=single,
         weight=weight,
         gravity=largest(weight),
         loss_m=math.sqrt(largest_inertia_bound(tree, slowness).value),

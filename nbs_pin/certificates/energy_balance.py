@@ -97,12 +97,15 @@ def balance(
 ) -> Balance:
     """V̇ and its terms between each instant and the next one, to second order in the time between them.
 
-    change: the increase of V [J]. law: the compiled controller, for speed.
+    change: the increase of V [J]. law: the compiled controller, for speed. Positions of continuous joints count modulo
+    a turn.
     """
     h, asked = (after.t - before.t)[..., None], (controller if law is None else law).torque
-    q, v = _middle(before.q, after.q, before.v, after.v, h), 0.5 * (before.v + after.v)
+    apart = controller.dynamics.difference
+    q, q_ref = before.q + apart(after.q, before.q), before.q_ref + apart(after.q_ref, before.q_ref)
+    q, v = _middle(before.q, q, before.v, after.v, h), 0.5 * (before.v + after.v)
     target = Reference(
-        _middle(before.q_ref, after.q_ref, before.v_ref, after.v_ref, h),
+        _middle(before.q_ref, q_ref, before.v_ref, after.v_ref, h),
         _middle(before.v_ref, after.v_ref, before.a_ref, after.a_ref, h),
         0.5 * (before.a_ref + after.a_ref),
     )

@@ -49,7 +49,9 @@ def labels(certificate: Certificate) -> tuple[str, ...]:
     return ("V", "‖z1‖", *(f"|z1| of {name}" for name in certificate.joint_names))
 
 
-def bound(certificate: Certificate, initial: float, t: float) -> float:
-    """`Certificate.storage_bound` at one time."""
+def bound(certificate: Certificate, initial: float, held: float, t: float) -> float:
+    """`Certificate.storage_bound` at one time; held: `Certificate.held_storage` from `initial` [J]."""
+    if held < math.inf:
+        return held
     level = certificate.level
     return min(initial * math.exp(-level.c * max(t, 0.0)) + level.storage, max(initial, level.storage))

@@ -23,6 +23,8 @@ from nbs_pin.robots.robot import Robot
 
 _HALVINGS, _BISECTIONS = 7, 4
 _HERE = "docs/certificates.md §13"
+_NOTHING = (math.inf,) * 4
+_ROUNDING = 1e-9  # of a V(0) that is computed again
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,8 @@ class HeldTorque:
     """How far ahead the law is evaluated [s]."""
     level: float
     """Level of V' that no hold leaves from a start on the reference [J]; inf if none is proved."""
+    level_from_start: float
+    """The same from the given start [J]; no hold leaves it from any start with V(0) below it."""
     potential: float
     """Largest Φ from a start on the reference [J]."""
     potential_from_start: float
@@ -50,6 +54,17 @@ class HeldTorque:
     def is_proved(self) -> bool:
         """Whether the bounds hold at this period."""
         return math.isfinite(self.potential_from_start)
+
+    def after(self, initial: float) -> tuple[float, float]:
+        """The level of V' and the largest Φ from V(0) = `initial` [J], as V' ≤ V; inf beyond what is proved."""
+        for level, potential in ((self.level, self.potential), (self.level_from_start, self.potential_from_start)):
+            if self.is_proved and initial <= level * (1.0 + _ROUNDING):
+                return level, potential
+        return math.inf, math.inf
+
+    def storage(self, initial: float, nu: float) -> float:
+        """Bound of V at the control instants from V(0) = `initial` [J], as V' ≥ (1 − ½hν)V; inf if none is proved."""
+        return self.after(initial)[0] / (1.0 - 0.5 * self.period * nu)
 
     @property
     def condition(self) -> Condition:
@@ -95,7 +110,7 @@ def held_torque(
         raise ArgumentError(f"lookahead is {lead} s, expected 0 to the period of {period} s; half a period is usual.")
     why_not = other or _why_not(law, robot, motion, jerk)
     unknown = np.full(law.nv, np.inf)
-    nothing = HeldTorque(period, lead, math.inf, math.inf, math.inf, unknown, 0.0, why_not)
+    nothing = HeldTorque(period, lead, *_NOTHING, unknown, 0.0, why_not)
     if why_not or robot is None or motion is None or jerk is None:
         return nothing
     arm = CoriolisBounds.of(robot, constants)
@@ -113,9 +128,11 @@ def held_torque(
         return torque_bound(asked, arm, bounds, motion.half)
 
     begin = max(least, begin)
-    near, far = kept(period, least), kept(period, begin)
+    near = kept(period, least)
+    far = near if begin == least else kept(period, begin)
     if math.isfinite(far.potential):
-        found = near.level, near.potential, far.potential, room(max(near.seen, far.seen))
+        levels = near.level, max(near.level, far.level)
+        found = *levels, near.potential, far.potential, room(max(near.seen, far.seen))
         return HeldTorque(period, lead, *found, period, "")
     shorter = (period * 0.5**k for k in range(1, _HALVINGS + 1))
     longest = next((h for h in shorter if math.isfinite(kept(h, begin).potential)), 0.0)
@@ -123,7 +140,7 @@ def held_torque(
     for _ in range(_BISECTIONS if longest > 0.0 else 0):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if math.isfinite(kept(middle, begin).potential) else (low, middle)
-    return HeldTorque(period, lead, math.inf, math.inf, math.inf, room(begin), low, "")
+    return HeldTorque(period, lead, *_NOTHING, room(begin), low, "")
 
 
 def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None, jerk: JointArray | None) -> str:

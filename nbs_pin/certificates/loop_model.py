@@ -1,5 +1,7 @@
 """Law and model as a monitor evaluates them at readings of encoders: as machine code where there are kernels."""
 
+import copy
+import threading
 from abc import ABC, abstractmethod
 
 import numpy as np
@@ -61,8 +63,13 @@ class CompiledModel(LoopModel):
         compile_periods()
         law, tree = controller.packed_law(), controller.dynamics.packed_tree()
         assert tree is not None
-        self._packed = (*pack_tree_law(law, tree), np.empty(at.watch_workspace(law, tree)))
+        self._law, self._size = pack_tree_law(law, tree), at.watch_workspace(law, tree)
         self._n = controller.nv
+
+    @property
+    def _packed(self) -> tuple[np.ndarray, ...]:
+        """The law with scratch space of this call alone: a `Watch` may be used from several threads."""
+        return (*self._law, np.empty(self._size))
 
     def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
         """As in `LoopModel`."""
@@ -95,33 +102,42 @@ class PlainModel(LoopModel):
     """Any law with any model, as it is written."""
 
     def __init__(self, controller: LyapunovLaw) -> None:
-        self._law = controller
-        compiled = controller.compile()
-        self._quick = compiled if isinstance(compiled, MemorylessController) else controller
-        self._torque = self._quick.torque
+        self._controller = controller
+        self._of_thread: dict[int, tuple[LyapunovLaw, MemorylessController]] = {}
+        self._own()
+
+    def _own(self) -> tuple[LyapunovLaw, MemorylessController]:
+        """The law and its machine code, copied for the thread that calls: models keep scratch space."""
+        own = self._of_thread.get(threading.get_ident())
+        if own is None:
+            law = copy.deepcopy(self._controller)
+            compiled = law.compile()
+            own = law, compiled if isinstance(compiled, MemorylessController) else law
+            self._of_thread[threading.get_ident()] = own
+        return own
 
     def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
         """As in `LoopModel`."""
-        return float(self._law.storage(*sample[at.Q : at.V_REF + 1]))
+        return float(self._own()[0].storage(*sample[at.Q : at.V_REF + 1]))
 
     def period(
         self, before: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float, last: float
     ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
         """As in `LoopModel`."""
-        value, t = self.storage(after), np.array([0.0, h])
+        value, t, (law, quick) = self.storage(after), np.array([0.0, h]), self._own()
         first, second = (LoopSamples(t[k : k + 1], *x[:, None]) for k, x in enumerate((before, after)))
-        flow = balance(self._law, first, second, np.array([value - last]), self._quick)
+        flow = balance(law, first, second, np.array([value - last]), quick)
         numbers = (x[0] for x in flow[:6])
         return np.array([value, *numbers, *flow.state_norms[0]]), np.concatenate(flow[6:10])
 
     def observe(self, samples: Float[np.ndarray, "3 7 n"], period: float) -> Float[np.ndarray, "8 n"]:
         """As in `LoopModel`."""
-        law, now = self._law, samples[1]
+        (law, quick), now = self._own(), samples[1]
         ahead = law.dynamics.difference(samples[2, at.Q], now[at.Q])
         behind = law.dynamics.difference(now[at.Q], samples[0, at.Q])
         v, a = 0.5 * (ahead + behind) / period, (ahead - behind) / period**2
         torque = 0.5 * (samples[0, at.TAU] + now[at.TAU])
-        asked = self._torque(now[at.Q], now[at.V], now[at.Q_REF], now[at.V_REF], now[at.A_REF])
+        asked = quick.torque(now[at.Q], now[at.V], now[at.Q_REF], now[at.V_REF], now[at.A_REF])
         lag = now[at.COMMAND] - np.clip(
             now[at.COMMAND], *np.sort([asked, self._ahead(now, samples[2], period)], axis=0)
         )
@@ -134,16 +150,17 @@ class PlainModel(LoopModel):
         q, v, q_ref, v_ref, a = now[at.Q : at.A_REF + 1]
         ahead = (x + h * (rate + 0.5 * h * a) for x, rate in ((q, v), (q_ref, v_ref)))
         q, q_ref = ahead
-        return np.asarray(self._torque(q, v + h * a, q_ref, v_ref + h * a, after[at.A_REF]))
+        return np.asarray(self._own()[1].torque(q, v + h * a, q_ref, v_ref + h * a, after[at.A_REF]))
 
     def centre(
         self, mean: Float[np.ndarray, "8 n"], q: JointArray, resolution: JointArray, width: float
     ) -> tuple[Float[np.ndarray, "4"], JointArray]:
         """As in `LoopModel`."""
-        value, gradient, bend = self._law.potential_terms(mean[at.Z1], 0.5 * resolution)
-        error = resolution / width + self._law.rate_like(q) * np.abs(bend)
+        law, _ = self._own()
+        value, gradient, bend = law.potential_terms(mean[at.Z1], 0.5 * resolution)
+        error = resolution / width + law.rate_like(q) * np.abs(bend)
         out, share = np.empty(at.CENTRE), np.empty(len(q))
-        mass = np.ascontiguousarray(self._law.dynamics.mass_matrix(q))
+        mass = np.ascontiguousarray(law.dynamics.mass_matrix(q))
         at.settle(mean[at.Z2], mass, np.ascontiguousarray(gradient), error, resolution, out, share)
         out[at.PHI] = value
         return out, share

@@ -16,6 +16,7 @@ from nbs_pin.certificates.assumptions import (
     excess_of,
     failures,
     greatest,
+    in_which_time,
     is_cut,
     jumps,
     listed,
@@ -66,8 +67,12 @@ class Monitored:
     """Whether the run records a disturbance; without one, MODEL and DISTURBANCE cannot be distinguished."""
     is_wrong: bool
     """Whether a bound was exceeded by more than the failed assumptions account for."""
+    compared: Bool[np.ndarray, " rows"]
+    """When V and torques were compared with their bounds: from encoders, when a window of readings was full."""
     suspects: tuple[str, ...] = ()
     """From encoders: simple faults each of which would explain the torques of the last window with any."""
+    basis: str = ""
+    """What else the verdict has to say of the bounds."""
 
     @cached_property
     def exceeded(self) -> Bool[np.ndarray, " rows"]:
@@ -81,16 +86,28 @@ class Monitored:
 
     @property
     def is_kept(self) -> bool:
-        """Whether V, ‖z1‖ and every |z1_i| stayed within their bounds."""
-        return not self.excesses
+        """Whether V, ‖z1‖ and every |z1_i| stayed within their bounds; False if V was never compared with its own."""
+        return not self.excesses and bool(self.compared.any())
+
+    @property
+    def blind(self) -> float:
+        """For how long V and torques were not compared after the first time that they were [s]; inf if never."""
+        if not self.compared.any():
+            return np.inf
+        first = int(np.argmax(self.compared))
+        return float(np.diff(self.t)[first:][~self.compared[first + 1 :]].sum())
 
     @property
     def verdict(self) -> str:
         """One sentence: whether the bounds were kept, and which assumptions failed."""
         failed = {name: f" (t = {self.t[:-1][when][0]:.4g} s)" for name, when in self.failures.items()}
-        at = "" if self.is_kept else f" at t = {self.t[self.exceeded][0]:.4g} s by {listed(tuple(self.excesses))}"
-        said = sentence(at, self.is_kept, self.is_wrong, failed, is_recorded=self.is_recorded)
-        return said + looks_like(self.suspects)
+        exceeding, unseen = tuple(self.excesses), ""
+        at = f" at t = {self.t[self.exceeded][0]:.4g} s by {listed(exceeding)}" if exceeding else ""
+        if self.blind > 0.0:
+            when = f"for {self.blind:.4g} s" if self.compared.any() else "at any time"
+            unseen = f"V and torques were not compared {when}"
+        said = sentence(at, not exceeding, self.is_wrong, failed, is_recorded=self.is_recorded, unseen=unseen)
+        return said + looks_like(self.suspects) + self.basis
 
 
 def monitor(run: Run, certificate: Certificate, *, start: int = 0, encoders: Encoders | None = None) -> Monitored:
@@ -99,8 +116,8 @@ def monitor(run: Run, certificate: Certificate, *, start: int = 0, encoders: Enc
     The torque that the model does not explain is found from differences of v, so noise counts as disturbance unless
     `encoders` states it. The certificate is called wrong (`is_wrong`) if V or an error exceeds its bound by more than
     the energy supplied by inadmissible torques, whatever their cause, accounts for. The hold of the torque is reported
-    if it has supplied a noticeable share of the bound of V, or if a bound is exceeded. A number that is not finite
-    breaks the promise.
+    if it has supplied a noticeable share of the bound of V, or if a bound is exceeded. A number that is not finite, or
+    beyond 1e30, breaks the promise.
 
     Args:
         run: A run of the certified controller.
@@ -169,6 +186,8 @@ def _exact(
         failures=failed,
         is_recorded=bool(recorded.any()),
         is_wrong=is_wrong,
+        compared=~lost,
+        basis=in_which_time(certificate, promise.initial),
     )
 
 
@@ -210,6 +229,8 @@ def _read(
         failures={name: when for name, when in failed.items() if when.any()},
         is_recorded=False,
         is_wrong=any(x.is_wrong for x in seen),
+        compared=np.array([np.isfinite(x.storage) for x in seen]),
+        basis="" if memory is None else memory.basis,
         suspects=suspects[-1] if suspects else (),
     )
 

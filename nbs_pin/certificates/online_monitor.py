@@ -10,7 +10,7 @@ import numpy as np
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
-from nbs_pin.certificates.assumptions import JUMPS, check_certificate, listed, looks_like, not_finite, sentence
+from nbs_pin.certificates.assumptions import JUMPS, LARGEST, check_certificate, listed, looks_like, not_finite, sentence
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders
@@ -45,10 +45,12 @@ class Watched(NamedTuple):
     """One sentence, as in `Monitored`."""
     suspects: tuple[str, ...] = ()
     """From encoders: simple faults each of which would explain the torques of the last window."""
+    blind: float = 0.0
+    """For how long V and torques have not been compared [s]: from encoders, until a window of readings is full."""
 
     @property
     def is_kept(self) -> bool:
-        """Whether V, ‖z1‖ and every |z1_i| are within their bounds now."""
+        """Whether nothing that is compared now exceeds its bound; while `blind`, V and torques are not compared."""
         return not self.excesses
 
 
@@ -93,10 +95,11 @@ class Watch:
     ) -> tuple[Watched, WatchMemory | WindowMemory | None]:
         """The result at time t [s], and the memory for the next step; `memory` is None at first.
 
-        The torque `tau` acts from t on [N·m]. A number that is not finite breaks the promise at this instant and is
-        left out of the memory. Raises ArgumentError unless t is finite and after the previous instant.
+        The torque `tau` acts from t on [N·m]. A number that is not finite, or beyond 1e30, breaks the promise at this
+        instant and is left out of the memory. Any number of threads may use one Watch, each loop with its own memory.
+        Raises ArgumentError unless t is finite and after the previous instant.
         """
-        if not math.isfinite(t):
+        if not abs(t) <= LARGEST:
             raise ArgumentError(f"the instant is t = {t} s, expected a finite time; give the time of the sample.")
         way: Any = self._way
         if memory is not None and isinstance(memory, WatchMemory) != (self.encoders is None):
@@ -108,13 +111,13 @@ class Watch:
                 "reference's q, v and a, tau and tau_command; give one number per joint."
             )
         sample = np.array(rows, dtype=float)
-        if not np.isfinite(sample).all():
+        if not (np.abs(sample) <= LARGEST).all():
             _, what = not_finite(LoopSamples(np.zeros(1), *sample[:, None]), self.certificate.joint_names)
-            return self._lost(memory, what), None if memory is None else way.lost(memory)
+            return self._lost(memory, what, t), None if memory is None else way.lost(memory)
         glance, memory = way.begin(t, sample) if memory is None else way.step(memory, t, sample)
-        return _said(glance, memory.broken), memory
+        return _said(glance, memory), memory
 
-    def _lost(self, memory: WatchMemory | WindowMemory | None, what: str) -> Watched:
+    def _lost(self, memory: WatchMemory | WindowMemory | None, what: str, t: float) -> Watched:
         """The result at an instant with a number that is not finite."""
         nothing, n = math.nan, self.certificate.controller.nv
         broken = () if memory is None else memory.broken
@@ -129,18 +132,29 @@ class Watch:
             broken=broken,
             balance=None,
             verdict=sentence(f" by {what}", False, False, dict.fromkeys(broken, ""), is_recorded=False),
+            blind=0.0 if memory is None else _blind(memory, t),
         )
 
 
-def _said(glance: Glance, broken: tuple[Assumption, ...]) -> Watched:
+def _blind(memory: WatchMemory | WindowMemory, t: float) -> float:
+    """For how long V and torques have not been compared at time t [s]."""
+    if isinstance(memory, WatchMemory):
+        return 0.0
+    return t - (memory.began if math.isnan(memory.compared) else memory.compared)
+
+
+def _said(glance: Glance, memory: WatchMemory | WindowMemory) -> Watched:
+    broken, blind = memory.broken, _blind(memory, memory.t)
     is_wrong = glance.is_wrong and not any(name in JUMPS for name in broken)
     if glance.excesses and not broken and not is_wrong:
         broken = glance.cause
     verdict = "promise kept"
-    if glance.excesses or broken:
+    if glance.excesses or broken or math.isnan(glance.storage):
+        unseen = f"V and torques have not been compared for {blind:.4g} s" if math.isnan(glance.storage) else ""
         at, failed = f" by {listed(glance.excesses)}", dict.fromkeys(broken, "")
-        verdict = sentence(at, not glance.excesses, is_wrong, failed, is_recorded=False)
+        verdict = sentence(at, not glance.excesses, is_wrong, failed, is_recorded=False, unseen=unseen)
         verdict += looks_like(glance.suspects)
+    verdict += memory.basis
     return Watched(
         storage=glance.storage,
         promise=glance.promise,
@@ -153,4 +167,5 @@ def _said(glance: Glance, broken: tuple[Assumption, ...]) -> Watched:
         balance=glance.balance,
         verdict=verdict,
         suspects=glance.suspects,
+        blind=blind,
     )

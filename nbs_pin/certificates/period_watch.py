@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.certificates.assumptions import DIFFERENCES, EPS, ROUNDING, decayed, noticeable
+from nbs_pin.certificates.assumptions import DIFFERENCES, EPS, ROUNDING, decayed, in_which_time, noticeable
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Limits
@@ -27,6 +27,10 @@ class WatchMemory(NamedTuple):
     """Time of the last instant [s]."""
     initial: float
     """V at the first instant [J]."""
+    proved: float
+    """Bound of V that is proved for held torques from there [J]; inf if none is."""
+    basis: str
+    """What else a verdict has to say of the bounds from there."""
     bounds: Float[np.ndarray, " errors"]
     """Bounds of ‖z1‖ and each |z1_i| at the first instant [rad]."""
     widest: Float[np.ndarray, " errors"]
@@ -44,7 +48,9 @@ class WatchMemory(NamedTuple):
     broken: tuple[Assumption, ...] = ()
     """Assumptions that have failed so far."""
     has_gap: bool = False
-    """Whether an instant was not finite, so that what torques did since the last one is not known."""
+    """Whether an instant was not finite, so that what torques did then is not known."""
+    is_lost: bool = False
+    """Whether the last instant was."""
 
 
 class PeriodWatch:
@@ -65,10 +71,11 @@ class PeriodWatch:
     def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WatchMemory]:
         """What the first instant shows, and the memory after it."""
         initial, certificate = self.model.storage(sample), self.certificate
-        largest = max(initial, certificate.storage) or 1.0
+        proved, basis = certificate.held_storage(initial), in_which_time(certificate, initial)
+        largest = bound(certificate, initial, proved, 0.0) or 1.0
         (size, joints), (most, mosts) = certificate.from_start(initial), certificate.from_start(largest)
         bounds, widest = np.array([size, *joints]), np.array([most, *mosts])
-        memory = WatchMemory(t, t, initial, bounds, widest, sample, initial)
+        memory = WatchMemory(t, t, initial, proved, basis, bounds, widest, sample, initial)
         z1 = certificate.controller.dynamics.difference(sample[at.Q], sample[at.Q_REF])
         return self._glance(memory, np.asarray(z1), None, False), memory
 
@@ -78,6 +85,10 @@ class PeriodWatch:
         if not h > 0.0:
             raise ArgumentError(f"the instant t = {t} s is not after the last one, {memory.t} s; give them in order.")
         z1, found = np.empty(n), np.empty(periods.FINDINGS)
+        if memory.is_lost:  # torques are compared again from here on
+            memory = memory._replace(t=t, last=sample, storage=self.model.storage(sample), is_lost=False)
+            z1 = np.asarray(self.certificate.controller.dynamics.difference(sample[at.Q], sample[at.Q_REF]))
+            return self._glance(memory, z1, None, False), memory
         bits = verdicts.instant(before, sample, z1, h, self.limits.rows)
         terms, vectors = self.model.period(before, sample, h, memory.storage)
         periods.judge_period(terms, vectors.copy(), before, sample, h, *self.limits, found)
@@ -104,13 +115,13 @@ class PeriodWatch:
 
     def lost(self, memory: WatchMemory) -> WatchMemory:
         """The memory after an instant that is not finite."""
-        return memory._replace(has_gap=True)
+        return memory._replace(has_gap=True, is_lost=True)
 
     def _glance(
         self, memory: WatchMemory, z1: Float[np.ndarray, " n"], flow: Balance | None, lag_is_greatest: bool
     ) -> Glance:
-        certificate, largest = self.certificate, max(memory.initial, self.certificate.storage)
-        promise = bound(certificate, memory.initial, memory.t - memory.began)
+        certificate, start = self.certificate, (memory.initial, memory.proved)
+        largest, promise = bound(certificate, *start, 0.0), bound(certificate, *start, memory.t - memory.began)
         bounds = (math.sqrt(promise / largest) if largest > 0.0 else 1.0) * memory.bounds
         values = np.array([memory.storage, math.sqrt(z1 @ z1), *np.abs(z1)])
         promised = np.array([promise, *bounds])

@@ -210,25 +210,34 @@ def _limit(b: Hold) -> float:
     k, t = b.loop.constants, b.loop.t
     excess, spread, ends = _excess(b, rows)
 
-    def level(choice: Float[np.ndarray, " k"]) -> float:
+    def levels(choices: Float[np.ndarray, "many k"]) -> Float[np.ndarray, " many"]:
         """From t√(y² + d²) ≤ s(y² + d²) + t²/4s, a rate c of V', and the share of y² in W."""
-        s, c, share = choice.tolist() if k.omega > 0.0 else (*choice.tolist(), 1.0)
-        if not (0.0 < s <= 1.0 and 0.0 < c < 2.0 / b.loop.h and 0.0 <= share <= 1.0):
-            return math.inf
-        form = np.diag([1.0 - c / (2.0 * k.rho), 1.0 - s - c * share / (2.0 * k.kappa), 1.0, 1.0, 0.0])
-        form[2, 2] -= c * (1.0 - share) / (2.0 * k.omega) if k.omega > 0.0 else 0.0
-        form -= excess + c * ends + s * np.outer(spread, spread)
-        if np.linalg.eigvalsh(form[:4, :4])[0] <= 1e-9:
-            return math.inf
-        free = form[:4, 4]
-        return float((t * t / (4.0 * s) - form[4, 4] + free @ np.linalg.solve(form[:4, :4], free)) / c)
+        s, c = choices[:, 0], choices[:, 1]
+        share = choices[:, 2] if k.omega > 0.0 else np.ones(len(s))
+        form = np.zeros((len(s), 5, 5))
+        form[:, 0, 0], form[:, 1, 1] = 1.0 - c / (2.0 * k.rho), 1.0 - s - c * share / (2.0 * k.kappa)
+        form[:, 2, 2] = 1.0 - (c * (1.0 - share) / (2.0 * k.omega) if k.omega > 0.0 else 0.0)
+        form[:, 3, 3] = 1.0
+        form -= excess + c[:, None, None] * ends + s[:, None, None] * np.outer(spread, spread)
+        found, allowed = np.full(len(s), math.inf), (s > 0.0) & (s <= 1.0) & (c > 0.0) & (c < 2.0 / b.loop.h)
+        some = np.flatnonzero(allowed & (share >= 0.0) & (share <= 1.0))
+        some = some[np.linalg.eigvalsh(form[some, :4, :4])[:, 0] > 1e-9]
+        free = form[some, :4, 4]
+        gain = (free * np.linalg.solve(form[some, :4, :4], free[..., None])[..., 0]).sum(axis=-1)
+        found[some] = (t * t / (4.0 * s[some]) - form[some, 4, 4] + gain) / c[some]
+        return found
 
-    fastest = 2.0 * min(k.rho, k.omega + k.kappa)
-    rates = fastest * np.linspace(0.04, 1.0, 25)
+    rates = 2.0 * min(k.rho, k.omega + k.kappa) * np.linspace(0.04, 1.0, 25)
     # Without ω only y² bounds W, so its share is 1.
-    share = [0.0] if k.omega > 0.0 else []
-    best = min((np.array([*x, *share]) for x in product(np.linspace(0.1, 1.0, 19), rates)), key=level)
-    if not math.isfinite(level(best)):
+    grid = np.array([(*x, 0.0) for x in product(np.linspace(0.1, 1.0, 19), rates)])[:, : 3 if k.omega > 0.0 else 2]
+    tried = levels(grid)
+    best = int(np.argmin(tried))
+    if not math.isfinite(tried[best]):
         return math.inf
-    found = minimize(lambda x: min(level(x), 1e300), best, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8})
-    return min(level(best), level(found.x)) * UP
+    found = minimize(
+        lambda x: min(float(levels(x[None])[0]), 1e300),
+        grid[best],
+        method="Nelder-Mead",
+        options={"xatol": 1e-4, "fatol": 1e-8},
+    )
+    return min(float(tried[best]), float(levels(found.x[None])[0])) * UP

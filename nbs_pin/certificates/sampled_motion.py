@@ -4,13 +4,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import positive
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.robots.robot import configuration_difference
 
 STEP = 0.005
 """Longest time between instants [s], for at most `_MOST` of them."""
@@ -72,15 +73,17 @@ def unexplained_steps(
     q: Float[np.ndarray, "rows n"],
     v: Float[np.ndarray, "rows n"],
     a: Float[np.ndarray, "rows n"],
+    continuous: Bool[np.ndarray, " n"] | None = None,
 ) -> tuple[tuple[Float[np.ndarray, "steps n"], Float[np.ndarray, "steps n"]], ...]:
     """Of q and of v, what remains of each change after that which the derivatives explain, and what a motion may leave.
 
     Over a step h a smooth q changes by ½h(v₀ + v₁) − h²/12 (a₁ − a₀) up to terms of higher order, and v by ½h(a₀ + a₁);
-    accelerations may jump.
+    accelerations may jump. Positions of `continuous` joints count modulo a turn.
     """
     h = np.diff(t)[:, None]
     jump, size = np.abs(np.diff(a, axis=0)), np.abs(a[1:]) + np.abs(a[:-1])
-    moved = np.abs(np.diff(q, axis=0) - 0.5 * h * (v[1:] + v[:-1]) + h * h / 12.0 * np.diff(a, axis=0))
+    travel = configuration_difference(q[1:], q[:-1], continuous)
+    moved = np.abs(travel - 0.5 * h * (v[1:] + v[:-1]) + h * h / 12.0 * np.diff(a, axis=0))
     turned = np.abs(np.diff(v, axis=0) - 0.5 * h * (a[1:] + a[:-1]))
     rounding = tuple(_ROUNDING * (1.0 + np.abs(x[1:])) for x in (q, v))
     return (

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.certificates.assumptions import ROUNDING
+from nbs_pin.certificates.assumptions import ROUNDING, in_which_time
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders, Limits
@@ -35,6 +35,10 @@ class WindowMemory(NamedTuple):
     """Time of the last instant [s]."""
     initial: float
     """Upper bound of V at the first instant [J]."""
+    proved: float
+    """Bound of V that is proved for held torques from there [J]; inf if none is."""
+    basis: str
+    """What else a verdict has to say of the bounds from there."""
     bounds: Float[np.ndarray, " errors"]
     """Bounds of ‖z1‖ and each |z1_i| at the first instant [rad]."""
     samples: Float[np.ndarray, "last 7 n"]
@@ -51,6 +55,8 @@ class WindowMemory(NamedTuple):
     """Largest ratio of torque to bound so far."""
     broken: tuple[Assumption, ...] = ()
     """Assumptions that have failed so far."""
+    compared: float = math.nan
+    """Time of the last instant at which V and torques were compared [s]; NaN before the first."""
     has_gap: bool = False
     """Whether an instant was not finite or missing, so that what torques did then is not known."""
 
@@ -74,8 +80,8 @@ class WindowWatch:
 
     def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WindowMemory]:
         """What the first instant shows, and the memory after it."""
-        memory = WindowMemory(t, t, 0.0, np.zeros(0), sample[None])
-        memory = self._promising(memory, sample, 0.0 * self.resolution)
+        memory = WindowMemory(t, t, 0.0, math.inf, "", np.zeros(0), sample[None])
+        memory = self._promising(memory, sample, math.inf)
         return self._first(memory), memory
 
     def step(self, memory: WindowMemory, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WindowMemory]:
@@ -85,6 +91,8 @@ class WindowWatch:
             raise ArgumentError(f"the instant t = {t} s is not after the last one, {memory.t} s; give them in order.")
         if not len(memory.samples):
             memory = memory._replace(t=t, samples=sample[None])
+            if math.isnan(memory.period):  # how well the start is known takes two instants in a row
+                memory = self._promising(memory._replace(began=t), sample, math.inf)
             return self._first(memory), memory
         z1 = np.empty(len(self.resolution))
         bits = verdicts.instant(memory.samples[-1], sample, z1, period, self.limits.rows)
@@ -95,7 +103,7 @@ class WindowWatch:
             memory = memory._replace(**self._with(memory, self.model.observe(memory.samples, memory.period)))
             if memory.filled == len(memory.history):
                 told = self._window(memory)
-                memory = memory._replace(ratio=max(memory.ratio, told.ratio))
+                memory = memory._replace(ratio=max(memory.ratio, told.ratio), compared=t)
         glance = self._glance(memory, z1, told, failed)
         if any(name not in memory.broken for name in glance.failed):
             broken = tuple(name for name in Assumption if name in memory.broken or name in glance.failed)
@@ -111,22 +119,23 @@ class WindowWatch:
         """The memory after an instant that is not finite: the window begins anew."""
         return memory._replace(samples=memory.samples[:0], filled=0, has_gap=True)
 
-    def _promising(self, memory: WindowMemory, sample: Float[np.ndarray, "7 n"], error: JointArray) -> WindowMemory:
-        """The memory with the bounds from the state of a sample, whose z2 is known to within `error` [rad/s]."""
-        law, q = self.certificate.controller, sample[at.Q]
-        e, mass = law.errors(q, *sample[at.V : at.A_REF + 1]), law.dynamics.mass_matrix(q)
-        value = float(e.value) + 0.5 * float(np.abs(e.gradient) @ self.resolution)
-        kinetic, slack = float(e.z2 @ mass @ e.z2), float(error @ np.abs(mass) @ error)
-        initial = value + 0.5 * (math.sqrt(kinetic) + math.sqrt(slack)) ** 2
+    def _promising(self, memory: WindowMemory, sample: Float[np.ndarray, "7 n"], period: float) -> WindowMemory:
+        """The memory with the bounds from the state of a sample, whose velocity is differenced over `period` [s]."""
+        e = self.certificate.controller.errors(sample[at.Q], *sample[at.V : at.A_REF + 1])
+        mean = np.zeros((at.SIGNALS, sample.shape[1]))
+        mean[at.Z1], mean[at.Z2] = e.z1, e.z2
+        (phi, more, kinetic, slack), _ = self.model.centre(mean, sample[at.Q], self.resolution, period)
+        initial = float(phi + more) + (math.sqrt(kinetic) + math.sqrt(slack)) ** 2
         size, joints = self.certificate.from_start(initial)
-        return memory._replace(initial=initial, bounds=np.array([size, *joints]))
+        proved, basis = self.certificate.held_storage(initial), in_which_time(self.certificate, initial)
+        return memory._replace(initial=initial, proved=proved, basis=basis, bounds=np.array([size, *joints]))
 
     def _in_time(self, memory: WindowMemory, period: float) -> WindowMemory:
         """The memory with a window for this period [s]; it begins anew where instants are not evenly spaced."""
         if abs(period - memory.period) <= _UNEVEN * memory.period:
             return memory
         if math.isnan(memory.period):
-            memory = self._promising(memory, memory.samples[-1], self.resolution / period)
+            memory = self._promising(memory._replace(began=memory.t), memory.samples[-1], period)
         else:
             memory = memory._replace(has_gap=True)
         half = self.encoders.half_width(self.certificate, period)
@@ -181,12 +190,13 @@ class WindowWatch:
     def _glance(
         self, memory: WindowMemory, z1: JointArray, told: "_Told | None", failed: tuple[Assumption, ...]
     ) -> Glance:
-        certificate, t, first = self.certificate, memory.t - memory.began, max(memory.initial, self.certificate.storage)
-        fallen = math.sqrt(bound(certificate, memory.initial, t) / first) if first > 0.0 else 1.0
+        certificate, t, start = self.certificate, memory.t - memory.began, (memory.initial, memory.proved)
+        first = bound(certificate, *start, 0.0)
+        fallen = math.sqrt(bound(certificate, *start, t) / first) if first > 0.0 else 1.0
         errors, bounds = np.array([math.sqrt(z1 @ z1), *np.abs(z1)]), fallen * memory.bounds
         over = (errors - self._reach > bounds * (1.0 + ROUNDING)).nonzero()[0].tolist()
         excesses = [self._labels[k + 1] for k in over]
-        promise = bound(certificate, memory.initial, t - (0.0 if told is None else 2.0 * memory.half * memory.period))
+        promise = bound(certificate, *start, t - (0.0 if told is None else 2.0 * memory.half * memory.period))
         if told is not None and not told.least <= promise * (1.0 + ROUNDING):
             excesses.insert(0, "V")
         failed = failed if told is None else (*failed, *told.failed)

@@ -1,13 +1,15 @@
 """`nbs-pin certify`: bounds of the tracking error before the arm moves, and the worst motion that a search finds."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.file_units import FileUnits
 from nbs_pin.cli.values import (
     OptionError,
     choice,
@@ -54,7 +56,7 @@ def friction_text() -> PrimitiveConstructorSpec[str]:
 
 
 @dataclass(frozen=True)
-class Certify:
+class Certify(FileUnits):
     """Certify a controller: bound its tracking error under any bounded disturbance, and say how each bound is known.
 
     Print every constant, condition and bound with its label PROVED, VERIFIED, PROBABILISTIC or EMPIRICAL, and write
@@ -121,3 +123,5 @@ class Certify:
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another certificate in that folder."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

@@ -1,11 +1,12 @@
 """`nbs-pin collect`: motions of an arm in MuJoCo, as data for learning its dynamics."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.values import default, integer, number
 
 
@@ -48,3 +49,5 @@ class Collect:
     """Folder for the results."""
     force: bool = False
     """Overwrite other data in that folder."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

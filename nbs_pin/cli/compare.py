@@ -1,13 +1,14 @@
 """`nbs-pin compare`: errors of a model of an arm against Pinocchio's."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.values import OptionError, default, integer, number, text
 
 
@@ -60,3 +61,5 @@ class Compare:
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another comparison in that folder."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

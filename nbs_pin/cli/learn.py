@@ -1,17 +1,19 @@
 """`nbs-pin learn`: a model of an arm from data, and its error on held-out motions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.file_units import FileUnits
 from nbs_pin.cli.values import choice, default, integer, number
 from nbs_pin.identification.registry import MODELS
 
 
 @dataclass(frozen=True)
-class Learn:
+class Learn(FileUnits):
     """Learn a model of an arm from data, and write model.nbs, summary.json and learning.png.
 
     Ctrl-C ends the fit of a network early and keeps the best iteration. Compare the result with Pinocchio's model:
@@ -29,6 +31,10 @@ class Learn:
     identified: inertias by least squares, in the geometry of the URDF."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the one named in the data")] = None
     """The arm by name or a path to a .urdf or .xacro file; a log does not name it."""
+    window: Annotated[float | None, number("--window", above=0.0, most=100.0, unit="s"), default("0.1")] = None
+    """Width of the window in which a log without v and a is differentiated [s]."""
+    resample: Annotated[float | None, number("--resample", least=1e-6, most=10.0, unit="s"), default("off")] = None
+    """Interpolate a log whose rows are not evenly spaced to this step [s]."""
     friction: bool = False
     """Also learn viscous and Coulomb friction of every joint."""
     held_out: Annotated[float, number("--held-out", least=0.0, most=0.9, unit="")] = 0.2
@@ -49,3 +55,5 @@ class Learn:
     """Folder for the results."""
     force: bool = False
     """Overwrite another model in that folder."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

@@ -1,11 +1,12 @@
 """`nbs-pin replay`: a recorded run as a page for the browser."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.values import default, integer
 
 
@@ -28,3 +29,5 @@ class Replay:
     """Open the page in the browser."""
     force: bool = False
     """Overwrite the file that --out names."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from nbs_pin import __version__
+from nbs_pin.base.doors import at_the_shell
 from nbs_pin.base.exceptions import CertificateRefused, NbsPinError
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.certify import Certify
@@ -71,7 +72,7 @@ def run(arguments: list[str], stops: list[int], begin: Callable[[], Any]) -> int
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters shows ? for them
     notes = Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
-    with _warnings_to(notes):
+    with _warnings_to(notes), at_the_shell():
         try:
             return _run(arguments, notes, stops, begin)
         except BaseException as error:
@@ -148,7 +149,8 @@ def parse(arguments: list[str]) -> Any:
             return None
         raise OptionError(f"{_first_paragraph(complaint.getvalue())}; see nbs-pin --help.") from None
     if unknown:
-        flags = [f"--{name.replace('_', '-')}" for name in vars(command)]
+        options = {**vars(command), **vars(getattr(command, "arm", command))}
+        flags = [f"--{name.replace('_', '-')}" for name in options]
         what = "has no option" if unknown[0].startswith("-") else "takes no argument"
         remedy = f"{_near(unknown[0], flags)}see nbs-pin {arguments[0]} --help."
         raise OptionError(f"nbs-pin {arguments[0]} {what} '{unknown[0]}'; {remedy}")

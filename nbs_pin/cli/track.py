@@ -1,19 +1,21 @@
 """`nbs-pin track`: simulate an arm that follows a motion; write run, summary, figure and replay."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.file_units import FileUnits
 from nbs_pin.cli.values import SAVED, choice, configuration, default, disturbance_text, integer, number
 from nbs_pin.controllers.registry import LAWS
 from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
 
 
 @dataclass(frozen=True)
-class Track:
+class Track(FileUnits):
     """Simulate an arm that follows a motion, and write run.npz, summary.json, tracking.png and replay.html.
 
     Example: nbs-pin track panda --start-error 0.3 --disturbance square:5@8 --out out/panda
@@ -70,3 +72,5 @@ class Track:
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another run in that folder."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

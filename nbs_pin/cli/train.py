@@ -1,12 +1,13 @@
 """`nbs-pin train`: train a controller through the closed loop, and compare before and after on fresh starts."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.values import SAVED, choice, default, integer, number, positive_list
 from nbs_pin.controllers.registry import LAWS
 
@@ -67,3 +68,5 @@ class Train:
     """Continue the training in that folder as if it had not been stopped."""
     force: bool = False
     """Overwrite the results of another training in that folder."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""

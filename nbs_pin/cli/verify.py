@@ -23,3 +23,5 @@ class Verify:
     """A certificate.json of nbs-pin certify --json."""
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="ARM.urdf"), default("the one that the file names")] = None
     """The URDF that the arm of the file must be."""
+    robot: Annotated[str | None, tyro.conf.arg(metavar="ARM"), default("any")] = None
+    """The arm, by name or path, that the certificate must be of."""

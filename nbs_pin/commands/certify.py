@@ -71,9 +71,11 @@ def _controller(options: Certify) -> LyapunovLaw:
     if name.endswith(SAVED) and options.feed_friction:
         raise OptionError(f"--feed-friction is for a law built here, and '{name}' holds one; omit it.")
     if name.endswith(SAVED):
+        if options.against is None:
+            options.arm.refuse_without_arm(f"'{name}' names its arm; omit it")
         law: Any = load(name)
     else:
-        robot = load_robot(name)
+        robot = load_robot(name, **options.arm.given())
         stated = _friction(options.friction, robot) or JointFriction.of(robot)
         law = build_law(options.law, robot, friction=stated if options.feed_friction else None, **settings)
     if not isinstance(law, LyapunovLaw):
@@ -92,7 +94,7 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
     """The task that the options describe; raises OptionError if they do not fit each other."""
     _check_options(options)
     period = options.period or 0.001
-    truth = None if options.against is None else load_robot(options.against)
+    truth = None if options.against is None else load_robot(options.against, **options.arm.given())
     blank = Task(reference=_no_motion, truth=truth)
     robot = arm_of(controller, blank)
     if options.trajectories is not None and is_exact(controller.dynamics, robot):
@@ -100,7 +102,9 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
             f"--trajectories applies to a model that is not exact, and this one is exact for {robot.name}; "
             "omit it, or give the true arm with --against."
         )
-    motion, duration = motion_of(options.reference, robot, frequency=options.frequency, period=period)
+    motion, duration = motion_of(
+        options.reference, robot, frequency=options.frequency, period=period, **options.units()
+    )
     numbers = None if options.disturbance is None else plain_numbers(options.disturbance) or []
     return dataclasses.replace(
         blank,

@@ -27,7 +27,7 @@ _AT_LIMIT = 1.0 - 1e-9
 def run(options: Collect, console: Console, notes: Console) -> None:
     """Collect, write and print; raises NbsPinError or OSError."""
     with notes.status(f"loading {options.robot}"):
-        robot = load_robot(options.robot)
+        robot = load_robot(options.robot, **options.arm.given())
     if options.friction and not (robot.damping.any() or robot.friction.any()):
         raise OptionError(f"--friction was given, but the URDF of {robot.name} states none; omit it.")
     results = Results.of(options, robot.name, robot, robot=robot.source)

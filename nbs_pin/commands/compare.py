@@ -44,7 +44,9 @@ _PRINTED = {"mass_matrix": "M", "coriolis": "C v", "gravity": "G", "inverse": "t
 def run(options: Compare, console: Console, notes: Console) -> None:
     """Compare, write and print; raises NbsPinError or OSError."""
     with notes.status(f"loading {options.model}"):
-        model = model_of(options.model)
+        if options.model.endswith(SAVED) and options.against is None:
+            options.arm.refuse_without_arm(f"'{options.model}' names its arm; give it with --against")
+        model = model_of(options.model, **options.arm.given())
         robot = _arm(options, model)
         region = _region(options, robot)
         recorded = None if options.along is None else Run.load(options.along)
@@ -70,7 +72,7 @@ class Comparison(NamedTuple):
     """Why there is no closed loop, empty if there is one."""
 
 
-def model_of(text: str) -> DynamicsProvider:
+def model_of(text: str, **load_options: Any) -> DynamicsProvider:
     """The model in a .nbs file, the model of a controller in a .nbs file, or Pinocchio's model of an arm.
 
     Raises:
@@ -82,7 +84,7 @@ def model_of(text: str) -> DynamicsProvider:
             "or .xacro file."
         )
     if not text.endswith(".nbs"):
-        return PinocchioDynamics(load_robot(text))
+        return PinocchioDynamics(load_robot(text, **load_options))
     stored: Any = load(text)
     if isinstance(stored, DynamicsProvider):
         return stored
@@ -261,7 +263,7 @@ def _rows(found: dict[str, Any], robot: Robot) -> Iterator[tuple[str, str, Any]]
 def _arm(options: Compare, model: DynamicsProvider) -> Robot:
     """The true arm; raises OptionError if neither the file nor the options name one."""
     if options.against is not None:
-        return load_robot(options.against)
+        return load_robot(options.against, **options.arm.given())
     if model.robot is None or not options.model.endswith(SAVED):
         raise OptionError(f"'{options.model}' does not name its true arm; give --against ROBOT.")
     return model.robot

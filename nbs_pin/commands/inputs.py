@@ -10,6 +10,7 @@ from nbs_pin.cli.values import SAVED, OptionError
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.robots.urdf_options import ALL
 from nbs_pin.storage.checkpoints import load
 
 
@@ -17,10 +18,14 @@ def arm_of(options: Track | Train) -> Robot:
     """The arm with the effort limits of the options; raises OptionError if they contradict each other."""
     if options.no_effort_limit and options.effort_limit is not None:
         raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
-    robot = load_robot(options.robot)
+    given = options.arm.given()
     if options.no_effort_limit or options.effort_limit is not None:
-        return robot.with_effort_limit(options.effort_limit or math.inf)
-    return robot
+        limits = given.get("limits", {})
+        if any("effort" in stated for stated in limits.values()):
+            raise OptionError("--limits states an effort, and --effort-limit or --no-effort-limit another; choose one.")
+        effort = {"effort": options.effort_limit or math.inf}
+        given["limits"] = {**limits, ALL: {**limits.get(ALL, {}), **effort}}
+    return load_robot(options.robot, **given)
 
 
 def law_of(name: str, robot: Robot, **settings: Any) -> Controller:

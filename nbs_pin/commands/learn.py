@@ -1,6 +1,7 @@
 """`nbs-pin learn`: a model of an arm from data, and its error on held-out motions."""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,10 @@ _ENDED = {"held out": "no further progress on held-out data", "iterations": "all
 def run(options: Learn, console: Console, notes: Console) -> None:
     """Learn, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     with notes.status(f"loading {options.data}"):
-        data, robot = data_and_arm(options.data, options.robot)
+        if options.robot is None:
+            options.arm.refuse_without_arm("give the arm with --robot")
+        read = options.units() | {"resample": options.resample, "window": options.window}
+        data, robot = data_and_arm(options.data, options.robot, read, options.arm.given())
     name = options.data.stem if robot is None else robot.name
     # Data are identified by their fingerprint, not by their path.
     results = Results.of(options, name, robot, data=None, data_sha256=sha256_of(options.data))
@@ -89,10 +93,15 @@ def arm_of(data: Dataset) -> Robot | None:
     return robot
 
 
-def data_and_arm(path: str | Path, arm: str | None) -> tuple[Dataset, Robot | None]:
-    """The data in a file (`load_log`) and the arm of that name or path, or else the one that the data name."""
-    given = None if arm is None else load_robot(arm)
-    data = load_log(path, robot=given)
+def data_and_arm(
+    path: str | Path, arm: str | None, read: Mapping[str, Any], load: Mapping[str, Any] | None = None
+) -> tuple[Dataset, Robot | None]:
+    """The data in a file and the arm of that name or path, or else the one that the data name.
+
+    `read` has further arguments of `load_log`, `load` of `load_robot`.
+    """
+    given = None if arm is None else load_robot(arm, **(load or {}))
+    data = load_log(path, robot=given, **read)
     return data, given or arm_of(data)
 
 

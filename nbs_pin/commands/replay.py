@@ -20,7 +20,9 @@ def run(options: Replay, console: Console, notes: Console) -> None:
     if options.out and page.exists() and not options.force:
         raise OptionError(f"'{page}' exists; give another --out, or --force to replace it.")
     with notes.status(f"drawing {page}"):
-        robot = None if options.robot is None else load_robot(options.robot)
+        if options.robot is None:
+            options.arm.refuse_without_arm("the run names its arm; give it with --robot")
+        robot = None if options.robot is None else load_robot(options.robot, **options.arm.given())
         replay(Run.load(source), page, robot, start=options.start)
     console.print(str(page), soft_wrap=True, highlight=False, markup=False)
     if options.open and not webbrowser.open(page.resolve().as_uri()):

@@ -45,7 +45,9 @@ def run(options: Track, console: Console, notes: Console) -> None:
         raise OptionError("--start and --start-error were both given; choose one.")
     with notes.status(f"loading {options.robot}"):
         robot = arm_of(options)
-    motion, length = motion_of(options.reference, robot, frequency=options.frequency, period=options.period)
+    motion, length = motion_of(
+        options.reference, robot, frequency=options.frequency, period=options.period, **options.units()
+    )
     duration = options.duration or length
     results = Results.of(options, robot.name, robot, robot=robot.source, duration=duration)
     results = results.check(FILES, options.force)
@@ -110,7 +112,7 @@ def track(
     friction = JointFriction.of(robot) if joint_friction == "keep" else None
     reference = Sinusoid.for_robot(robot) if reference is None else reference
     _check_size(robot.nv, duration, period)
-    check_reference(reference, robot, duration)
+    check_reference(reference, robot, duration, joint_friction=joint_friction)
     if not isinstance(controller, Controller):
         controller = law_of(controller, robot, bandwidth=bandwidth, period=period, friction=friction, seed=seed)
     if not isinstance(plant, Plant):

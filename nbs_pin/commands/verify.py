@@ -7,7 +7,9 @@ from rich.text import Text
 
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.verify import Verify
-from nbs_pin.verification.verify import FALSE, OPEN, TAKEN, VERIFIED, Verification, verify
+from nbs_pin.robots.robot import load_robot
+from nbs_pin.verification.stated import FALSE, OPEN, TAKEN, VERIFIED
+from nbs_pin.verification.verify import Verification, verify
 
 _TITLES = {
     FALSE: "not shown true",
@@ -20,7 +22,8 @@ _TITLES = {
 def run(options: Verify, console: Console, notes: Console) -> int:
     """Verify, print and return the exit code; raises NbsPinError or OSError."""
     with notes.status(f"checking {options.certificate}"):
-        found = verify(options.certificate, urdf=options.urdf)
+        robot = None if options.robot is None else load_robot(options.robot)
+        found = verify(options.certificate, urdf=options.urdf, robot=robot)
     for status, title in _TITLES.items():
         if any(check.status == status for check in found.checks):
             console.print(_table(title, found, status))

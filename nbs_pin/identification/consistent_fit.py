@@ -41,6 +41,11 @@ class ConsistentFit:
     decrement: float
     """The last Newton decrement: distance to the minimum in the norm of the Hessian over γ."""
 
+    @property
+    def converged(self) -> bool:
+        """Whether the last step led to the minimum."""
+        return self.decrement < _NEAR
+
 
 def consistent_fit(
     design: Float[np.ndarray, "rows unknowns"], target: Float[np.ndarray, " rows"], bodies: int, strength: float

@@ -1,6 +1,7 @@
 """`fit`: a model of an arm from measured motions, chosen by name."""
 
 import time
+import warnings
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,10 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.compatibility import arm_fault, other_data_fault
 from nbs_pin.identification.datasets import Dataset
-from nbs_pin.identification.fit_report import FitReport, torque_nmse
+from nbs_pin.identification.doubts import doubts
+from nbs_pin.identification.fit_report import FitReport, torque_nmse, zero_torque_nmse
 from nbs_pin.identification.fitters import FitTask
+from nbs_pin.identification.identify import sign_fault
 from nbs_pin.identification.registry import MODELS
 from nbs_pin.robots.robot import Robot
 
@@ -49,7 +52,8 @@ def fit(
 
     Raises:
         ArgumentError: If the model or a setting is unknown, the robot is missing, data, robot and held_out are not of
-            one arm (`compatibility.py`), or the data have no torque and the loss is not "acceleration".
+            one arm (`compatibility.py`), the torque of a joint has the wrong sign for the robot (`sign_fault`), or the
+            data have no torque and the loss is not "acceleration".
 
     Example:
         >>> import nbs_pin as nbs
@@ -59,7 +63,7 @@ def fit(
         True
     """
     fitter = entry("model", model, MODELS).load()
-    fault = "" if robot is None else arm_fault(data, robot)
+    fault = "" if robot is None else arm_fault(data, robot) or (sign_fault(data, robot) if data.tau.any() else "")
     if fault:
         raise ArgumentError(f"{fault}.")
     start = time.perf_counter()
@@ -77,10 +81,12 @@ def fit(
         held_out=fitted.held_out,
         train_nmse=torque_nmse(bare, train, fitted.friction),
         test_nmse=None if test is None else torque_nmse(bare, test, fitted.friction),
-        stopped=fitted.stopped,
+        stopped=_ended(fitted.stopped, bare, train if test is None else test, fitted.friction),
         unidentifiable=_useless(bare, train, fitted.friction) + fitted.unidentifiable,
         details=fitted.details,
     )
+    for doubt in doubts(bare, train, fitted.friction, robot):
+        warnings.warn(f"{doubt}.", stacklevel=2)
     return fitted.assemble(report)
 
 
@@ -93,6 +99,12 @@ def split_data(data: Dataset, held_out: Dataset | float | None = None, seed: int
         return data, held_out
     share = (HELD_OUT if data.trajectories > 1 else 0.0) if held_out is None else held_out
     return (data, None) if share == 0.0 else data.split(share, seed)
+
+
+def _ended(stopped: str, model: DynamicsProvider, data: Dataset, friction: JointFriction | None) -> str:
+    """Why the fit ended, unless no torque at all predicts the data as well."""
+    worthless = data.tau.any() and torque_nmse(model, data, friction) >= zero_torque_nmse(data)
+    return "no better than zero torque" if worthless and stopped != "interrupted" else stopped
 
 
 def _useless(model: DynamicsProvider, data: Dataset, friction: JointFriction | None) -> tuple[str, ...]:

@@ -37,7 +37,8 @@ class FitReport:
     """The same on the held-out data, None without; optimistic for a network, whose iteration these selected."""
     stopped: str
     """Why it ended: "converged", "iterations", "held out" (no improvement there), "interrupted", or, for a chain,
-    "starts": no other random tree found the best minimum, or no physical bodies reach it; give more data or starts."""
+    "starts": no other random tree found the best minimum, or no physical bodies reach it; give more data or starts.
+    However it ended, "no better than zero torque" if that predicts the data as well."""
     unidentifiable: tuple[str, ...]
     """What the data do not determine, the worst first."""
     details: Mapping[str, Any] = field(default_factory=dict)
@@ -50,11 +51,20 @@ def torque_errors(model: DynamicsProvider, data: Dataset, friction: JointFrictio
     return torque - data.tau if friction is None else torque + friction.torque(data.v) - data.tau
 
 
+def zero_torque_nmse(data: Dataset) -> float:
+    """`torque_nmse` of a model that predicts no torque at all."""
+    return _nmse(data.tau, data)
+
+
 def torque_nmse(model: DynamicsProvider, data: Dataset, friction: JointFriction | None = None) -> float:
     """Mean over joints of mean squared torque error over torque variance; joints whose torque is constant are left out.
 
     The model's torque includes the given friction. NaN if no torque varies.
     """
-    squares, variance = np.square(torque_errors(model, data, friction)).mean(axis=0), data.tau.var(axis=0)
+    return _nmse(torque_errors(model, data, friction), data)
+
+
+def _nmse(errors: np.ndarray, data: Dataset) -> float:
+    squares, variance = np.square(errors).mean(axis=0), data.tau.var(axis=0)
     varies = variance > _VARIES * max(variance.max(), np.square(data.tau).max())
     return float((squares[varies] / variance[varies]).mean()) if varies.any() else float("nan")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
@@ -159,6 +160,7 @@ def fit_identified(task: FitTask) -> Fitted:
         friction=found.friction,
         parameters=numbers + (0 if found.friction is None else 2 * task.data.nv),
         evaluations=report.steps,
+        stopped="converged" if report.converged else "iterations",
         unidentifiable=report.unidentifiable,
         details={"noise_Nm": np.asarray(report.noise).tolist(), "condition": float(report.condition)},
     )
@@ -166,5 +168,5 @@ def fit_identified(task: FitTask) -> Fitted:
 
 def _needed(task: FitTask) -> Robot:
     if task.robot is None:
-        raise ArgumentError(f"model '{task.model}' needs the arm's URDF; give robot=nbs.load_robot(…).")
+        raise ArgumentError(f"model '{task.model}' needs the arm's URDF; give {option('robot', BLANK)}.")
     return task.robot

@@ -17,6 +17,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pseudo_inertia import PARAMETERS_OF_COORDINATES, coordinates, inertial_parameters
+from nbs_pin.identification.compatibility import arm_fault
 from nbs_pin.identification.consistent_fit import ConsistentFit, consistent_fit, in_factors
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.regressor import (
@@ -37,8 +38,16 @@ _NEGLIGIBLE = 1e-6
 """Share of the largest singular value below which the torque counts as independent of a direction."""
 _RANDOM_STATES = 80
 """Random states that determine the base directions: six equations for each of a joint's 13 unknowns."""
+_SOME, _PRIOR = 1_000, 0.3
+"""Samples that decide on the signs of torques; γ of these fits."""
+_WELL = 0.02
+"""Unexplained share of the torque's variance below which its signs are not doubted."""
 _ROUNDS = 6
 """Iterations of the reweighted least squares that estimate the noise."""
+_UNPHYSICAL, _MUCH = 3.0, 0.1
+"""Residual of physical bodies that contradicts the estimated noise, in units of it and of the torque's size."""
+_WORSE = 1.1
+"""Residual in units of the torque's size that is worse than that of no bodies at all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +72,8 @@ class IdentificationReport:
     """The other directions, least excited first: parameter combinations that stay near their prior values."""
     steps: int
     """Number of Newton steps."""
+    converged: bool = True
+    """Whether these ended at the minimum."""
 
 
 def identify(
@@ -78,7 +89,8 @@ def identify(
 
     Geometry and gravity are the robot's; its inertias are not used. Least squares weighted by each joint's noise, which
     is estimated from the residual, is followed by the same over physically consistent bodies (`consistent_fit`). Clean
-    data give M, C and G to rounding.
+    data give M, C and G to rounding. Where physical bodies leave far more than that noise, joints are weighted by their
+    torque, so that the model is never worse than none on the data it is fitted to, in the mean over joints.
 
     Args:
         data: Samples with torque, at least two equations per base parameter.
@@ -90,8 +102,9 @@ def identify(
             lighter towards the tip, with masses that give torques of the recorded size; it matters if data are scarce.
 
     Raises:
-        ArgumentError: If the data have another joint tree, fewer than two equations per base parameter or no torque,
-            which inertias of every scale explain, or if the arm neither moves nor carries weight.
+        ArgumentError: If the data have another joint tree or are of another arm (`compatibility.py`), have fewer than
+            two equations per base parameter or no torque, which inertias of every scale explain, if the torque of a
+            joint has the wrong sign (`sign_fault`), or if the arm neither moves nor carries weight.
 
     Example:
         >>> import nbs_pin as nbs
@@ -104,6 +117,9 @@ def identify(
     positive("regularisation", regularisation, "measurements")
     _check_arm(data, robot)
     scalars = Scalars(friction, rotor_inertia, transition)
+    fault = sign_fault(data, robot)
+    if fault:
+        raise ArgumentError(f"{data!r}: {fault}.")
     bodies = explain(RobotGeometry(robot), data, scalars, regularisation)
     parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
     rotors = bodies.scalars[-1] if rotor_inertia else None
@@ -137,9 +153,9 @@ def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation:
     expected = expectation(geometry, data, scalars, triangles)
     equations = expected.in_units(triangles)
     base = _base_directions(geometry, data, scalars, expected)
-    noise = _noise(equations, base.shape[1] + others, len(data))
-    design, target = _weighted(equations, noise)
-    fit = consistent_fit(design, target, data.nv, regularisation)
+    fit, design, noise = _physical(
+        equations, _noise(equations, base.shape[1] + others, len(data)), data, regularisation
+    )
     weak, values = _unexcited(design, base)
     report = IdentificationReport(
         samples=len(data),
@@ -151,16 +167,58 @@ def explain(geometry: Geometry, data: Dataset, scalars: Scalars, regularisation:
         condition=float(values[0] / values[-1]) if values[-1] > 0.0 else np.inf,
         unidentifiable=tuple(_direction(x, expected, scalars.names(geometry.names)) for x in weak),
         steps=fit.steps,
+        converged=fit.converged,
     )
     found = (fit.scalars * expected.scalars).reshape(-1, data.nv)
     return Bodies(expected.bodies @ fit.factors, found, expected, report)
 
 
+def sign_fault(data: Dataset, robot: Robot) -> str:
+    """Whether the torque of a joint, or of all, has the wrong sign, as a clause for an error message, or "".
+
+    Friction and physical bodies in the arm's geometry are fitted to some of the samples, with signs as they are and
+    reversed: of one joint or of all, then of a further one, as long as that halves what is unexplained. The data are
+    at fault if a tenth or less remains.
+    """
+    some = data.take(np.sort(np.random.default_rng(0).permutation(len(data))[:_SOME]))
+    geometry, scalars = RobotGeometry(robot), Scalars(friction=True, rotor_inertia=False, transition=0.01)
+    triangles = joint_triangles(geometry, some, scalars)
+    equations = expectation(geometry, some, scalars, triangles).in_units(triangles)
+    size, n = torque_size(equations, len(some)), data.nv
+
+    def unexplained(signs: np.ndarray) -> float:
+        turned = equations.copy()
+        turned[:, :, -1] *= signs[:, None]
+        fit = consistent_fit(*_weighted(turned, size), n, _PRIOR)
+        return _nmse(turned, fit, some)
+
+    stated = best = unexplained(np.ones(n))
+    signs, tries = np.ones(n), [*(1.0 - 2.0 * np.eye(n)), -np.ones(n)]
+    while best > _WELL:
+        left, found = min(((unexplained(signs * turn), k) for k, turn in enumerate(tries)), key=lambda x: x[0])
+        if left > 0.5 * best:
+            break
+        best, signs = left, signs * tries[found]
+    if best > 0.1 * stated or (signs > 0.0).all():
+        return ""
+    wrong = [name for name, sign in zip(robot.joint_names, signs, strict=True) if sign < 0.0]
+    all_wrong = len(wrong) == n
+    which = "every joint" if all_wrong else " and ".join(wrong)
+    return (
+        f"sign of tau of {which}? {_percent(stated)} of the torque's variance is unexplained, and with the sign "
+        f"reversed {_percent(best)}; reverse it{', or gravity if the arm hangs' if all_wrong else ''}"
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{share:.2%}" if share < 0.1 else f"{share:.0%}"
+
+
 def _check_arm(data: Dataset, robot: Robot) -> None:
     """Raise ArgumentError unless the data have the joints of the robot and some torque."""
-    parents, prismatic = robot.parents, robot.prismatic
-    if not (np.array_equal(parents, data.parents) and np.array_equal(prismatic, data.prismatic)):
-        raise ArgumentError(f"{data!r} is not of {robot!r}: number, kinds or order of the joints differ; give its arm.")
+    fault = arm_fault(data, robot)
+    if fault:
+        raise ArgumentError(f"{fault}.")
     if not data.tau.any():
         raise ArgumentError(f"{data!r} has no torque: inertias of every scale explain such a motion; record torques.")
 
@@ -197,6 +255,25 @@ def _noise(equations: np.ndarray, base: int, samples: int) -> JointArray:
     return noise
 
 
+def _physical(
+    equations: np.ndarray, noise: JointArray, data: Dataset, strength: float
+) -> tuple[ConsistentFit, np.ndarray, JointArray]:
+    """The physically consistent fit, its weighted design, and the noise by which it is weighted [N·m].
+
+    `noise` is the residual of arbitrary bodies. Where physical bodies leave far more, as with a torque of wrong sign,
+    a joint that only unphysical bodies explain would count for all. The joints are then weighted by their torque
+    instead, with which the fit is never worse than no torque at all, but for the prior.
+    """
+    design, target = _weighted(equations, noise)
+    fit, size = consistent_fit(design, target, data.nv, strength), torque_size(equations, len(data))
+    left = np.sqrt(_squares(equations, fit, len(data)))
+    if (left > np.maximum(_UNPHYSICAL * noise, _MUCH * size)).any() or (left > _WORSE * size).any():
+        noise = np.maximum(noise, size)
+        design, target = _weighted(equations, noise)
+        fit = consistent_fit(design, target, data.nv, strength)
+    return fit, design, noise
+
+
 def _weighted(equations: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Design and target of all joints in units of the noise, compressed by one QR decomposition."""
     rows = (equations / noise[:, None, None]).reshape(-1, equations.shape[-1])
@@ -226,8 +303,14 @@ def _direction(direction: np.ndarray, expected: Expected, names: list[str]) -> s
 
 def _nmse(equations: np.ndarray, fit: ConsistentFit, data: Dataset) -> float:
     """Mean squared residual over variance, averaged over the joints whose torque varies."""
-    bodies = coordinates(fit.factors @ fit.factors.swapaxes(1, 2)).ravel()
-    squares = np.square(equations @ np.concatenate([bodies, fit.scalars, [-1.0]])).sum(axis=1) / len(data)
+    squares = _squares(equations, fit, len(data))
     variance = data.tau.var(axis=0)
     varies = variance > 1e-12 * max(variance.max(), np.square(data.tau).max())
     return float((squares[varies] / variance[varies]).mean()) if varies.any() else 0.0
+
+
+def _squares(equations: np.ndarray, fit: ConsistentFit, samples: int) -> JointArray:
+    """Mean squared residual per joint [N²·m²]."""
+    bodies = coordinates(fit.factors @ fit.factors.swapaxes(1, 2)).ravel()
+    residual = equations @ np.concatenate([bodies, fit.scalars, [-1.0]])
+    return np.asarray(np.square(residual).sum(axis=1) / samples)

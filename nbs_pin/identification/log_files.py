@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from nbs_pin.base.csv_files import QUANTITIES, joint_columns, joint_order, read_csv
+from nbs_pin.base.csv_files import QUANTITIES, ROS_NAMES, joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import FileFormatError
 
 _NEEDED = "log t, q and tau (and v and a if known)"
@@ -29,19 +29,21 @@ def columns_of_csv(path: Path, joint_names: Sequence[str] | None) -> Columns:
     """The columns of a CSV file (see `load_log`), joints in the order of `joint_names`; None keeps the file's."""
     header, table = read_csv(path)
     columns = {kind: joint_columns(header, kind) for kind in QUANTITIES}
-    joints = list(columns["q"]) or ["1"]
+    found = list(columns["q"])
+    joints = [found[i] for i in joint_order(path, found, joint_names)] if found else ["1"]
     needed = [kind for kind in QUANTITIES if columns[kind] or kind in ("q", "tau")]
     absent = [f"{kind}_{joint}" for kind in needed for joint in joints if joint not in columns[kind]]
     if absent:
         raise FileFormatError(f"{path}: no column '{absent[0]}' among {', '.join(header)}; {_NEEDED}, for each joint.")
     arrays = {kind: table[:, [columns[kind][joint] for joint in joints]] for kind in needed}
     arrays |= {name: table[:, header.index(name)] for name in ("t", "trajectory") if name in header}
-    return _columns(path, arrays, joints, joint_names)
+    return _columns(path, arrays, joints, None)
 
 
 def columns_of_arrays(path: Path, stored: dict[str, np.ndarray], joint_names: Sequence[str] | None) -> Columns:
     """The columns of an NPZ file (see `load_log`), joints in the order of `joint_names`; None keeps the file's."""
-    arrays = {name: stored[name] for name in ("t", "trajectory", *QUANTITIES) if name in stored}
+    arrays = {kind: stored[ROS_NAMES[kind]] for kind in QUANTITIES if ROS_NAMES[kind] in stored}
+    arrays |= {name: stored[name] for name in ("t", "trajectory", *QUANTITIES) if name in stored}
     absent = [name for name in ("t", "q", "tau") if name not in arrays]
     if absent:
         raise FileFormatError(f"{path}: no '{absent[0]}' among {', '.join(stored) or 'no keys'}; {_NEEDED}.")

@@ -33,10 +33,19 @@ def inertia_derivatives(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None
     return np.array([_derivative(tree, i, weight) for i in range(tree.nv)])
 
 
-def rate_bound(arm: Arm, weights: JointArray) -> float:
+def single_rates(arm: Arm) -> JointArray:
+    """The least C_i found with |q̇_i| ≤ C_i √(q̇ᵀMq̇) for all rates and in every pose; inf where none is found."""
+    tree = RigidTree.of(arm)
+    return np.array([_largest_rate(tree, unit) for unit in np.eye(tree.nv)])
+
+
+def rate_bound(arm: Arm, weights: JointArray, single: JointArray | None = None) -> float:
     """The least C found with Σ w_i|q̇_i| ≤ C √(q̇ᵀMq̇) for all rates and in every pose, w ≥ 0; inf if none is found.
 
     (Σ w_i|q̇_i|)² ≤ Σ w_i · Σ w_i q̇_i² for any split; here the split takes each joint's own bound into account.
+
+    Args:
+        single: `single_rates` of the arm, if they are known.
     """
     tree = RigidTree.of(arm)
     used = np.flatnonzero(weights > 0.0)
@@ -44,9 +53,7 @@ def rate_bound(arm: Arm, weights: JointArray) -> float:
         return 0.0
     if not np.isfinite(weights).all():
         return np.inf
-    single = np.zeros(tree.nv)
-    for i in used:
-        single[i] = _largest_rate(tree, np.eye(tree.nv)[i])
+    single = np.where(weights > 0.0, single_rates(tree) if single is None else single, 0.0)
     if not np.isfinite(single).all():
         return np.inf
     share = weights * single

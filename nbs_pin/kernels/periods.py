@@ -15,7 +15,18 @@ from nbs_pin.kernels.laws import difference, friction, torque_of
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.records import Dual, Mat, Motion, State, Target, Vec
 from nbs_pin.kernels.trees import tree_torque
-from nbs_pin.kernels.verdicts import BOX, CONSTANT, GAP_COULOMB, GAP_VISCOUS, OF_Q, OF_TORQUE, OF_V, RADIUS, outside
+from nbs_pin.kernels.verdicts import (
+    BOX,
+    CONSTANT,
+    GAP_COULOMB,
+    GAP_VISCOUS,
+    OF_Q,
+    OF_TORQUE,
+    OF_V,
+    RADIUS,
+    outside,
+    wrapped,
+)
 from nbs_pin.kernels.views import damping_in, numbers, potential_in, take, take3, take4, vector
 from nbs_pin.kernels.watching import A_REF, COMMAND, Q_REF, TAU, V_REF, Q, V, inertia, parts
 
@@ -45,6 +56,12 @@ def compile_judge() -> None:
 @inlined
 def _middle(x0: float, x1: float, rate0: float, rate1: float, h: float) -> float:
     return 0.5 * (x0 + x1) + 0.125 * h * (rate0 - rate1)
+
+
+@inlined
+def _near(x: float, other: float, wraps: float) -> float:
+    """x less whole turns, next to another position, where `wraps` is 1 [rad]."""
+    return other + wrapped(x - other, wraps) if wraps > 0.0 else x
 
 
 @inlined
@@ -94,11 +111,13 @@ def period_terms(
     out[STORAGE] = storage(after, layout, weights, work)
     q, v, a, asked, work = take4(work, n)
     q_ref, v_ref, a_ref, work = take3(work, n)
-    size_q, size_v = 0.0, 0.0
+    size_q, size_v, wraps = 0.0, 0.0, vector(law, at.WRAPS)
     for i in range(n):
-        q[i] = _middle(before[Q, i], after[Q, i], before[V, i], after[V, i], h)
+        near = _near(after[Q, i], before[Q, i], wraps[i])
+        q[i] = _middle(before[Q, i], near, before[V, i], after[V, i], h)
         v[i], a[i] = 0.5 * (before[V, i] + after[V, i]), (after[V, i] - before[V, i]) / h
-        q_ref[i] = _middle(before[Q_REF, i], after[Q_REF, i], before[V_REF, i], after[V_REF, i], h)
+        near = _near(after[Q_REF, i], before[Q_REF, i], wraps[i])
+        q_ref[i] = _middle(before[Q_REF, i], near, before[V_REF, i], after[V_REF, i], h)
         v_ref[i] = _middle(before[V_REF, i], after[V_REF, i], before[A_REF, i], after[A_REF, i], h)
         a_ref[i] = 0.5 * (before[A_REF, i] + after[A_REF, i])
         size_q, size_v = size_q + q[i] * q[i], size_v + v[i] * v[i]
@@ -106,7 +125,7 @@ def period_terms(
     torque_of(State(q, v), Target(q_ref, v_ref, a_ref), law, tree, work, asked)
     tree_torque(Motion(q, v, v, a), tree, work, found[UNEXPLAINED])
     z1, z2 = a, found[ERROR]
-    difference(q, q_ref, vector(law, at.WRAPS), z1)
+    difference(q, q_ref, wraps, z1)
     _losses(Motion(q, v, v_ref, z1), law, tree, work, z2, out, found)
     out[DISTURBANCE], out[HELD], out[SATURATION] = 0.0, 0.0, 0.0
     for i in range(n):

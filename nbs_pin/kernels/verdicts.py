@@ -56,7 +56,8 @@ def compile_verdicts() -> None:
 
 
 @inlined
-def _wrapped(x: float, wraps: float) -> float:
+def wrapped(x: float, wraps: float) -> float:
+    """x less whole turns, in (−π, π] [rad], where `wraps` is 1."""
     return x - 2.0 * math.pi * np.ceil((x - math.pi) / (2.0 * math.pi)) if wraps > 0.0 else x
 
 
@@ -74,8 +75,8 @@ def instant(before: Mat, now: Mat, z1: Vec, period: float, limits: Mat) -> int:
     found, h = 0, period
     for i in range(len(z1)):
         wraps = limits[WRAPS, i]
-        z1[i] = _wrapped(now[Q, i] - now[Q_REF, i], wraps)
-        if wraps > 0.0 and abs(z1[i] - _wrapped(before[Q, i] - before[Q_REF, i], wraps)) > math.pi:
+        z1[i] = wrapped(now[Q, i] - now[Q_REF, i], wraps)
+        if wraps > 0.0 and abs(z1[i] - wrapped(before[Q, i] - before[Q_REF, i], wraps)) > math.pi:
             found |= WRAP
         if before[TAU, i] != before[COMMAND, i]:
             found |= EFFORT
@@ -85,7 +86,7 @@ def instant(before: Mat, now: Mat, z1: Vec, period: float, limits: Mat) -> int:
         q0, q1, v0, v1 = before[Q_REF, i], now[Q_REF, i], before[V_REF, i], now[V_REF, i]
         a0, a1 = before[A_REF, i], now[A_REF, i]
         jump, size = abs(a1 - a0), abs(a1) + abs(a0)
-        moved = abs(q1 - q0 - 0.5 * h * (v1 + v0) + h * h / 12.0 * (a1 - a0))
+        moved = abs(wrapped(q1 - q0, wraps) - 0.5 * h * (v1 + v0) + h * h / 12.0 * (a1 - a0))
         turned = abs(v1 - v0 - 0.5 * h * (a1 + a0))
         may_move = h * h * jump + h * OF_RATE * (abs(v1) + abs(v0)) + ROUNDING * (1.0 + abs(q1))
         may_turn = h * jump + h * OF_ACCELERATION * size + ROUNDING * (1.0 + abs(v1))

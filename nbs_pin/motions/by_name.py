@@ -13,11 +13,20 @@ DEFAULT_DURATION = 10.0
 """Duration of a motion by name, which has no end of its own [s]."""
 
 
-def motion_of(text: str, robot: Robot, *, frequency: float, period: float) -> tuple[DesiredMotion, float]:
+def motion_of(
+    text: str,
+    robot: Robot,
+    *,
+    frequency: float,
+    period: float,
+    time_unit: str | None = None,
+    degrees: bool | None = None,
+) -> tuple[DesiredMotion, float]:
     """The motion that `text` names and its duration [s].
 
     `text` is "sinusoid" (`Sinusoid.for_robot` at `frequency` [rad/s]), "paper" (`paper_reference`), or a CSV or NPZ
-    file (`load_reference`), whose duration is cut to whole periods [s]. Raises ArgumentError for any other text.
+    file, whose duration is cut to whole periods [s]; `load_reference` takes `time_unit` and `degrees`. Raises
+    ArgumentError for any other text.
     """
     if text == "sinusoid":
         return Sinusoid.for_robot(robot, frequency), DEFAULT_DURATION
@@ -29,5 +38,5 @@ def motion_of(text: str, robot: Robot, *, frequency: float, period: float) -> tu
         raise ArgumentError(f"no reference '{text}'; {hint}give sinusoid, paper, or a .csv or .npz file.")
     from nbs_pin.motions.reference_files import load_reference
 
-    motion = load_reference(text, robot.joint_names)
+    motion = load_reference(text, robot, time_unit=time_unit, degrees=degrees)
     return motion, max(1, math.floor(motion.duration / period + 1e-9)) * period

@@ -1,5 +1,6 @@
 """Desired motions from samples and from files: a C² spline with exact derivatives, held constant beyond its ends."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,16 @@ from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
+from nbs_pin.motions.recordings import (
+    Joints,
+    degrees_fault,
+    from_first_row,
+    in_radians,
+    seconds_in,
+    time_fault,
+    unwrapped,
+)
+from nbs_pin.robots.robot import Robot
 
 FEWEST_SAMPLES = 4
 """Fewest samples of a not-a-knot cubic spline."""
@@ -22,6 +33,7 @@ PLAUSIBLE_JUMP = 1.0
 _LARGEST = 1e9  # [s, rad] and [1/s]; the fourth power of it, in the equations of the spline, is finite
 _SUDDEN = 10.0  # times the median change of velocity nearby is a jump; fast smooth motions reach two or three
 _AROUND = 7  # samples in that median; an outlier of q affects the velocity change at only three of them
+_APART = 2.0  # times the steps beside it is what an outlier departs from both neighbours
 _MISREAD = 0.1  # tolerance of a stated velocity against dq/dt, relative to the joint's largest speed
 
 
@@ -78,32 +90,56 @@ class Sampled:
         return Reference(q, np.where(moving, v, 0.0), np.where(moving, a, 0.0))
 
 
-def load_reference(path: str | Path, joint_names: Sequence[str]) -> Sampled:
-    """Load the motion of the joints `joint_names` from a CSV or NPZ file.
+def load_reference(
+    path: str | Path, robot: Robot | Sequence[str], *, time_unit: str | None = None, degrees: bool | None = None
+) -> Sampled:
+    """Load the motion of an arm from a CSV or NPZ file.
 
     CSV: a header of `t` and the joint names in any order (or q1 … qn in the arm's order), then numbers in [s] and
     [rad]; or the header of a log, with columns `q_NAME` and others (`load_log`).
     NPZ: arrays `t` (rows,) and `q` (rows, n), and `joint_names` (n,) if their order is to be checked; a saved `Run` is
     such a file. A velocity `v` (rows, n) is only compared with dq/dt, which must not jump, not even at the ends.
 
+    Time is counted from the first row. Joints that turn without limit are unwrapped where they jump by a turn. Both
+    are said in a warning where they change something.
+
+    Args:
+        path: The file, *.csv or *.npz.
+        robot: The arm, or the names of its joints, which are then taken as rotary, with limits.
+        time_unit: The unit of t: "s", "ms", "us" or "ns". None takes seconds and refuses times that look otherwise.
+        degrees: True converts angles, False takes them as radians, None refuses values that look like degrees.
+
     Raises:
         FileNotFoundError: If the file does not exist.
         FileFormatError: If it has any other fault; names file, row, column and remedy.
+        ArgumentError: If the unit of time is unknown.
     """
     path = Path(path)
     read = {".csv": _read_csv, ".npz": _read_npz}.get(path.suffix.lower())
     if read is None:
         raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv or .npz; convert it.")
+    joints, seconds = Joints.of(robot), seconds_in(time_unit)
     t, q, v, columns = read(path)
-    order, names = joint_order(path, columns, joint_names), list(joint_names)
-    q = q[:, order]
+    order, names = joint_order(path, columns, joints.names), list(joints.names)
+    q, v = q[:, order], None if v is None else v[:, order]
     fault = _fault(t, q, names)
+    if not fault and degrees is None:
+        fault = degrees_fault(q, joints, robot if isinstance(robot, Robot) else None, turning=True)
+    if degrees:
+        q, v = in_radians(q, joints.prismatic), None if v is None else in_radians(v, joints.prismatic)
+    first, t = t[0] if len(t) else 0.0, from_first_row(t) * seconds
+    if not fault and time_unit is None:
+        fault = time_fault(t, q, v, [slice(0, len(t))])
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
-    motion = Sampled(t, q)
-    fault = _jump(motion, names) or ("" if v is None else _disagreement(motion, v[:, order], names))
+    even = unwrapped(q, joints, [slice(0, len(t))], degrees)
+    motion = Sampled(t, even.q)
+    fault = even.fault or _jump(motion, names) or ("" if v is None else _disagreement(motion, v, names))
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
+    late = (f"time is counted from the first row, which is at t = {first:.12g} {time_unit or 's'}",) if first else ()
+    for note in (*late, *even.notes):
+        warnings.warn(f"{path}: {note}.", stacklevel=2)
     return motion
 
 
@@ -139,19 +175,41 @@ def _overflow(table: np.ndarray, names: list[str]) -> str:
 def _jump(motion: Sampled, columns: list[str]) -> str:
     """Where the velocity jumps and what to do, or an empty string."""
     t, q = motion.t, motion.q
+    jumps = _jumps(motion)
+    if not jumps.any():
+        return ""
+    row, joint = (int(k) for k in np.unravel_index(np.argmax(jumps), jumps.shape))
+    at = f"velocity jump {jumps[row, joint]:.3g} rad/s of {columns[joint]} at t = {t[row]:.6g} s"
+    if row in (0, len(t) - 1):
+        return f"{at}, where the motion {'ends' if row else 'starts'} and q is held; add samples at rest there"
+    for k in range(max(row - 1, 1), min(row + 2, len(t) - 1)):
+        if _stands_alone(motion, k, joint):
+            return (
+                f"{at}: q is {q[k, joint]:.6g} in row {k + 1}, between {q[k - 1, joint]:.6g} and "
+                f"{q[k + 1, joint]:.6g}, an outlier? correct it or remove that row"
+            )
+    return f"{at} (row {row + 1}); smooth the motion or sample it more finely"
+
+
+def _stands_alone(motion: Sampled, row: int, joint: int) -> bool:
+    """Whether a sample is far from both neighbours, compared with their own steps, and without it nothing jumps."""
+    x, rest = motion.q[:, joint], np.arange(len(motion.t)) != row
+    if len(x) <= FEWEST_SAMPLES:
+        return False
+    beside = np.abs(np.diff(x))[[k for k in (row - 2, row + 1) if 0 <= k < len(x) - 1]]
+    apart = min(abs(x[row] - x[row - 1]), abs(x[row + 1] - x[row]))
+    return bool(apart > _APART * beside.max() and not _jumps(Sampled(motion.t[rest], x[rest][:, None])).any())
+
+
+def _jumps(motion: Sampled) -> np.ndarray:
+    """Implausible changes of velocity at each sample (rows, n) [rad/s], 0 where there is none."""
+    t, q = motion.t, motion.q
     ends = motion(t[[0, -1]]).v
     changes = np.abs(np.vstack((ends[:1], np.diff(np.diff(q, axis=0) / np.diff(t)[:, None], axis=0), ends[1:])))
     padded = np.pad(changes[1:-1], ((_AROUND // 2, _AROUND // 2), (0, 0)))
     usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, _AROUND, axis=0), axis=-1)
     bound = np.pad(_SUDDEN * usual, ((1, 1), (0, 0)))
-    jumps = np.where(changes > np.maximum(bound, PLAUSIBLE_JUMP), changes, 0.0)
-    if not jumps.any():
-        return ""
-    row, joint = np.unravel_index(np.argmax(jumps), jumps.shape)
-    at = f"velocity jump {jumps[row, joint]:.3g} rad/s of {columns[joint]} at t = {t[row]:.6g} s"
-    if row in (0, len(t) - 1):
-        return f"{at}, where the motion {'ends' if row else 'starts'} and q is held; add samples at rest there"
-    return f"{at} (row {row + 1}); smooth the motion or sample it more finely"
+    return np.asarray(np.where(changes > np.maximum(bound, PLAUSIBLE_JUMP), changes, 0.0))
 
 
 def _disagreement(motion: Sampled, v: np.ndarray, columns: list[str]) -> str:
@@ -172,6 +230,8 @@ _Columns: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str]
 
 def _read_npz(path: Path) -> _Columns:
     data = read_npz(path)
+    if data.get("t", np.empty(0)).dtype.kind in "iu":  # stamps
+        data["t"] = data["t"].astype(float)
     require(data, path, {"t": "f", "q": "f"} | ({"v": "f"} if "v" in data else {}))
     if data["q"].ndim != 2:
         raise FileFormatError(f"{path}: 'q' has shape {data['q'].shape}, expected (rows, joints); choose one motion.")

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from nbs_pin.base.checks import PerJoint, floats, per_joint, positive
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.robots.robot import Robot
@@ -177,15 +178,20 @@ class MinimumJerk:
         )
 
 
-def check_reference(reference: DesiredMotion, robot: Robot, duration: float, *, samples: int = 2001) -> None:
+def check_reference(
+    reference: DesiredMotion, robot: Robot, duration: float, *, samples: int = 2001, joint_friction: str = "drop"
+) -> None:
     """Check a desired motion against the limits of the arm at `samples` times over `duration` [s].
 
-    Its torque is M a + C v + G, without joint friction; `Robot.with_effort_limit` sets other effort limits.
+    Its torque is M a + C v + G, with the joint friction of the URDF if `joint_friction` is "keep" and without it if it
+    is "drop"; `Robot.with_effort_limit` sets other effort limits.
 
     Raises:
         ArgumentError: If a limit is exceeded; names the joint, the time, the value, the limit and the remedy.
     """
     positive("duration", duration, "s")
+    if joint_friction not in ("drop", "keep"):
+        raise ArgumentError(f"joint_friction is {joint_friction!r:.80}; give 'drop' or 'keep'.")
     t = np.linspace(0.0, duration, samples)
     desired = Reference(*(floats(f"the reference's {name}", x) for name, x in zip("qva", reference(t), strict=True)))
     for name, x in desired._asdict().items():
@@ -199,14 +205,55 @@ def check_reference(reference: DesiredMotion, robot: Robot, duration: float, *, 
                 "let it take arrays of times."
             )
     degrees = " (are these degrees?)" if np.median(np.max(np.abs(desired.q), axis=-1)) > 2.0 * np.pi else ""
-    speed, effort = robot.velocity_limit, robot.effort_limit
     _check_range(robot, t, "position", desired.q, robot.lower, robot.upper, f"stay inside{degrees}")
-    _check_range(robot, t, "velocity", desired.v, -speed, speed, "slow it down")
-    data = robot.model.createData()
-    tau = np.array([pin.rnea(robot.model, data, *row) for row in zip(*desired, strict=True)])
-    _check_range(robot, t, "torque", tau, -effort, effort, "slow it down, choose another posture or raise the limit")
+    _check_range(robot, t, "velocity", desired.v, -robot.velocity_limit, robot.velocity_limit, "slow it down")
+    _check_torque(robot, t, desired, joint_friction == "keep")
 
 
+def _check_torque(robot: Robot, t: np.ndarray, desired: Reference, friction: bool) -> None:
+    """Raise ArgumentError where the torque exceeds a limit; the remedy tells friction and weight from inertia."""
+    data, effort = robot.model.createData(), robot.effort_limit
+    drag = np.zeros(robot.nv)
+    if friction:
+        _check_friction(robot, desired.v)
+        drag = robot.damping * desired.v + robot.friction * np.tanh(desired.v / _TRANSITION)
+    tau = np.array([pin.rnea(robot.model, data, *row) for row in zip(*desired, strict=True)]) + drag
+    beyond = np.argwhere(~(np.abs(tau) <= effort))
+    if not beyond.size:
+        return
+    k, i = beyond[0]
+    weight = abs(pin.computeGeneralizedGravity(robot.model, data, desired.q[k])[i])
+    enough = option("effort_limit", _rounded_up(float(np.abs(tau).max())))  # for every joint
+    remedy = f"slow it down, choose another posture or raise the limit: {enough}"
+    if weight > effort[i]:
+        remedy = remedy.replace("slow it down, choose", f"its weight alone takes {weight:.4g}, so choose")
+    elif friction and abs(drag[k, i]) > 0.5 * abs(tau[k, i]):
+        remedy = f"its friction takes {abs(drag[k, i]):.4g} of that: {option('joint_friction', 'drop')}, or {remedy}"
+    _check_range(robot, t, "torque", tau, -effort, effort, remedy)
+
+
+def _check_friction(robot: Robot, v: np.ndarray) -> None:
+    """Raise ArgumentError if a joint that is to move cannot, because its friction takes all of its effort."""
+    stuck = (robot.friction >= robot.effort_limit) & v.any(axis=0)
+    if stuck.any():
+        joint = robot.joints[int(np.argmax(stuck))]
+        unit = _UNITS["torque"][joint.prismatic]
+        raise ArgumentError(
+            f"the Coulomb friction {joint.friction:g} {unit} of joint '{joint.name}' is not below its effort limit "
+            f"{joint.effort:g} {unit}, so that it cannot move; correct the URDF, leave friction out "
+            f"({option('joint_friction', 'drop')}) or raise the limit "
+            f"({option('effort_limit', _rounded_up(2.0 * joint.friction))})."
+        )
+
+
+def _rounded_up(value: float) -> float:
+    """The value rounded up to two digits."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 1.0)
+    return float(f"{np.ceil(value / unit) * unit:.6g}")
+
+
+_TRANSITION = 0.01
+"""Speed scale of Coulomb friction, that of `JointFriction.of` [rad/s]."""
 _UNITS = {"position": ("rad", "m"), "velocity": ("rad/s", "m/s"), "torque": ("N·m", "N")}
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nbs_pin.base.exceptions import RobotError, RobotNotFound
-from nbs_pin.robots.urdf_checks import ZeroLimits
+from nbs_pin.robots.urdf_options import ZeroLimits
 
 
 @dataclass(frozen=True)

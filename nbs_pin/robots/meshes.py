@@ -15,8 +15,11 @@ import trimesh
 from jaxtyping import Float, Int
 from lxml import etree
 
+from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.catalogue import example_robot_share
+from nbs_pin.robots.packages import MISSING, Packages, is_file
+from nbs_pin.robots.urdf_source import shorten
 from nbs_pin.robots.visual_checks import LARGEST
 
 logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else it prints tracebacks of faults that we tell
@@ -51,39 +54,46 @@ class Part:
     color: Color | None
 
 
-def find_mesh(uri: str, urdf: Path, package_dirs: tuple[Path, ...] = ()) -> Path:
+def find_mesh(uri: str, packages: Packages) -> Path:
     """The mesh file that `uri` refers to in a URDF, restricted to the folders that belong to the robot.
 
-    These are the URDF's own folder, the ROS package around it (the nearest folder with a `package.xml`),
-    example-robot-data, and `package_dirs`. Raises MeshError for another scheme, suffix or folder, or a missing file.
+    These are the URDF's own folder, the ROS package around it, the package that a package:// address names
+    (`Packages.find`), example-robot-data, and the folders given with `package_dirs`. Backslashes count as slashes.
+
+    Raises:
+        MeshError: For another scheme, suffix or folder, or a missing file.
     """
-    try:
-        return _found(uri, urdf, package_dirs)
-    except (OSError, ValueError, RuntimeError) as error:  # of names that the file system cannot hold, or circular links
-        if isinstance(error, MeshError):
-            raise
-        raise MeshError(f"mesh '{uri:.200}' cannot be found ({error!s:.200}): give another file name.") from error
-
-
-def _found(uri: str, urdf: Path, package_dirs: tuple[Path, ...]) -> Path:
-    scheme, _, rest = uri.rpartition("://")
-    package = next((folder for folder in urdf.parents if (folder / "package.xml").is_file()), urdf.parent)
-    roots = [folder.resolve() for folder in (urdf.parent, package, example_robot_share(), *package_dirs)]
+    scheme, _, rest = uri.replace("\\", "/").rpartition("://")
+    if MISSING in rest:
+        scheme, rest = "package", rest.partition(MISSING)[2]
     if scheme not in ("", "file", "package"):
         raise MeshError(f"mesh '{uri}' is not a file on this machine: give a relative or package:// path.")
     if Path(rest).suffix.lower() not in SUFFIXES:
         raise MeshError(f"mesh '{uri}' is a file of unknown kind: give one of {', '.join(SUFFIXES)}.")
-    candidates = [urdf.parent / unquote(rest)]
+    own = packages.file.parent
+    roots = [own, packages.around, example_robot_share().resolve(), *packages.given]
+    path = own / unquote(rest)
     if scheme == "package":
         name, _, inner = unquote(rest).partition("/")
-        candidates = [root / name / inner for root in roots] + [root / inner for root in roots if root.name == name]
-    inside = [path.resolve() for path in candidates if any(path.resolve().is_relative_to(root) for root in roots)]
-    if not inside:
-        raise MeshError(f"mesh '{uri}' leaves the robot's folder {roots[0]}: name its folder in package_dirs.")
-    found = next((path for path in inside if path.is_file()), None)
-    if found is None:
-        raise MeshError(f"mesh '{uri}' was not found at {inside[0]}: check the path or give package_dirs.")
-    return found
+        found, assumed = packages.find(name), packages.assume()
+        if found is None and assumed is not None and is_file(assumed / inner):
+            found = assumed
+        if found is None:
+            raise MeshError(
+                f"package '{shorten(name)}' was not found near {packages.file} nor on ROS_PACKAGE_PATH or "
+                f"AMENT_PREFIX_PATH: give the folder it lies in, {option('package_dirs', BLANK)}."
+            )
+        roots, path = [found.resolve(), *roots], found / inner
+    try:
+        resolved = path.resolve()
+    except (OSError, ValueError) as error:
+        raise MeshError(f"mesh '{shorten(uri)}' has no usable name ({error}): correct it.") from error
+    if not any(resolved.is_relative_to(root) for root in roots) and not packages.holds(resolved):
+        remedy = f"give the folder of its package, {option('package_dirs', BLANK)}"
+        raise MeshError(f"mesh '{uri}' leaves the robot's folder {roots[0]}: {remedy}.")
+    if not is_file(resolved):
+        raise MeshError(f"mesh '{uri}' was not found at {resolved}: check the path or {option('package_dirs', BLANK)}.")
+    return resolved
 
 
 def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:

@@ -1,7 +1,8 @@
 """A robot arm: its checked URDF and the Pinocchio model built from it."""
 
 import hashlib
-from collections.abc import Iterable
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,14 +15,13 @@ from jaxtyping import Bool, Float, Int
 
 from nbs_pin.base.arrays import JointArray, Vectors, array_namespace
 from nbs_pin.base.checks import PerJoint, floats
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError, RobotError
 from nbs_pin.base.storable import storable
 from nbs_pin.robots.catalogue import find
+from nbs_pin.robots.mass_matrix import weak_joints
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
-from nbs_pin.robots.urdf_checks import ZERO_LIMITS
-
-_SINGULAR = 1e-10
-"""Smallest eigenvalue of M, scaled to a unit diagonal, that counts as positive."""
+from nbs_pin.robots.urdf_options import read_options
 
 
 @storable(("name", "source", "options", "sha256", "effort_limit"))
@@ -92,7 +92,8 @@ class Robot:
     def sampling_range(self) -> tuple[JointArray, JointArray]:
         """(lower, upper) for sampling configurations [rad, m]: the position limits, ∓π where there is none."""
         lower, upper = self.lower, self.upper
-        return np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
+        low = np.where(np.isfinite(lower), lower, np.minimum(-np.pi, upper - 2.0 * np.pi))
+        return low, np.where(np.isfinite(upper), upper, np.maximum(np.pi, lower + 2.0 * np.pi))
 
     @property
     def one_turn_range(self) -> tuple[JointArray, JointArray]:
@@ -178,23 +179,37 @@ def load_robot(
     name_or_path: str | Path,
     *,
     gravity: float | Iterable[float] | None = None,
-    lock: Iterable[str] | None = None,
+    lock: Iterable[str] | Mapping[str, float] | None = None,
     zero_limits: str | None = None,
+    limits: Mapping[str, Mapping[str, float | None]] | None = None,
+    repair: bool | None = None,
+    inertia_from: str | None = None,
+    xacro_args: Mapping[str, Any] | None = None,
+    package_dirs: Iterable[str | Path] | None = None,
 ) -> Robot:
     """Load an arm by name or from a `.urdf` or `.xacro` file.
+
+    Joints that mimic another are locked where the other is at zero, and named in a warning.
 
     Args:
         name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), or the path of a file.
         gravity: Downward acceleration [m/s²] or a vector in the base frame. None takes the catalogue's, else 9.81.
-        lock: Joints to fix at zero. None takes the catalogue's list.
-        zero_limits: "refuse" joints that state zero effort, zero velocity or an empty range at zero, or read these as
-            "unlimited", for files that do not state their limits. None takes the catalogue's, else "refuse".
+        lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. None takes the catalogue's list.
+        zero_limits: "refuse" joints that state no limits, an effort or velocity that is not > 0, or an empty range at
+            zero, or read these as "unlimited". None takes the catalogue's, else "refuse".
+        limits: Limits in place of the file's, by joint ("*" for all) and by "lower", "upper" [rad, m], "effort"
+            [N·m, N] and "velocity" [rad/s, m/s]; None for no limit.
+        repair: Take the nearest inertia that a rigid body can have where the file states one that none has.
+        inertia_from: "file", or "shapes" to fill the shapes of bodies without mass with 1000 kg/m³, as a guess.
+        xacro_args: Values of the arguments of a `.xacro` file.
+        package_dirs: Folders with ROS packages, for `$(find …)` and package:// in the file. Also searched are packages
+            around and beside the file, ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.
 
     Raises:
         RobotNotFound: If no such name or file exists.
         RobotError: If the description would give a wrong model.
-        ArgumentError: If gravity is not one or three finite numbers, or zero_limits is unknown.
-        MissingExtra: If a `.xacro` file is given and the extra `xacro` is not installed.
+        ArgumentError: If an argument is of another type or out of range.
+        MissingExtra: If the file must be expanded by xacro and the extra `xacro` is not installed.
 
     Example:
         >>> import nbs_pin as nbs
@@ -202,20 +217,25 @@ def load_robot(
         Robot('panda', 7 joints)
     """
     entry = find(str(name_or_path))
-    zeros = entry.zero_limits if zero_limits is None else zero_limits
-    if zeros not in ZERO_LIMITS:
-        raise ArgumentError(f"zero_limits is {zero_limits!r}; give {' or '.join(ZERO_LIMITS)}.")
-    names = entry.lock if lock is None else lock
-    locked = (names,) if isinstance(names, str) else tuple(names)
-    urdf = read_urdf(entry.path, lock=locked, zero_limits=zeros)
+    told = {
+        "lock": entry.lock if lock is None else lock,
+        "zero_limits": entry.zero_limits if zero_limits is None else zero_limits,
+        "limits": limits,
+        "repair": repair,
+        "inertia_from": inertia_from,
+        "xacro_args": xacro_args,
+        "package_dirs": package_dirs,
+    }
+    options = read_options(told)
+    urdf = read_urdf(entry.path, options)
     vector = _gravity_vector(entry.gravity if gravity is None else gravity)
     model = _build_model(urdf)
     model.gravity.linear = vector
-    told = {"gravity": gravity, "lock": lock, "zero_limits": zero_limits}
-    stored = {"gravity": vector.tolist(), "lock": list(locked), "zero_limits": zero_limits}
-    options = {key: stored[key] for key, value in told.items() if value is not None}
-    robot = Robot(entry.name or urdf.name, entry.name or str(entry.path), urdf, model, vector, options)
-    _check_mass_matrix(robot)
+    given = {"gravity": gravity, **told, "lock": lock, "zero_limits": zero_limits}
+    stored = {"gravity": vector.tolist(), **options.stored()}
+    said = {key: stored[key] for key, value in given.items() if value is not None}
+    robot = Robot(entry.name or urdf.name, entry.name or str(entry.path), urdf, model, vector, said)
+    _check_inertia(robot)
     return robot
 
 
@@ -252,23 +272,16 @@ def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
     return model
 
 
-def _check_mass_matrix(robot: Robot) -> None:
-    """Raise RobotError unless M(q) ≻ 0 at zero and at five seeded configurations within the limits.
-
-    M is scaled to a unit diagonal, so that the test depends neither on units nor on masses of different magnitude.
-    """
-    model, data = robot.model, robot.model.createData()
-    low, high = robot.sampling_range
-    for q in (np.clip(0.0, low, high), *np.random.default_rng(0).uniform(low, high, (5, robot.nv))):
-        mass = pin.crba(model, data, q)
-        inertia = np.diag(mass)
-        weakest = int(np.argmin(inertia))
-        if np.isfinite(mass).all() and inertia[weakest] > 0.0:
-            values, vectors = np.linalg.eigh(mass / np.sqrt(inertia) / np.sqrt(inertia)[:, None])
-            if values[0] > _SINGULAR:
-                continue
-            weakest = int(np.argmax(np.abs(vectors[:, 0])))
-        raise RobotError(
-            f"{robot.urdf.path}: joint '{model.names[1 + weakest]}': M(q) is not finite and positive definite at "
-            f"q = {np.round(q, 3).tolist()}; give the links behind it inertia about its axis."
-        )
+def _check_inertia(robot: Robot) -> None:
+    """Raise RobotError unless M(q) ≻ 0 in every pose within the limits."""
+    names, problem = weak_joints(robot.model, robot.lower, robot.upper)
+    if not names:
+        return
+    joints = ET.fromstring(robot.urdf.xml).findall("joint")
+    own = next((joint for joint in joints if joint.get("name") == names[0]), None)
+    unsaid = own is not None and own.find("axis") is None
+    problem += "; it states no <axis>, which URDF reads as 1 0 0" if unsaid else ""
+    remedy = f"{'add <axis xyz=…>, ' if unsaid else ''}give the links behind it inertia about its axis"
+    raise RobotError(
+        f"{robot.urdf.path}: joint '{names[0]}': {problem}; {remedy}, or lock it ({option('lock', names)})."
+    )

@@ -5,16 +5,11 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
-from nbs_pin.robots.urdf_checks import (
-    Joint,
-    Limits,
-    ZeroLimits,
-    check_axis,
-    check_bodies,
-    check_tree,
-    read_friction,
-    read_limits,
-)
+from nbs_pin.robots.bodies import check_bodies
+from nbs_pin.robots.packages import Packages
+from nbs_pin.robots.urdf_checks import Joint, check_axis, check_tree
+from nbs_pin.robots.urdf_limits import Limits, read_friction, read_limits
+from nbs_pin.robots.urdf_options import LIMITS, UrdfOptions
 from nbs_pin.robots.urdf_source import read_source
 
 _UNLIMITED = 1e9
@@ -61,37 +56,45 @@ class Urdf:
         return ET.tostring(robot)
 
 
-def read_urdf(path: Path, *, lock: tuple[str, ...] = (), zero_limits: ZeroLimits = "refuse") -> Urdf:
-    """The checked description in the `.urdf` or `.xacro` file `path`, with the joints in `lock` fixed at zero.
+def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
+    """The checked description in the `.urdf` or `.xacro` file `path`, read as `options` say.
 
-    An arm without a name, which drawing tools refuse, is named after its file. `zero_limits` says whether to "refuse"
-    joints that state zero effort, zero velocity or an empty range at zero, or to read these as "unlimited".
+    An arm without a name, which drawing tools refuse, is named after its file.
 
     Raises:
         RobotError: If the description would give a wrong model; names file, line, element, value and remedy.
         RobotNotFound: If the file does not exist.
         MissingExtra: If it is a `.xacro` file and the extra `xacro` is not installed.
     """
-    robot = read_source(path)
+    options = UrdfOptions() if options is None else options
+    packages = Packages(path, options.package_dirs)
+    robot = read_source(path, options.xacro_args, packages)
     robot.element.set("name", robot.element.get("name", path.stem))
-    joints = check_tree(robot, lock)
-    check_bodies(robot, joints)
-    moving = tuple(_settle(joint, zero_limits) for joint in joints if joint.moves)
+    joints = check_tree(robot, options)
+    check_bodies(robot, joints, options, packages)
+    limits = read_limits(joints, options)
+    moving = tuple(_settle(joint, limits[joint.name], options) for joint in joints if joint.moves)
     return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving)
 
 
-def _settle(joint: Joint, zero_limits: ZeroLimits) -> JointData:
-    """The data of a moving joint; its element becomes a revolute or prismatic joint that states all limits."""
+def _settle(joint: Joint, limits: Limits, options: UrdfOptions) -> JointData:
+    """The data of a moving joint; its element becomes a revolute or prismatic joint that states all limits.
+
+    An effort or velocity limit given in place of the file's is not written into it: the description, and with it
+    `Robot.sha256`, stays that of the file.
+    """
     check_axis(joint)
-    limits = read_limits(joint, zero_limits)
     damping, friction = read_friction(joint)
     element = joint.node.element
     stated = element.find("limit")
     stated = ET.SubElement(element, "limit") if stated is None else stated
-    for key, value in zip(Limits._fields, limits, strict=True):
-        stated.set(key, repr(value if math.isfinite(value) else math.copysign(_UNLIMITED, value)))
+    for key, value in zip(LIMITS, limits, strict=True):
+        replaced = key in ("effort", "velocity") and options.limit(joint.name, key) is not None
+        if not replaced or not float(stated.get(key, "0")) > 0.0:
+            stated.set(key, repr(value if math.isfinite(value) else math.copysign(_UNLIMITED, value)))
     element.set("type", "prismatic" if joint.kind == "prismatic" else "revolute")
-    return JointData(joint.name, joint.kind == "continuous", joint.kind == "prismatic", *limits, damping, friction)
+    wrapped = joint.kind == "continuous" and math.isinf(limits.lower) and math.isinf(limits.upper)
+    return JointData(joint.name, wrapped, joint.kind == "prismatic", *limits, damping, friction)
 
 
 def _bare(element: ET.Element) -> ET.Element:

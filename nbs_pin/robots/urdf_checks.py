@@ -1,17 +1,22 @@
-"""Checks of a URDF: unique names, one tree, physical inertias, valid axes and limits.
+"""Checks of a URDF: unique names, one tree, valid axes and limits; joints locked as asked.
 
 Pinocchio and MuJoCo each accept descriptions that silently give a wrong model (a mass "nan", a zero axis, a link with
 two parents). These checks run before either reads the file and raise RobotError with file, line and remedy.
 """
 
 import math
+import re
 import warnings
+import xml.etree.ElementTree as ET
 from collections import defaultdict
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+import pinocchio as pin
 
+from nbs_pin.base.doors import BLANK, option
+from nbs_pin.robots.urdf_options import ALL, UrdfOptions
 from nbs_pin.robots.urdf_source import Node, shorten
 
 MAX_JOINTS = 64
@@ -20,28 +25,15 @@ MAX_LINKS = 1000
 """Largest number of links of an arm, tool frames included."""
 MAX_NAME = 128
 """Largest length of the name of a link or joint."""
-ZeroLimits: TypeAlias = Literal["refuse", "unlimited"]
-"""How to treat a zero effort, a zero velocity or an empty range at zero."""
-ZERO_LIMITS: tuple[ZeroLimits, ...] = get_args(ZeroLimits)
 MOVING = ("revolute", "continuous", "prismatic")
 """Supported joint types with one degree of freedom."""
 
 _UNSUPPORTED = ("floating", "planar")
 _ROUNDING = 1e-6
 """Relative tolerance for numbers that were rounded when the file was written."""
-_POINT = 1e-9
-"""Radius of gyration below which a body counts as a point mass [m]."""
-_OPEN = ", or load it with zero_limits='unlimited' if 0 means no limit"
-_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-
-
-class Limits(NamedTuple):
-    """Position [rad, m], effort [N·m, N] and velocity [rad/s, m/s] limits of a joint, inf where none is stated."""
-
-    lower: float
-    upper: float
-    effort: float
-    velocity: float
+LONGEST_WAY, MOST_TURNED = 100.0, 1e6
+"""Largest distance [m] and angle [rad] in an origin or a position that an arm can have."""
+_WHEEL = re.compile(r"wheel|caster", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -60,46 +52,85 @@ class Joint:
         return self.kind != "fixed"
 
 
-def check_tree(robot: Node, lock: tuple[str, ...]) -> list[Joint]:
-    """The joints in file order, those in `lock` fixed; checks for unique names, known types and a single tree."""
+def check_tree(robot: Node, options: UrdfOptions) -> list[Joint]:
+    """The joints in file order, those to lock fixed; checks for unique names, known types and a single tree.
+
+    Joints that mimic another are locked where they stand at the other's zero, with a warning that names them.
+    """
     _check_name(robot, robot.text("name"))
     links = _unique(robot, "link")
     nodes = _unique(robot, "joint")
-    unknown = [name for name in lock if name not in nodes]
-    if unknown:
-        raise robot.refuse(f"no joint '{unknown[0]}' to lock", f"the joints are {', '.join(nodes)}")
-    joints = [_joint(node, name, name in lock) for name, node in nodes.items()]
-    mimics = [joint for joint in joints if joint.moves and joint.node.element.find("mimic") is not None]
-    if mimics:
-        remedy = f"lock them (lock={[joint.name for joint in mimics]}) or remove <mimic>"
-        raise mimics[0].node.need("mimic").refuse("mimic joints are not supported", remedy)
+    for argument, names in (("lock", list(options.lock)), ("limits", list(options.limits))):
+        unknown = [name for name in names if name not in nodes and (argument, name) != ("limits", ALL)]
+        if unknown:
+            raise robot.refuse(f"no joint '{unknown[0]}' for {argument}", f"the joints are {', '.join(nodes)}")
+    if len(links) > MAX_LINKS:
+        raise robot.refuse(f"too large: {len(links)} links (limit {MAX_LINKS})", "give a smaller arm")
+    mimics = _mimics(nodes, options)
+    _check_kinds(nodes, options)
+    joints = [_joint(node, name, (mimics | dict(options.lock)).get(name)) for name, node in nodes.items()]
     _check_connected(links, joints)
-    moving = sum(joint.moves for joint in joints)
-    if moving == 0:
-        raise robot.refuse("0 movable joints", "give an arm (a file with xacro macros must be expanded first)")
-    for what, count, most in (("moving joints", moving, MAX_JOINTS), ("links", len(links), MAX_LINKS)):
-        if count > most:
-            raise robot.refuse(f"too large: {count} {what} (limit {most})", "give a smaller arm or fix joints")
+    moving = [joint.name for joint in joints if joint.moves]
+    if not moving:
+        raise robot.refuse("0 movable joints", "give an arm (a file with xacro macros must call them)")
+    if len(moving) > MAX_JOINTS:
+        problem = f"too large: {len(moving)} moving joints (limit {MAX_JOINTS})"
+        raise robot.refuse(problem, f"lock {len(moving) - MAX_JOINTS} of them ({option('lock', [moving[-1], BLANK])})")
+    wheels = [joint for joint in joints if joint.kind == "continuous" and _WHEEL.search(f"{joint.name} {joint.child}")]
+    if wheels:
+        names = [joint.name for joint in wheels]
+        text = f"{wheels[0].node.place}: joints {', '.join(map(repr, names))} look like wheels, and the base is fixed"
+        warnings.warn(f"{text}, so they spin in the air; lock them by {lock_too(options, names)}.", stacklevel=2)
     return joints
 
 
-def check_bodies(robot: Node, joints: list[Joint]) -> None:
-    """Check that every stated inertia is physical and that every moving joint carries mass.
+def lock_too(options: UrdfOptions, names: Iterable[str] | Mapping[str, float]) -> str:
+    """`lock` as one gives it to lock further joints than those that are locked already."""
+    places = {**options.lock, **(names if isinstance(names, Mapping) else dict.fromkeys(names, 0.0))}
+    return option("lock", places if any(places.values()) else list(places))
 
-    Links fixed to each other count as one body, so a tool frame or a flange of a massive link may have no mass.
+
+def _mimics(nodes: dict[str, Node], options: UrdfOptions) -> dict[str, float]:
+    """Where the joints that mimic another stand when the others are at zero, or where these are locked [rad, m].
+
+    A joint whose range excludes zero counts as being at the nearer end.
     """
-    above = {joint.child: joint for joint in joints}
-    mass: dict[str, float] = defaultdict(float)
-    for link in robot.named("link"):
-        name = link.text("name")
-        stated = _mass(link)
-        while name in above and not above[name].moves:
-            name = above[name].parent
-        mass[name] += stated
-    for joint in joints:
-        if joint.moves and mass[joint.child] == 0.0:
-            problem = f"moves link '{joint.child}', which has no mass (M would be singular)"
-            raise joint.node.refuse(problem, f"give link '{joint.child}' an <inertial> with mass > 0 or lock the joint")
+    coupled = {name: node.child("mimic") for name, node in nodes.items() if node.element.get("type") in MOVING}
+    mimics = {name: node for name, node in coupled.items() if node is not None and name not in options.lock}
+    found: dict[str, float] = {}
+    for name, node in mimics.items():
+        factor, place, seen = 1.0, 0.0, {name}
+        while True:
+            source, place = node.text("joint"), place + factor * node.number("offset", 0.0)
+            factor *= node.number("multiplier", 1.0)
+            if source not in nodes:
+                raise node.refuse(f"mimics joint '{shorten(source)}', which is not defined", "fix <mimic joint=…>")
+            if source not in mimics or source in seen:
+                break
+            seen.add(source)
+            node = mimics[source]
+        at = 0.0 if source in seen else options.lock.get(source, _nearest_to_zero(nodes[source]))
+        found[name] = place + factor * at
+    if found:
+        stated = ", ".join(f"'{name}' (of '{mimics[name].text('joint')}', at {x:g})" for name, x in found.items())
+        text = f"{next(iter(mimics.values())).place}: joints that mimic another are locked: {stated}"
+        remedy = lock_too(options, dict.fromkeys(found, BLANK))
+        warnings.warn(f"{text}; lock them elsewhere by {remedy}.", stacklevel=2)
+    return found
+
+
+def _stated_range(node: Node) -> tuple[float, float]:
+    """The position limits in a joint's element [rad, m], none where it states no range."""
+    limit = node.child("limit")
+    if limit is None or node.element.get("type") == "continuous":
+        return -math.inf, math.inf
+    lower, upper = limit.number("lower", 0.0), limit.number("upper", 0.0)
+    return (lower, upper) if lower < upper else (-math.inf, math.inf)
+
+
+def _nearest_to_zero(node: Node) -> float:
+    lower, upper = _stated_range(node)
+    return min(max(0.0, lower), upper)
 
 
 def check_axis(joint: Joint) -> None:
@@ -112,52 +143,21 @@ def check_axis(joint: Joint) -> None:
     if length < 1e-9:
         raise axis.refuse(f"axis xyz '{axis.text('xyz')}' has zero length", "fix <axis xyz=…>")
     if abs(length - 1.0) > _ROUNDING:
-        place = f"{axis.label}:{axis.lines[axis.element]}: {axis.owner}"
-        text = f"{place}: axis xyz '{axis.text('xyz')}' is not a unit vector; it was normalised."
+        text = f"{axis.place}: {axis.owner}: axis xyz '{axis.text('xyz')}' is not a unit vector; it was normalised."
         warnings.warn(text, stacklevel=2)
         axis.element.set("xyz", " ".join(repr(x / length) for x in xyz))
-
-
-def read_limits(joint: Joint, zero_limits: ZeroLimits) -> Limits:
-    """The limits that a joint states.
-
-    A continuous joint has no position limits and may omit the others; every other moving joint must state all four.
-    `zero_limits`: "refuse" a zero effort or velocity and an empty range, or read these zeros as "unlimited".
-    """
-    none = Limits(-math.inf, math.inf, math.inf, math.inf)
-    limit = joint.node.child("limit")
-    if limit is None:
-        if joint.kind != "continuous":
-            remedy = "add <limit lower=… upper=… effort=… velocity=…/> or make the joint continuous"
-            raise joint.node.refuse(f"{joint.kind} joint without <limit>", remedy)
-        return none
-    strength = [_strength(limit, key, joint.kind, zero_limits) for key in ("effort", "velocity")]
-    if joint.kind == "continuous":
-        return Limits(-math.inf, math.inf, *strength)
-    lower, upper = limit.number("lower"), limit.number("upper")
-    if zero_limits == "unlimited" and lower == upper == 0.0:
-        return Limits(-math.inf, math.inf, *strength)
-    if lower >= upper:
-        sign = ">" if lower > upper else "="
-        remedy = "give lower < upper or make the joint fixed" + (_OPEN if lower == upper == 0.0 else "")
-        raise limit.refuse(f"limit lower {lower:g} {sign} upper {upper:g}", remedy)
-    return Limits(lower, upper, *strength)
-
-
-def read_friction(joint: Joint) -> tuple[float, float]:
-    """Viscous damping [N·m·s/rad] and Coulomb friction [N·m] of the joint, zero where not stated."""
-    dynamics = joint.node.child("dynamics")
-    if dynamics is None:
-        return 0.0, 0.0
-    return dynamics.number("damping", 0.0, least=0.0), dynamics.number("friction", 0.0, least=0.0)
 
 
 def check_origin(node: Node) -> None:
     """Check that the placement of a joint or inertia, where stated, is six finite numbers."""
     origin = node.child("origin")
     if origin is not None:
-        origin.numbers("xyz", 3, (0.0, 0.0, 0.0))
-        origin.numbers("rpy", 3, (0.0, 0.0, 0.0))
+        for key, most, unit in (("xyz", LONGEST_WAY, "m"), ("rpy", MOST_TURNED, "rad")):
+            values = origin.numbers(key, 3, (0.0, 0.0, 0.0))
+            if max(map(abs, values)) > most:
+                raise origin.refuse(
+                    f"origin {key} '{origin.text(key)}' is beyond ±{most:g} {unit}", f"fix <origin {key}=…>"
+                )
 
 
 def _unique(robot: Node, tag: str) -> dict[str, Node]:
@@ -167,7 +167,7 @@ def _unique(robot: Node, tag: str) -> dict[str, Node]:
         name = node.text("name")
         _check_name(node, name)
         if name in nodes:
-            lines = f"lines {nodes[name].lines[nodes[name].element]} and {node.lines[node.element]}"
+            lines = node.lines(nodes[name].element)
             raise node.refuse(f"the name '{name}' is used twice ({lines})", f"rename one {tag}")
         nodes[name] = node
     return nodes
@@ -180,22 +180,58 @@ def _check_name(node: Node, name: str) -> None:
         raise node.refuse(problem, f"rename the {node.element.tag}")
 
 
-def _joint(node: Node, name: str, locked: bool) -> Joint:
-    """The joint of an element, fixed if `locked`; a fixed joint keeps only its parent, child and origin."""
+def _check_kinds(nodes: dict[str, Node], options: UrdfOptions) -> None:
+    """Raise RobotError for joints of other types than those supported, unless they are locked."""
+    kinds = {name: node.text("type") for name, node in nodes.items()}
+    other = [name for name, kind in kinds.items() if kind in _UNSUPPORTED and name not in options.lock]
+    for name, kind in kinds.items():
+        if kind not in (*MOVING, "fixed", *_UNSUPPORTED) or name in other:
+            remedy = "use revolute, continuous, prismatic or fixed"
+            remedy += f", or lock it: {lock_too(options, other)}" if name in other else ""
+            raise nodes[name].refuse(f"type '{shorten(kind)}' is not supported", remedy)
+
+
+def _joint(node: Node, name: str, locked: float | None) -> Joint:
+    """The joint of an element, fixed if it is `locked` somewhere; a fixed one keeps only parent, child and origin."""
     kind = node.text("type")
-    allowed = (*MOVING, "fixed", *(_UNSUPPORTED if locked else ()))
-    if kind not in allowed:
-        remedy = "use revolute, continuous, prismatic or fixed"
-        remedy += f", or lock it: lock=['{name}']" if kind in _UNSUPPORTED else ""
-        raise node.refuse(f"type '{shorten(kind)}' is not supported", remedy)
-    kind = "fixed" if locked else kind
+    check_origin(node)
+    joint = Joint(node, name, kind, node.need("parent").text("link"), node.need("child").text("link"))
+    if locked:
+        _move(joint, locked)
+    kind = "fixed" if locked is not None else kind
     node.element.set("type", kind)
     if kind == "fixed":
         for child in list(node.element):
             if child.tag not in ("parent", "child", "origin"):
                 node.element.remove(child)
-    check_origin(node)
-    return Joint(node, name, kind, node.need("parent").text("link"), node.need("child").text("link"))
+    return replace(joint, kind=kind)
+
+
+def _move(joint: Joint, place: float) -> None:
+    """Turn or shift the origin of a joint to its position `place` [rad, m]."""
+    if joint.kind not in MOVING:
+        remedy = f"lock it at 0 ({option('lock', [joint.name])})"
+        raise joint.node.refuse(f"a joint of type '{joint.kind}' cannot be locked at {place:g}", remedy)
+    lower, upper = _stated_range(joint.node)
+    most = LONGEST_WAY if joint.kind == "prismatic" else MOST_TURNED
+    if not abs(place) <= most:
+        raise joint.node.refuse(f"it is locked at {place:g}", f"lock it within ±{most:g}")
+    if not lower <= place <= upper:
+        text = f"{joint.node.place}: {joint.node.owner}: it is locked at {place:g}"
+        warnings.warn(f"{text}, outside its range of [{lower:g}, {upper:g}].", stacklevel=2)
+    check_axis(joint)
+    axis = joint.node.child("axis")
+    direction = np.array([1.0, 0.0, 0.0] if axis is None else axis.numbers("xyz", 3))
+    direction /= np.linalg.norm(direction)
+    origin = joint.node.child("origin")
+    xyz, rpy = (np.zeros(3) if origin is None else np.array(origin.numbers(k, 3, (0.0,) * 3)) for k in ("xyz", "rpy"))
+    frame = pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz)
+    slides = joint.kind == "prismatic"
+    shift = pin.SE3(np.eye(3), place * direction) if slides else pin.SE3(pin.exp3(place * direction), np.zeros(3))
+    moved = frame * shift
+    element = ET.SubElement(joint.node.element, "origin") if origin is None else origin.element
+    element.set("xyz", " ".join(map(repr, moved.translation.tolist())))
+    element.set("rpy", " ".join(map(repr, pin.rpy.matrixToRpy(moved.rotation).tolist())))
 
 
 def _check_connected(links: dict[str, Node], joints: list[Joint]) -> None:
@@ -222,42 +258,3 @@ def _check_connected(links: dict[str, Node], joints: list[Joint]) -> None:
     if lost:
         names = ", ".join(f"'{joint.name}'" for joint in lost[:5])
         raise lost[0].node.refuse(f"not a tree: joints {names} form a cycle or follow one", "fix their <parent>")
-
-
-def _mass(link: Node) -> float:
-    """The mass of a link [kg], 0 if none is stated; raises RobotError unless a rigid body can have its inertia.
-
-    Principal moments of a rigid body are ≥ 0 and none exceeds the sum of the other two. Point masses (all zero) and
-    rods (one zero) are allowed; M(q) ≻ 0 is tested on the whole arm.
-    """
-    inertial = link.child("inertial")
-    if inertial is None:
-        return 0.0
-    check_origin(inertial)
-    mass = inertial.need("mass").number("value", least=0.0)
-    node = inertial.need("inertia")
-    xx, xy, xz, yy, yz, zz = (node.number(key) for key in _INERTIA)
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if mass == 0.0 and inertia.any():
-        raise inertial.need("mass").refuse("mass value '0' is not > 0 though inertia is stated", "fix <mass value=…>")
-    small, middle, large = moments = np.linalg.eigvalsh(inertia)
-    slack = _ROUNDING * large + _POINT**2 * mass
-    for wrong, problem in (
-        (small < -slack, "inertia is not positive definite"),
-        (small + middle < large - slack, "not a physical body, principal moments a + b < c"),
-    ):
-        if wrong:
-            stated = ", ".join(f"{moment:.4g}" for moment in moments)
-            raise node.refuse(f"{problem} ({stated} kg·m²)", "fix <inertia …>")
-    return mass
-
-
-def _strength(limit: Node, key: str, kind: str, zero_limits: ZeroLimits) -> float:
-    """The effort or velocity limit: > 0, or inf if there is none."""
-    value = limit.number(key, math.inf if kind == "continuous" else None)
-    if value == 0.0 and zero_limits == "unlimited":
-        return math.inf
-    if value <= 0.0:
-        remedy = f"state the drive's {key} in <limit {key}=…>" + (_OPEN if value == 0.0 else "")
-        raise limit.refuse(f"limit {key} '{value:g}' is not > 0", remedy)
-    return value

@@ -6,13 +6,14 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.sax.saxutils import escape
+from typing import Any, NamedTuple
 
 from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
 
-from nbs_pin.base.exceptions import MissingExtra, RobotError, RobotNotFound
+from nbs_pin.base.exceptions import RobotError, RobotNotFound
+from nbs_pin.robots.packages import Packages
+from nbs_pin.robots.xacro_source import LINE, expand
 
 MAX_BYTES = 5_000_000
 """Largest URDF that is read [bytes]; meshes are separate files."""
@@ -20,29 +21,48 @@ MAX_DEPTH = 128
 """Deepest nesting of XML elements."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_QUOTE = {'"': "&quot;"}
-_FOREIGN = {"xacro": "expand it with xacro first or give the .xacro file", "xinclude": "insert the included text"}
+_LATE = re.compile(rb"(\s+)<\?xml[^>]*\?>")
+"""A declaration that is not at the start, which XML does not allow and readers of URDF pass over."""
+_FOREIGN = {"xacro": 'declare xmlns:xacro="http://www.ros.org/wiki/xacro"', "xinclude": "insert the included text"}
+
+
+class Place(NamedTuple):
+    """Where an element is written."""
+
+    file: str
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}"
 
 
 @dataclass(frozen=True)
 class Node:
     """An XML element with its place in the file for messages, and strict access to children and numbers."""
 
-    label: str
-    """Name of the file in messages."""
-    lines: Mapping[ET.Element, int]
+    places: Mapping[ET.Element, Place]
     element: ET.Element
     owner: str
     """Name of the element in messages, such as "link 'l1'"."""
 
     def refuse(self, problem: str, remedy: str) -> RobotError:
         """A RobotError that names file, line, element, problem and remedy."""
-        line = self.lines.get(self.element, 1)
-        return RobotError(f"{self.label}:{line}: {self.owner}: {problem}; {remedy}.")
+        return RobotError(f"{self.place}: {self.owner}: {problem}; {remedy}.")
+
+    @property
+    def place(self) -> Place:
+        """File and line of the element."""
+        return self.places[self.element]
+
+    def lines(self, other: ET.Element) -> str:
+        """The lines of another element and of this one, with the files if they differ."""
+        first, second = self.places[other], self.place
+        same = first.file == second.file
+        return f"lines {first.line} and {second.line}" if same else f"{first} and {second}"
 
     def at(self, element: ET.Element, owner: str | None = None) -> "Node":
         """Another element of the same file."""
-        return Node(self.label, self.lines, element, owner or self.owner)
+        return Node(self.places, element, owner or self.owner)
 
     def named(self, tag: str) -> Iterator["Node"]:
         """The children <tag>, each named in messages by its own name."""
@@ -53,8 +73,8 @@ class Node:
         """The child <tag>, or None; raises RobotError if there are two."""
         found = self.element.findall(tag)
         if len(found) > 1:
-            lines = " and ".join(str(self.lines[element]) for element in found[:2])
-            raise self.at(found[1]).refuse(f"<{tag}> is stated twice (lines {lines})", f"keep one <{tag}>")
+            second = self.at(found[1])
+            raise second.refuse(f"<{tag}> is stated twice ({second.lines(found[0])})", f"keep one <{tag}>")
         return self.at(found[0]) if found else None
 
     def need(self, tag: str) -> "Node":
@@ -95,7 +115,9 @@ class Node:
 
     def _bad_number(self, key: str, expected: str) -> RobotError:
         tag, value = self.element.tag, self.text(key)
-        remedy = _FOREIGN["xacro"] if "${" in value else f"fix <{tag} {key}=…>"
+        remedy = f"fix <{tag} {key}=…>"
+        if "${" in value:
+            remedy = "expand the file with xacro first, or give it with the ending .xacro"
         return self.refuse(f"{tag} {key} '{shorten(value)}' is not {expected}", remedy)
 
 
@@ -105,26 +127,33 @@ def shorten(text: str) -> str:
     return safe if len(safe) <= 60 else safe[:57] + "..."
 
 
-def read_source(path: Path) -> Node:
-    """The <robot> element of a `.urdf` or `.xacro` file.
+def read_source(path: Path, xacro_args: Mapping[str, str], packages: Packages) -> Node:
+    """The <robot> element of a file, expanded by xacro if it is a `.xacro` file or has elements of xacro.
 
-    Raises RobotNotFound if the file does not exist, RobotError if it cannot be read or parsed, and MissingExtra for a
-    `.xacro` file if the extra `xacro` is not installed.
+    Raises RobotNotFound if the file does not exist, RobotError if it cannot be read, parsed or expanded, and
+    MissingExtra where it must be expanded and the extra `xacro` is not installed.
     """
-    data = _read_bytes(path)
-    if path.suffix != ".xacro":
-        return parse(data, str(path))
-    name = parse(data, str(path), expanded=False).element.get("name", path.stem)
-    return parse(_expand(path, name), f"{path} (expanded)")
+    label, data = str(path), _read_bytes(path)
+    source = parse(data, label, expanded=False)
+    if path.suffix != ".xacro" and not any(_foreign(element) == "xacro" for element in source.element.iter()):
+        if xacro_args:
+            raise RobotError(f"{label}: it has nothing of xacro, which could take {', '.join(xacro_args)}; omit that.")
+        return parse(data, label)
+    expanded, files = expand(path, source.element, xacro_args, packages)
+    robot = parse(expanded, label, files)
+    robot.element.set("name", robot.element.get("name") or source.element.get("name") or path.stem)
+    return robot
 
 
-def parse(data: bytes, label: str, *, expanded: bool = True) -> Node:
-    """The <robot> element in the bytes of a URDF; `label` names them in messages.
+def parse(data: bytes, label: str, files: list[str] | None = None, *, expanded: bool = True) -> Node:
+    """The <robot> element in the bytes of a URDF; `label` names them in messages, or the `files` that they came from.
 
     They must be UTF-8 without DTD, entity or (if `expanded`) xacro and XInclude, within MAX_BYTES and MAX_DEPTH.
     """
     _check_text(data, label)
-    builder = _Builder(label)
+    late = _LATE.match(data)
+    data = late[1] + data[late.end() :] if late else data
+    builder = _Builder(label, files)
     parser = DefusedXMLParser(target=builder, encoding="utf-8", forbid_dtd=True)
     builder.expat = parser.parser
     try:
@@ -136,23 +165,27 @@ def parse(data: bytes, label: str, *, expanded: bool = True) -> Node:
         line = parser.parser.CurrentLineNumber
         raise RobotError(f"{label}:{line}: DTD and entities are not allowed; remove <!DOCTYPE …>.") from error
     _drop_default_namespace(root)
-    node = Node(label, builder.lines, root, f"robot '{shorten(root.get('name', ''))}'")
+    node = Node(builder.places, root, f"robot '{shorten(root.get('name', ''))}'")
     if root.tag != "robot":
         raise node.refuse(f"the root element is <{shorten(root.tag)}>", "a URDF <robot> is needed")
     for element in root.iter() if expanded else ():
-        _refuse_foreign(node.at(element))
+        kind = _foreign(element)
+        if kind:
+            tag = str(element.tag).rpartition("}")[2]
+            raise node.at(element).refuse(f"<{kind}:{shorten(tag)}> is not expanded", _FOREIGN[kind])
     return node
 
 
 class _Builder(ET.TreeBuilder):
-    """Tree builder that records the line of every element and limits the depth to MAX_DEPTH."""
+    """Tree builder that records the place of every element and limits the depth to MAX_DEPTH."""
 
     expat: Any = None
 
-    def __init__(self, label: str) -> None:
+    def __init__(self, label: str, files: list[str] | None) -> None:
         super().__init__()
         self.label = label
-        self.lines: dict[ET.Element, int] = {}
+        self.files = files
+        self.places: dict[ET.Element, Place] = {}
         self.depth = 0
 
     def start(self, tag: Any, attrs: Any, /) -> ET.Element:
@@ -160,8 +193,16 @@ class _Builder(ET.TreeBuilder):
         line = self.expat.CurrentLineNumber
         if self.depth > MAX_DEPTH:
             raise RobotError(f"{self.label}:{line}: too deep: more than {MAX_DEPTH} nested elements; flatten <{tag}>.")
+        strange = next((name for name in (tag, *attrs) if not name.isascii()), None)
+        if strange is not None:
+            raise RobotError(f"{self.label}:{line}: '{shorten(strange)}' is no name of URDF; correct it.")
+        place = Place(self.label, line)
+        if self.files is not None:
+            file, _, there = attrs.pop(LINE, "").partition(":")
+            marked = file.isdecimal() and there.isdecimal() and int(file) < len(self.files)
+            place = Place(self.files[int(file)], int(there)) if marked else Place(self.label, 1)
         element = super().start(tag, attrs)
-        self.lines[element] = line
+        self.places[element] = place
         return element
 
     def end(self, tag: Any, /) -> ET.Element:
@@ -176,12 +217,10 @@ def _drop_default_namespace(root: ET.Element) -> None:
         element.tag = element.tag.removeprefix(namespace)
 
 
-def _refuse_foreign(node: Node) -> None:
-    """Raise RobotError for an element of xacro or XInclude, which URDF readers silently skip."""
-    namespace, _, tag = str(node.element.tag).rpartition("}")
-    for kind, remedy in _FOREIGN.items():
-        if kind in namespace.lower():
-            raise node.refuse(f"<{kind}:{shorten(tag)}> is not expanded", remedy)
+def _foreign(element: ET.Element) -> str | None:
+    """Whose element it is, xacro or xinclude, which URDF readers silently skip; None for one of URDF."""
+    namespace = str(element.tag).rpartition("}")[0].lower()
+    return next((kind for kind in _FOREIGN if kind in namespace), None)
 
 
 def _check_text(data: bytes, label: str) -> None:
@@ -207,22 +246,3 @@ def _read_bytes(path: Path) -> bytes:
         raise RobotNotFound(f"cannot read {path}: it is a directory; give the .urdf file inside it.") from error
     except OSError as error:
         raise RobotError(f"cannot read {path}: {error.strerror}; check its permissions.") from error
-
-
-def _expand(path: Path, name: str) -> bytes:
-    """The URDF of the robot `name` that a xacro file expands to, with includes relative to the file.
-
-    xacro evaluates Python expressions: expand only files that you trust.
-    """
-    try:
-        from xacrodoc import XacroDoc, packages
-    except ModuleNotFoundError as error:
-        raise MissingExtra(f"{path} needs xacro: pip install 'nbs-pin[xacro]'.") from error
-    packages.walk_up_from(path)
-    include = escape(str(path.resolve()), _QUOTE)
-    try:
-        document = XacroDoc.from_includes([include], name=escape(name, _QUOTE), resolve_packages=False)
-    except Exception as error:  # xacro evaluates Python, which can raise any exception
-        raise RobotError(f"{path}: xacro cannot expand it ({type(error).__name__}: {error}); fix the file.") from error
-    expanded: str = document.dom.toxml()
-    return expanded.encode()

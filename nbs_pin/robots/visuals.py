@@ -19,6 +19,7 @@ from lxml import etree
 
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.meshes import Color, MeshError, Part, find_mesh, read_mesh, shaded
+from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.robot import Robot
 from nbs_pin.robots.visual_checks import material_faults, visual_fault
 
@@ -94,7 +95,8 @@ def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple
     So are links with a visual that cannot be drawn, whatever is wrong with it: a warning names link and fault. Meshes
     may also be read from `package_dirs`.
     """
-    root, folders = _root(robot), tuple(Path(folder) for folder in package_dirs)
+    root = _root(robot)
+    packages = Packages(robot.urdf.path, (*package_dirs, *robot.options.get("package_dirs", ())))
     faults = _without_faulty_visuals(root)
     description = _described(robot, root)
     materials = {material.name: material.color for material in description.robot.materials if material.color}
@@ -102,11 +104,15 @@ def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple
     for link in description.robot.links:
         for visual in link.visuals:
             try:
-                visuals += _drawn(link.name, visual, _parts(visual.geometry, robot.urdf.path, folders), materials)
+                visuals += _drawn(link.name, visual, _parts(visual.geometry, packages), materials)
             except MeshError as error:
                 faults.setdefault(link.name, str(error))
-    for name, fault in faults.items():
-        warnings.warn(f"link '{name}' is drawn as a capsule: {fault}", stacklevel=2)
+    for reason in dict.fromkeys(faults.values()):
+        links = [name for name, fault in faults.items() if fault == reason]
+        several = f"links {', '.join(map(repr, links[:5]))}{' …' * (len(links) > 5)} are drawn as capsules"
+        warnings.warn(
+            f"{several if len(links) > 1 else f'link {links[0]!r} is drawn as a capsule'}: {reason}", stacklevel=2
+        )
     return (*visuals, *_capsules(robot, {visual.link for visual in visuals}, set(faults)))
 
 
@@ -167,11 +173,11 @@ def _drawn(link: str, visual: Any, parts: tuple[Part, ...], materials: dict[str,
     return [Visual(link, placement, part.vertices, part.faces, part.color or stated or GREY) for part in parts]
 
 
-def _parts(geometry: Any, urdf: Path, package_dirs: tuple[Path, ...]) -> tuple[Part, ...]:
+def _parts(geometry: Any, packages: Packages) -> tuple[Part, ...]:
     """A URDF geometry as triangle meshes."""
     if geometry.mesh is not None:
         scale = np.ones(3) if geometry.mesh.scale is None else np.broadcast_to(geometry.mesh.scale, (3,)).astype(float)
-        return read_mesh(find_mesh(geometry.mesh.filename, urdf, package_dirs), scale)
+        return read_mesh(find_mesh(geometry.mesh.filename, packages), scale)
     if geometry.box is not None:
         return (shaded(trimesh.creation.box(geometry.box.size), None),)
     if geometry.cylinder is not None:

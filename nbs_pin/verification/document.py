@@ -5,7 +5,7 @@ import json
 import math
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -28,6 +28,40 @@ ASSUMED = (
 """Assumptions of every certificate whose words do not vary (docs/certificates.md §9)."""
 COMPARED = "> largest torque of the law"
 """End of the name of a condition that may be a comparison, besides those of the paper as printed."""
+
+
+@runtime_checkable
+class Arm(Protocol):
+    """An arm as `load_robot` gives it, as far as a file states it."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+
+    @property
+    def sha256(self) -> str:
+        """Of links, joints, limits and gravity."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints that move."""
+
+
+def check_arm(path: Path, stated: dict[str, Any] | None, robot: Arm) -> None:
+    """Raise FileFormatError unless the robot is the one that the file states."""
+    joints = [joint["name"] for joint in stated["joints"]] if stated else []
+    if stated is None or stated["sha256"] is None:
+        raise FileFormatError(f"{path}: the certificate names no arm, and {robot.name} was given; leave out the robot.")
+    if joints != list(robot.joint_names):
+        raise FileFormatError(
+            f"{path}: the joints of the certificate that move are {', '.join(joints)}, those of {robot.name} "
+            f"{', '.join(robot.joint_names)}; give the robot with the same joints locked."
+        )
+    if stated["sha256"] != robot.sha256:
+        raise FileFormatError(
+            f"{path}: the certificate is of the arm {stated['name']} with the sha256 {stated['sha256'][:12]}…, and "
+            f"that of {robot.name} is {robot.sha256[:12]}…; give the robot that was certified, with its gravity."
+        )
 
 
 def read_document(path: Path) -> dict[str, Any]:

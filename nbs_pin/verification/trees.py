@@ -8,13 +8,14 @@ import numpy as np
 from defusedxml import ElementTree
 
 from nbs_pin.base.exceptions import FileFormatError
-from nbs_pin.verification.balls import Balls, arb, balls, certain, skew
+from nbs_pin.verification.balls import Balls, arb, balls, certain, positive_definite, skew
 
 SAME = 1e-10
 """Largest difference between two arms, relative to the sizes of the arm and of its bodies."""
 
 _POINT = 1e-4
 """Squared radius of gyration to which inertias are compared at least, relative to the size of the arm."""
+_MOVING = ("continuous", "revolute", "prismatic")
 
 
 class Link(NamedTuple):
@@ -49,6 +50,22 @@ def urdf_tree(path: Path, joints: list[dict[str, Any]]) -> list[Link]:
         return _Description(ElementTree.parse(path).getroot(), joints).links()
     except (ValueError, KeyError, AttributeError, TypeError, SyntaxError, RecursionError) as error:
         raise FileFormatError(f"{path}: not the URDF of this certificate ({error}); give its own.") from error
+
+
+def still_joints(path: Path, joints: list[dict[str, Any]]) -> list[str]:
+    """The joints of a URDF that could move and that the file does not name."""
+    named = {joint["name"] for joint in joints}
+    elements = ElementTree.parse(path).getroot().findall("joint")
+    return [x.get("name", "") for x in elements if x.get("type") in _MOVING and x.get("name") not in named]
+
+
+def always_heavy(tree: list[Link]) -> bool:
+    """Whether every body certainly has energy in every motion of its own, so that M ≻ 0 in every pose.
+
+    Of the joints that move, the body of the first moves, and no body has less energy than none.
+    """
+    bodies = (certain(x.mass > 0, x.armature >= 0) and positive_definite(x.inertia) for x in tree)
+    return all(bodies)
 
 
 def differences(stated: list[Link], read: list[Link]) -> list[str]:

@@ -5,31 +5,20 @@ of the file are taken as exact, and each inequality is decided in ball arithmeti
 certain. Section signs are those of docs/certificates.md.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from nbs_pin.verification.balls import Balls, arb, balls, certain, ctx, inverse, positive_definite, skew
-from nbs_pin.verification.document import is_unchanged, read_document, unit
-from nbs_pin.verification.trees import Link, differences, stated_tree, urdf_tree
+from nbs_pin.verification.document import Arm, check_arm, read_document, unit
+from nbs_pin.verification.stated import FALSE, OPEN, TAKEN, Check, decided, stated
+from nbs_pin.verification.trees import Link, always_heavy, differences, stated_tree, still_joints, urdf_tree
 
 BITS = 192
 """Precision of the balls."""
-VERIFIED, TAKEN, OPEN, FALSE = "re-verified", "taken as stated", "NOT re-verified", "FALSE"
-"""What becomes of a statement: checked here, a premise of what is checked, beyond this program, or not shown true."""
-_LABELS = ("PROVED", "VERIFIED", "PROBABILISTIC", "EMPIRICAL")
-
-
-class Check(NamedTuple):
-    """One statement of the file, and what became of it."""
-
-    name: str
-    status: str
-    because: str
 
 
 @dataclass(frozen=True)
@@ -46,45 +35,48 @@ class Verification:
         return self.label == "PROVED" and not {check.status for check in self.checks} & {OPEN, FALSE}
 
 
-def verify(path: str | Path, *, urdf: str | Path | None = None) -> Verification:
+def verify(path: str | Path, *, urdf: str | Path | None = None, robot: Arm | None = None) -> Verification:
     """Check a certificate file again, in ball arithmetic and without the code that made it (docs/certificates.md §11).
 
     Args:
         path: A file that `nbs.write_certificate` or `nbs-pin certify --json` wrote.
         urdf: The arm's URDF. None takes the file that the certificate names, if it is there.
+        robot: The arm as `load_robot` gives it, which must be the one that was certified: the same links, limits and
+            gravity (`Robot.sha256`), and the same joints locked.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        FileFormatError: If it is no certificate, or the URDF is not that of its arm.
+        FileFormatError: If it is no certificate, or the URDF or the robot is not that of its arm.
         MissingExtra: If the extra `verify` is not installed.
     """
     document = read_document(Path(path))
+    if robot is not None:
+        check_arm(Path(path), document["arm"], robot)
     with ctx.workprec(BITS):
         tree, checks = _arm(document["arm"], urdf)
         checks += _inertias(document, tree)
-        for part in (_constants, _levels, _errors, _stated):
+        for part in (_constants, _levels, _errors, stated):
             checks += part(document)
     return Verification(document["label"], tuple(checks))
-
-
-def _decided(name: str, true: bool, because: str) -> Check:
-    return Check(name, VERIFIED if true else FALSE, because)
 
 
 def _arm(arm: dict[str, Any] | None, urdf: str | Path | None) -> tuple[list[Link], list[Check]]:
     """The tree of the URDF, or else of the file, and whether the two are the same."""
     if arm is None:
         return [], [Check("inertia", OPEN, "the model is no rigid tree")]
-    path, stated, name = Path(urdf or arm["urdf"] or ""), stated_tree(arm["joints"]), "the tree is the arm's"
+    path, given, name = Path(urdf or arm["urdf"] or ""), stated_tree(arm["joints"]), "the tree is the arm's"
     if urdf is None and not (path.suffix == ".urdf" and path.is_file()):
-        return stated, [Check(name, OPEN, "the file names no URDF that is here; give it with --urdf")]
+        return given, [Check(name, OPEN, "the file names no URDF that is here; give it with --urdf")]
     read = urdf_tree(path, arm["joints"])
-    faults = differences(stated, read)
-    return read, [_decided(name, not faults, f"differs in {', '.join(faults)}" if faults else f"read from {path}")]
+    faults, still = differences(given, read), still_joints(path, arm["joints"])
+    locked = [Check("joints held at zero", TAKEN, f"{', '.join(still)}, which the file does not name")] if still else []
+    because = f"differs in {', '.join(faults)}" if faults else f"read from {path}"
+    return read, [decided(name, not faults, because), *locked]
 
 
 def _inertias(document: dict[str, Any], tree: list[Link]) -> Iterator[Check]:
-    """The bounds of M by their multipliers, and 1/κ and 1/ν with them (§6)."""
+    """The bounds of M by their multipliers, 1/κ and 1/ν with them (§6), and M ≻ 0, without which V bounds nothing."""
+    is_positive, is_open = bool(tree) and always_heavy(tree), False
     kappa, nu, n = document["constants"]["kappa"], document["constants"]["nu"], len(document["law"]["rate"])
     for line, used in zip(document["inertia"], (kappa, nu, None, None), strict=True):
         name, least = f"{line['side']} λ(W^-½MW^-½), W = {line['weight']}", line["side"] == "least"
@@ -92,6 +84,7 @@ def _inertias(document: dict[str, Any], tree: list[Link]) -> Iterator[Check]:
             continue  # no bound is claimed
         if line["label"] != "PROVED" or line["multipliers"] is None or line["value"] is None or not tree:
             if used or line["label"] == "PROVED":
+                is_open = True
                 yield Check(name, OPEN, f"{line['label']}: {line['because']}")
             continue
         bound = arb(line["value"])
@@ -99,9 +92,14 @@ def _inertias(document: dict[str, Any], tree: list[Link]) -> Iterator[Check]:
             bound = bound.max(1 / arb(used)) if least else bound.min(1 / arb(used))
         weight = balls(document["law"]["floor"] if line["weight"] == "D0" else np.eye(n))
         form = energy_form(tree, bound * weight, 1 if least else -1, line["multipliers"])
-        yield _decided(
-            name, form is not None and positive_definite(form), f"{len(line['multipliers'])} multipliers, §6"
-        )
+        true = form is not None and positive_definite(form)
+        is_positive = is_positive or (true and least and bound > 0)
+        yield decided(name, true, f"{len(line['multipliers'])} multipliers, §6")
+    if tree and not is_positive and is_open:
+        yield Check("M ≻ 0 in every pose", OPEN, "no multipliers show it")
+    elif tree:
+        because = "by its least eigenvalue or the inertia of each body" if is_positive else "V ≥ Φ does not follow"
+        yield decided("M ≻ 0 in every pose", is_positive, because)
 
 
 def energy_form(tree: list[Link], weight: Balls, sign: int, multipliers: Sequence[float]) -> Balls | None:
@@ -174,10 +172,10 @@ def _constants(document: dict[str, Any]) -> Iterator[Check]:
     k: dict[str, Any] = {key: x if x is None else arb(x) for key, x in document["constants"].items()}
     stiffness, floor, rate = balls(law["stiffness"]), balls(law["floor"]), balls(law["rate"])
     if not positive_definite(floor):
-        yield _decided("D₀", False, "D₀ ≻ 0, §1")
+        yield decided("D₀", False, "D₀ ≻ 0, §1")
         return
-    yield _decided("ρ", positive_definite(2 * stiffness - np.diag(k["rho"] / rate)), "2S ≻ ρΛ⁻¹, §1")
-    yield _decided("δ", positive_definite(floor - np.diag(k["delta"] / rate)), "D₀ ≻ δΛ⁻¹, §1")
+    yield decided("ρ", positive_definite(2 * stiffness - np.diag(k["rho"] / rate)), "2S ≻ ρΛ⁻¹, §1")
+    yield decided("δ", positive_definite(floor - np.diag(k["delta"] / rate)), "D₀ ≻ δΛ⁻¹, §1")
     viscous, coulomb = (abs(balls(friction[x]) - balls(friction[f"fed_{x}"])) for x in ("viscous", "coulomb"))
     fed = [i for i in range(n) if not viscous[i].is_zero()]
     known = all(friction["speed"][i] is not None for i in fed)
@@ -189,13 +187,13 @@ def _constants(document: dict[str, Any]) -> Iterator[Check]:
         true = given["radius"] == 0.0 or positive_definite(ball)
     else:
         true = certain(balls(given["box"]) @ metric @ balls(given["box"]) <= left**2)
-    yield _decided("t", true and known and certain(left >= 0), "t² ≥ sup τᵀD₀⁻¹τ of disturbance and friction, §1, §8")
+    yield decided("t", true and known and certain(left >= 0), "t² ≥ sup τᵀD₀⁻¹τ of disturbance and friction, §1, §8")
     left = k["alpha"] - error["alpha"]
     true = not fed or positive_definite(left**2 * floor - np.diag(viscous**2 * rate))
-    yield _decided("α", true and certain(left >= 0), "α²D₀ ≻ ΔbΛΔb, §8")
-    yield _decided("β", certain(k["beta"] >= error["beta"]), "that of the model error, §5")
+    yield decided("α", true and certain(left >= 0), "α²D₀ ≻ ΔbΛΔb, §8")
+    yield decided("β", certain(k["beta"] >= error["beta"]), "that of the model error, §5")
     smooth = arb(-1).exp().lambertw() * friction["transition"] * balls(friction["fed_coulomb"]).sum()
-    yield _decided("P", certain(smooth <= k["power"]), "P ≥ max x(1 − tanh x) ε Σĉ, §8")
+    yield decided("P", certain(smooth <= k["power"]), "P ≥ max x(1 − tanh x) ε Σĉ, §8")
     if any(error.values()):
         yield Check("model error", TAKEN, "k/√d, α and β of §5")
 
@@ -207,17 +205,17 @@ def _levels(document: dict[str, Any]) -> Iterator[Check]:
     c, storage, rate = (arb(document["level"][key]) for key in ("c", "storage", "rate"))
     spare, potential, cut = c * storage - k["power"], arb(document["bounds"]["potential"]), document["polygon"]
     share = arb(0) if k["t"].is_zero() else k["t"] ** 2 / (4 * spare)
-    yield _decided("c and V∞", certain(spare >= 0) and _falls(k, c, share), "with the θ, η and r that they leave, §2")
-    yield _decided("rate", _falls(k, 2 * rate, arb(0)), "of decay without disturbance, §2")
+    yield decided("c and V∞", certain(spare >= 0) and _falls(k, c, share), "with the θ, η and r that they leave, §2")
+    yield decided("rate", _falls(k, 2 * rate, arb(0)), "of decay without disturbance, §2")
     if cut is None:
-        yield _decided("Φ∞", certain(potential >= storage), "Φ ≤ V ≤ V∞, §2")
+        yield decided("Φ∞", certain(potential >= storage), "Φ ≤ V ≤ V∞, §2")
         return
     phi, low, true = arb(cut["start"]), arb(0), certain(potential >= cut["start"])
     for m, high in zip(balls(cut["steepness"]), balls(cut["heights"]), strict=True):
         end = phi - (high - low) / m
         true = true and certain(m >= 1, high > low, end >= 0) and _closed(k, m, end, low, high)
         phi, low = end, high
-    yield _decided("Φ∞", true and certain(phi + low >= storage), f"{len(cut['heights'])} edges, each by (3) of §3")
+    yield decided("Φ∞", true and certain(phi + low >= storage), f"{len(cut['heights'])} edges, each by (3) of §3")
 
 
 def _falls(k: dict[str, Any], c: Any, share: Any) -> bool:
@@ -259,10 +257,10 @@ def _errors(document: dict[str, Any]) -> Iterator[Check]:
         return level <= 0.0 or all(positive_definite(form) for form in forms)
 
     level, length = document["bounds"]["potential"], unit(document, "rad", "m")
-    yield _decided("‖z1‖ and |z1_i|", bounded(document["bounds"], level), "e²S ≻ Φ∞I and e_i²S ≻ Φ∞e_ie_iᵀ, §2")
+    yield decided("‖z1‖ and |z1_i|", bounded(document["bounds"], level), "e²S ≻ Φ∞I and e_i²S ≻ Φ∞e_ie_iᵀ, §2")
     if start is not None:
         yield Check("V(0) of the start", TAKEN, f"{start['storage']:.6g} J, which takes the weights of the law")
-        yield _decided("errors from the start", bounded(start, max(level, start["storage"])), "Φ ≤ max(V(0), Φ∞), §3")
+        yield decided("errors from the start", bounded(start, max(level, start["storage"])), "Φ ≤ max(V(0), Φ∞), §3")
     if document["linear"] is not None:
         yield Check("‖z1‖ of one joint", OPEN, f"{document['linear']['error']:.6g} {length} by linear theory, §4")
     if document["held"] is not None:
@@ -271,26 +269,4 @@ def _errors(document: dict[str, Any]) -> Iterator[Check]:
     for i, joint in enumerate(document["arm"]["joints"] if document["arm"] else []):
         if joint["continuous"]:
             largest = max(sizes["joint_errors"][i] for sizes in (document["bounds"], start) if sizes)
-            yield _decided(f"π > |z1| of {joint['name']}", certain(largest < arb.pi()), "its error jumps at ±π")
-
-
-def _stated(document: dict[str, Any]) -> Iterator[Check]:
-    """Seal, label, conditions and premises."""
-    yield _decided("the file is as it was written", is_unchanged(document), "its SHA-256, which names no author")
-    used = document["constants"]["kappa"] > 0.0 or document["constants"]["nu"] is not None
-    claims, holding = [*document["claims"], *(document["inertia"][:2] if used else [])], True
-    for x in document["conditions"]:
-        left, right = (math.inf if x[side] is None else x[side] for side in ("left", "right"))
-        if x["role"] != "comparison":
-            true = x["holds"] and left > right
-            holding, claims = holding and true, claims + [x] * (x["role"] == "sufficient")
-            yield Check(x["name"], TAKEN if true else FALSE, f"{left:.6g} > {right:.6g} {x['unit']}".rstrip())
-    weakest = max([*(x["label"] for x in claims), "PROVED" if holding else "EMPIRICAL"], key=_LABELS.index)
-    yield _decided(f"label {document['label']}", document["label"] == weakest, "the weakest of claims and conditions")
-    given, kind = document["disturbance"], document["law"]["kind"]
-    box = f"‖τ_d‖ ≤ {given['radius']:g}" if given["box"] is None else f"|τ_d,i| ≤ {given['box']}"
-    yield Check("disturbance", TAKEN, f"{box} {unit(document, 'N·m', 'N')}")
-    if any(any(document["friction"][key]) for key in ("viscous", "coulomb", "fed_viscous", "fed_coulomb")):
-        yield Check("joint friction and |v_d|", TAKEN, "b, c, b̂, ĉ, ε and the speed of the reference as in the file")
-    yield Check(f"law {kind}", TAKEN, "Φ ≥ z1ᵀSz1, D ⪰ D₀, Λ, ω and ζ as in the file, by the structure of its code")
-    yield from (Check(x["assumption"], TAKEN, f"assumption, {x['checked']}") for x in document["assumptions"])
+            yield decided(f"π > |z1| of {joint['name']}", certain(largest < arb.pi()), "its error jumps at ±π")

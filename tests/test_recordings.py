@@ -1,0 +1,419 @@
+"""Files of recorded motions: units of time and angles, where time begins, wraps, outliers, clocks, columns."""
+
+import re
+import warnings
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+import nbs_pin as nbs
+from nbs_pin import cli
+from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.doors import at_the_shell, option
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
+from nbs_pin.base.npz import write_npz
+from nbs_pin.identification.datasets import trajectory_slices
+from nbs_pin.identification.logs import load_log
+from nbs_pin.motions.recordings import TIME_UNITS, Joints, in_radians, unwrapped
+from nbs_pin.motions.reference_files import load_reference
+from nbs_pin.robots.catalogue import find
+from nbs_pin.robots.robot import load_robot
+from tests.commands import refusal
+
+T = np.linspace(0.0, 4.0, 401)
+TWO = load_robot("two_link")
+
+
+def smooth(t, size=1.0):
+    """From rest to rest, angles up to `size` and twice that [rad]."""
+    s = np.clip(t / t[-1], 0.0, 1.0)
+    s = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    return size * np.column_stack((s, -2.0 * np.sin(2.0 * np.pi * s)))
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory):
+    """two_link with joints that turn without limit."""
+    text = find("two_link").path.read_text().replace('type="revolute"', 'type="continuous"')
+    path = tmp_path_factory.mktemp("arm") / "turning.urdf"
+    path.write_text(text)
+    robot = load_robot(path)
+    assert robot.continuous.all()
+    return robot
+
+
+@contextmanager
+def noted():
+    """The warnings of the block, as a list of texts that is filled at its end."""
+    texts = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield texts
+    texts += [str(warning.message) for warning in caught]
+
+
+def reference_file(folder, t, q, v=None):
+    write_npz(folder / "motion.npz", {"t": t, "q": q} | ({} if v is None else {"v": v}))
+    return folder / "motion.npz"
+
+
+def log_file(folder, t, q, v=None, **more):
+    """A log of two trajectories of the same motion, with a torque that does not matter here."""
+    arrays = {"q": q, "tau": np.cos(3.0 * q) + 2.0} | ({} if v is None else {"v": v}) | more
+    twice = {name: np.concatenate([x, x]) for name, x in arrays.items()}
+    stamps = np.concatenate([t, t])
+    np.savez(folder / "log.npz", t=stamps, trajectory=np.arange(len(stamps)) // len(t), **twice)
+    return folder / "log.npz"
+
+
+# Time.
+
+
+@pytest.mark.parametrize("start", [1.695e9, -1.0, 12.5])
+def test_time_is_counted_from_the_first_row_which_is_said_once(tmp_path, start):
+    q = smooth(T)
+    with noted() as none:
+        expected = load_reference(reference_file(tmp_path, T, q), TWO)
+    with noted() as notes:
+        motion = load_reference(reference_file(tmp_path, start + T, q, np.gradient(q, T, axis=0)), TWO)
+    assert none == []
+    assert len(notes) == 1
+    assert f"time is counted from the first row, which is at t = {start:.12g} s" in notes[0]
+    assert motion.duration == pytest.approx(4.0, abs=1e-6)
+    for seen, wanted in zip(motion(T[1:-1]), expected(T[1:-1]), strict=True):
+        assert_allclose(seen, wanted, rtol=1e-5, atol=1e-5)  # seconds since 1970 are rounded to 2e-7
+    assert np.abs(motion(2.0).v).max() > 0.5
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("kind", ["reference", "log"])
+def test_other_units_of_time_are_named_and_converted_when_given(tmp_path, unit, stated, kind):
+    q = smooth(T)
+    v = np.gradient(q, T, axis=0) if stated else None
+    write, load = (reference_file, load_reference) if kind == "reference" else (log_file, load_log)
+    arm = {"robot": TWO}
+    plain = load(write(tmp_path, T, q, v), **arm)
+    path = write(tmp_path, T / TIME_UNITS[unit], q, v)
+    called = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}[unit]
+    with pytest.raises(FileFormatError, match=f"t looks like {called}.* give time_unit='{unit}'"):
+        load(path, **arm)
+    converted = load(path, **arm, time_unit=unit)
+    assert_allclose(converted.t, plain.t, rtol=1e-12)
+    assert_allclose(converted.q, plain.q, rtol=1e-12)
+
+
+def test_stamps_of_whole_nanoseconds_are_converted(tmp_path):
+    stamps = 1_695_000_000_000_000_000 + np.round(1e9 * T).astype(np.int64)
+    with noted() as notes:
+        motion = load_reference(reference_file(tmp_path, stamps, smooth(T)), TWO, time_unit="ns")
+    assert_allclose(motion.t, T, atol=1e-6)
+    assert len(notes) == 1
+    assert notes[0].endswith(" ns.")
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0, 10.0])
+def test_sparse_rows_are_seconds_if_the_arm_gets_somewhere_and_slow_ones_if_said(tmp_path, step):
+    t = step * np.arange(21.0)
+    quick, slow = smooth(t, 0.1 * step), smooth(t, 1e-3)
+    assert load_reference(reference_file(tmp_path, t, quick), TWO).duration == t[-1]
+    path = reference_file(tmp_path, t, slow)
+    if step > 0.5:
+        with pytest.raises(FileFormatError, match="time_unit='s' if it is that slow"):
+            load_reference(path, TWO)
+    assert load_reference(path, TWO, time_unit="s").duration == t[-1]
+
+
+def test_a_unit_that_is_none_is_refused(tmp_path):
+    for load, write in ((load_reference, reference_file), (load_log, log_file)):
+        with pytest.raises(ArgumentError, match="time_unit is 'min'; give one of s, ms, us, ns"):
+            load(write(tmp_path, T, smooth(T)), robot=TWO, time_unit="min")
+
+
+# Angles.
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-7.0, 7.0), st.floats(2.0, 12.0), st.integers(0, 99))
+def test_unwrapping_undoes_wrapping_but_for_whole_turns(offset, size, seed):
+    q = offset + smooth(T, size) + 1e-3 * np.random.default_rng(seed).standard_normal((len(T), 2))
+    joints = Joints(("a", "b"), np.ones(2, dtype=bool), np.zeros(2, dtype=bool))
+    for low in (-np.pi, 0.0):
+        found = unwrapped(low + np.mod(q - low, 2.0 * np.pi), joints, [slice(0, len(T))], None)
+        turns = (found.q - q) / (2.0 * np.pi)
+        assert not found.fault
+        assert_allclose(turns, np.round(turns[:1]) + np.zeros((len(T), 1)), atol=1e-9)
+
+
+def test_joints_without_limits_are_unwrapped_in_references_and_logs(tmp_path, turning):
+    q = smooth(T, 5.0)
+    wrapped = np.mod(q + np.pi, 2.0 * np.pi) - np.pi
+    with noted() as notes:
+        motion = load_reference(reference_file(tmp_path, T, wrapped), turning)
+    assert len(notes) == 2
+    assert all("turns without limit, so it was unwrapped" in note for note in notes)
+    assert_allclose(motion(T).q, q, atol=1e-9)
+    for v in (None, np.gradient(q, T, axis=0)):
+        with noted() as notes:
+            data = load_log(log_file(tmp_path, T, wrapped, v), robot=turning)
+        whole = load_log(log_file(tmp_path, T, q, v), robot=turning)
+        assert len(notes) == 2
+        assert_allclose(data.v, whole.v, atol=1e-9)
+        assert_allclose(data.a, whole.a, atol=1e-7)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_wraps_of_joints_with_limits_are_named_and_nothing_is_said_of_v(tmp_path, stated):
+    q = smooth(T, 1.6) + np.array([0.0, 0.3])
+    v = np.gradient(q, T, axis=0)
+    row = int(np.flatnonzero(np.abs(np.diff(np.mod(q[:, 1] + np.pi, 2.0 * np.pi))) > 6.0)[0]) + 1
+    wrapped = np.mod(q + np.pi, 2.0 * np.pi) - np.pi
+    words = rf"joint2 jumps by -?6\.\d+ rad between rows {row} and {row + 1}: a wrap\? unwrap"
+    for write, load in ((reference_file, load_reference), (log_file, load_log)):
+        with pytest.raises(FileFormatError, match=words) as caught:
+            load(write(tmp_path, T, wrapped, v if stated else None), robot=TWO, degrees=False)
+        assert "v of" not in str(caught.value)
+
+
+@pytest.mark.parametrize("row", [2, 57, 200, 398])
+@pytest.mark.parametrize("size", [0.5, 6.0, 50.0])
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_single_outlier_is_named_as_such(tmp_path, row, size, stated):
+    q = smooth(T, 0.5)
+    v = np.gradient(q, T, axis=0) if stated else None
+    spoilt = q.copy()
+    spoilt[row, 0] += size
+    for write, load in ((reference_file, load_reference), (log_file, load_log)):
+        with pytest.raises(FileFormatError, match=rf"row {row + 1}.*an outlier\?"):
+            load(write(tmp_path, T, spoilt, v), robot=TWO, degrees=False)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_two_recordings_in_one_are_told_apart(tmp_path, stated):
+    q = np.concatenate([smooth(T, 0.5), smooth(T, 0.5) + 0.4])
+    t = np.arange(len(q)) * T[1]
+    v = np.gradient(q, t, axis=0) if stated else None
+    words = r"to 0\.4 between rows 401 and 402: does another recording begin there\? number .* 'trajectory'"
+    with pytest.raises(FileFormatError, match=words):
+        load_log(log_file(tmp_path, t, q, v), robot=TWO)
+
+
+def test_degrees_are_converted_when_said_and_named_when_they_wrap(tmp_path, turning):
+    q = smooth(T, 5.0)
+    wrapped = np.degrees(np.mod(q + np.pi, 2.0 * np.pi) - np.pi)
+    path = reference_file(tmp_path, T, wrapped)
+    with pytest.raises(
+        FileFormatError, match=r"jumps by -?3\d\d\S* between rows .* a wrap in degrees\? give degrees=True"
+    ):
+        load_reference(path, turning)
+    with pytest.warns(UserWarning, match="unwrapped"):
+        assert_allclose(load_reference(path, turning, degrees=True)(T).q, q, atol=1e-9)
+    panda = load_robot("panda")
+    far = np.degrees(np.tile(0.5 * (panda.lower + panda.upper) + 0.2, (9, 1)))
+    with pytest.raises(FileFormatError, match="looks like degrees; give degrees=True, or degrees=False"):
+        load_reference(reference_file(tmp_path, T[:9], far), panda)
+    assert_array_equal(in_radians(np.array([[180.0, 1.0]]), np.array([False, True])), [[np.pi, 1.0]])
+
+
+# Clocks.
+
+
+@pytest.mark.parametrize("fault", ["jitter", "dropped"])
+def test_uneven_rows_are_resampled_if_asked(tmp_path, fault):
+    """A smooth motion is found again to the accuracy of cubic splines, whose error falls with the fourth power."""
+    rng, step = np.random.default_rng(0), T[1]
+    t = T + 0.01 * step * rng.uniform(-1.0, 1.0, len(T)) if fault == "jitter" else T[rng.random(len(T)) > 0.03]
+    t[0] = 0.0
+    path = log_file(tmp_path, t, smooth(np.append(t, 4.0))[:-1])
+    with pytest.raises(FileFormatError, match=r"not evenly spaced .* give resample=0\.01, or log v and a"):
+        load_log(path, robot=TWO)
+    data = load_log(path, robot=TWO, resample=step)
+    rows = trajectory_slices(data.trajectory)[0]
+    exact = nbs.Sampled(T, smooth(T))(data.t[rows])
+    assert_allclose(data.q[rows], exact.q, atol=1e-5)
+    assert_allclose(data.v[rows], exact.v, atol=1e-3)
+    assert_allclose(data.a[rows], exact.a, atol=0.1)
+    assert_allclose(data.tau[rows], np.cos(3.0 * exact.q) + 2.0, atol=1e-2)
+    assert_allclose(np.diff(data.t[rows]), step, rtol=1e-9)
+
+
+def test_long_gaps_are_not_bridged(tmp_path):
+    t = np.concatenate([T[:200], T[240:]])
+    path = log_file(tmp_path, t, smooth(t))
+    with pytest.raises(FileFormatError, match=r"0\.41 s are missing between rows 200 and 201.* another 'trajectory'"):
+        load_log(path, robot=TWO, resample=0.01)
+    for step, words in ((0.0, "resample is 0"), (1e-9, "more than 10,000,000 rows")):
+        with pytest.raises(ArgumentError, match=words):
+            load_log(log_file(tmp_path, T, smooth(T)), robot=TWO, resample=step)
+
+
+# Columns.
+
+
+def table(names="t,q_joint1,q_joint2,v_joint1,v_joint2,tau_joint1,tau_joint2"):
+    q = smooth(T)
+    return names.split(","), np.column_stack((T, q, np.gradient(q, T, axis=0), np.cos(q)))
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Loads a table as a log of one trajectory."""
+
+    def loaded(head, rows):
+        write_csv(tmp_path / "log.csv", head, rows)
+        with noted() as notes:
+            data = load_log(tmp_path / "log.csv", robot=TWO)
+        return data, [note for note in notes if "one trajectory" not in note]
+
+    return loaded
+
+
+def test_the_names_of_ros_are_understood(load, tmp_path):
+    head, rows = table()
+    plain, _ = load(head, rows)
+    words = {"q_": "position_", "v_": "velocity_", "tau_": "effort_"}
+    ros = [next((name.replace(a, b, 1) for a, b in words.items() if name.startswith(a)), name) for name in head]
+    renamed, notes = load(ros, rows)
+    assert notes == []
+    for name in ("q", "v", "a", "tau"):
+        assert_array_equal(getattr(renamed, name), getattr(plain, name))
+    assert_array_equal(load_reference(tmp_path / "log.csv", TWO).q, rows[:, 1:3])
+
+
+def test_columns_of_a_gripper_are_left_out_and_said(load, tmp_path):
+    head, rows = table()
+    plain, _ = load(head, rows)
+    more, notes = load([*head, "q_finger"], np.column_stack((rows, T)))
+    assert_array_equal(more.q, plain.q)
+    assert len(notes) == 1
+    assert "no joint of the arm is named finger; left out" in notes[0]
+    with pytest.warns(UserWarning, match="finger; left out"):
+        load_reference(tmp_path / "log.csv", TWO)
+    with pytest.raises(FileFormatError, match="leave out the columns of other joints and number these 1 to 2"):
+        load(["t", "q1", "q2", "q3", "tau1", "tau2", "tau3"], rows)
+    with pytest.raises(FileFormatError, match=r"1 joints .* expected 2 .* add those of joint2"):
+        load(["t", "q_joint1", "tau_joint1"], rows[:, :3])
+
+
+def test_a_comma_at_the_end_of_lines_is_no_column(load):
+    head, rows = table()
+    plain, _ = load(head, rows)
+    for start in ([*head, ""], head):
+        again, _ = load(start, [[*map(repr, row.tolist()), ""] for row in rows])
+        assert_array_equal(again.q, plain.q)
+
+
+@pytest.mark.parametrize(("mark", "name"), [(";", "semicolons"), ("\t", "tabs")])
+def test_other_separators_are_named(tmp_path, mark, name):
+    head, rows = table()
+    text = "\n".join([mark.join(head), *(mark.join(map(str, row)) for row in rows)])
+    (tmp_path / "log.csv").write_text(text)
+    for read in (load_log, load_reference):
+        with pytest.raises(FileFormatError, match=f"separated by {name}, expected commas"):
+            read(tmp_path / "log.csv", robot=TWO)
+
+
+def test_a_velocity_that_is_zero_is_what_is_wrong(load):
+    head, rows = table()
+    rows[:, 4] = 0.0
+    with pytest.raises(FileFormatError, match="v of joint 2 is 0 in every row while q changes; log it, or leave v out"):
+        load(head, rows)
+
+
+@pytest.mark.parametrize("setting", [{"degrees": True}, {"window": 0.2}, {"time_unit": "ms"}, {"resample": 0.01}])
+def test_a_saved_dataset_takes_no_settings_of_a_log(tmp_path, setting):
+    nbs.collect(TWO, "uniform", samples=10).save(tmp_path / "data.npz")
+    (name,) = setting
+    with pytest.raises(ArgumentError, match=f"is a saved dataset, .* takes no {name}=.*; leave that out"):
+        load_log(tmp_path / "data.npz", robot=TWO, **setting)
+    assert len(load_log(tmp_path / "data.npz", robot=TWO, degrees=False)) == 10
+
+
+# Remedies, in Python and in the shell.
+
+
+def test_an_option_is_named_as_its_reader_types_it():
+    assert option("time_unit", "ms") == "time_unit='ms'"
+    assert option("degrees", False) == "degrees=False"
+    assert option("effort_limit", 80.0) == "Robot.with_effort_limit(80.0)"
+    with at_the_shell():
+        assert option("time_unit", "ms") == "--time-unit ms"
+        assert (option("degrees", True), option("degrees", False)) == ("--degrees", "--radians")
+        assert option("effort_limit", 80.0) == "--effort-limit 80.0"
+    assert option("degrees", True) == "degrees=True"
+
+
+def test_the_shell_names_its_own_options_and_they_help(tmp_path, capsys):
+    path, out = reference_file(tmp_path, 1e3 * T, smooth(T, 0.4)), ["--out", str(tmp_path / "out")]
+    track = ["track", "two_link", "--reference", str(path), *out, "--plant", "pinocchio"]
+    assert "give --time-unit ms, or --time-unit s" in refusal(cli.main(track), capsys)
+    assert cli.main([*track, "--time-unit", "ms"]) == 0
+    assert "simulated 4 s" in capsys.readouterr().out
+    assert "--degrees and --radians" in refusal(cli.main([*track, "--degrees", "--radians"]), capsys)
+    log = log_file(tmp_path, T + 1e-4 * np.sin(1e3 * T), smooth(T))
+    learn = ["learn", str(log), "--robot", "two_link", "--model", "identified", *out]
+    assert "give --resample 0.01" in refusal(cli.main(learn), capsys)
+
+
+# Friction and weight in the torques of a reference.
+
+
+@pytest.fixture
+def rubbing(tmp_path):
+    """Makes a two_link with friction and effort limits."""
+
+    def arm(damping, friction, effort):
+        text = find("two_link").path.read_text()
+        text = re.sub(r"<dynamics[^>]*/>", "", text)
+        text = re.sub(r"(<limit[^>]*/>)", rf'\1<dynamics damping="{damping}" friction="{friction}"/>', text)
+        (tmp_path / "arm.urdf").write_text(text)
+        robot = load_robot(tmp_path / "arm.urdf")
+        assert robot.friction.tolist() == [friction] * 2
+        return robot.with_effort_limit(effort)
+
+    return arm
+
+
+def test_friction_beyond_the_effort_limit_is_named_if_it_is_kept(rubbing):
+    robot = rubbing(0.0, 200.0, 150.0)
+    motion = nbs.Sinusoid.for_robot(robot)
+    nbs.check_reference(motion, robot, 5.0)
+    words = r"Coulomb friction 200 N·m of joint 'joint1' is not below its effort limit 150 .*\(joint_friction='drop'\)"
+    with pytest.raises(ArgumentError, match=words):
+        nbs.check_reference(motion, robot, 5.0, joint_friction="keep")
+    nbs.check_reference(nbs.Hold(motion(0.0).q), robot, 5.0, joint_friction="keep")
+    with pytest.raises(ArgumentError, match="give 'drop' or 'keep'"):
+        nbs.check_reference(motion, robot, 5.0, joint_friction="some")
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(0.0, 3.0), st.floats(0.0, 5.0))
+def test_the_torque_of_a_reference_includes_the_friction_of_the_urdf(tmp_path_factory, damping, friction):
+    text = find("two_link").path.read_text()
+    text = re.sub(r"<dynamics[^>]*/>", "", text)
+    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(re.sub(r"(<limit[^>]*/>)", rf'\1<dynamics damping="{damping}" friction="{friction}"/>', text))
+    robot = load_robot(path)
+    motion, t = nbs.Sinusoid.for_robot(robot), np.linspace(0.0, 5.0, 2001)
+    q, v, a = motion(t)
+    drag = nbs.JointFriction.of(robot).torque(v)
+    needed = np.abs(nbs.PinocchioDynamics(robot).reference_torque(q, v, v, a) + drag).max(axis=0)
+    nbs.check_reference(motion, robot.with_effort_limit(1.0001 * needed), 5.0, joint_friction="keep")
+    with pytest.raises(ArgumentError, match="torque"):
+        nbs.check_reference(motion, robot.with_effort_limit(0.9999 * needed), 5.0, joint_friction="keep")
+
+
+def test_the_remedy_for_too_large_a_torque_is_one_that_helps():
+    q = np.array([0.5 * np.pi, 0.0])
+    for posture in (q, np.zeros(2)):
+        weight = np.abs(nbs.PinocchioDynamics(TWO).gravity(posture)).max()
+        if weight > 1.0:
+            break
+    weak = TWO.with_effort_limit(0.5 * weight)
+    with pytest.raises(ArgumentError, match=r"its weight alone takes .*, so choose another posture or raise") as caught:
+        nbs.check_reference(nbs.Hold(posture), weak, 1.0)
+    limit = float(re.search(r"with_effort_limit\((\S+)\)", str(caught.value))[1])
+    nbs.check_reference(nbs.Hold(posture), TWO.with_effort_limit(limit), 1.0)

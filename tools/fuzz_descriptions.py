@@ -1,0 +1,241 @@
+"""Files of arms broken at random: `python tools/fuzz_descriptions.py --count 20000 --seed 0`.
+
+Mutants of the arms of the catalogue and of a xacro file (bytes, numbers, attributes, elements, encodings). What
+`load_robot` accepts must have M(q) ≻ 0 in every pose that a search finds, and MuJoCo must build the same M from the
+same bytes, to 1e-9 of its largest entry. Prints the counts and ends with 1 if an error was not the package's own, a
+worker died, or an accepted arm was not sound.
+"""
+
+import argparse
+import collections
+import os
+import random
+import re
+import tempfile
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+from rich.progress import track
+from scipy.optimize import minimize
+
+from nbs_pin.base.exceptions import NbsPinError
+from nbs_pin.robots.catalogue import ROBOT_NAMES, find
+from nbs_pin.robots.robot import Robot, load_robot
+
+NASTY = [
+    "nan",
+    "inf",
+    "-inf",
+    "-1",
+    "0",
+    "-0.0",
+    "1e-320",
+    "1e-30",
+    "1e-16",
+    "1e-12",
+    "1e-6",
+    "1e-3",
+    "0.5",
+    "2",
+    "7",
+    "100",
+    "1e6",
+    "1e9",
+    "1e16",
+    "1e20",
+    "1e200",
+    "1e308",
+    "1e400",
+    "1_0",
+    "0x10",
+    "1,5",
+    "٣",
+    "''",
+    "x",
+    "${1/0}",
+    "${x}",
+    "$(arg",
+    "y)",
+    "$(find",
+    "z)",
+    "1.5707963267948966",
+]
+PIECES = [
+    "<link/>",
+    "<joint/>",
+    "&x;",
+    "<!--",
+    "]]>",
+    "<xacro:if value='1'>",
+    "<limit/>",
+    "<inertial/>",
+    "\x00",
+    "é",
+    "\ufeff",
+]
+XACRO = """<?xml version="1.0"?>
+<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:arg name="mass" default="2.0"/>
+  <xacro:property name="length" value="0.4"/>
+  <xacro:macro name="arm" params="name parent m:=1.0 *origin">
+    <link name="${name}"><inertial><origin xyz="0 0 ${length / 2}"/><mass value="${m}"/>
+      <inertia ixx="${m * length ** 2 / 12}" ixy="0" ixz="0" iyy="${m * length ** 2 / 12}" iyz="0" izz="0.001"/>
+    </inertial></link>
+    <joint name="${name}_joint" type="revolute"><xacro:insert_block name="origin"/>
+      <parent link="${parent}"/><child link="${name}"/><axis xyz="0 1 0"/>
+      <limit lower="-2" upper="2" effort="50" velocity="3"/><dynamics damping="0.1" friction="0.2"/></joint>
+  </xacro:macro>
+  <link name="base"/>
+  <xacro:arm name="a" parent="base" m="$(arg mass)"><origin xyz="0 0 0.1"/></xacro:arm>
+  <xacro:arm name="b" parent="a"><origin xyz="0 0 ${length}" rpy="0 0 ${pi / 2}"/></xacro:arm>
+</robot>
+"""
+
+
+def mutants(seed: int, texts: list[tuple[str, str]]) -> Iterator[tuple[str, bytes]]:
+    """An endless stream of mutants: suffix of the file and its bytes."""
+    rng = random.Random(seed)
+    while True:
+        suffix, text = rng.choice(texts)
+        for _ in range(rng.choice((1, 1, 1, 2, 3))):
+            text = mutated(text, rng)
+        data = text.encode("utf-8", "replace")
+        if rng.random() < 0.1:
+            spot = rng.randrange(len(data) + 1)
+            data = data[:spot] + rng.randbytes(rng.randrange(4)) + data[spot + rng.randrange(20) :]
+        if rng.random() < 0.01:
+            data = text.encode(rng.choice(("utf-16", "latin-1", "utf-32")), "replace")
+        yield suffix, data
+
+
+def mutated(text: str, rng: random.Random) -> str:
+    """One change of a text."""
+    kind = rng.random()
+    if kind < 0.55:
+        return _number(text, rng)
+    if kind < 0.7:
+        return _element(text, rng)
+    attributes = list(re.finditer(r'\s[\w:]+="[^"]*"', text))
+    if kind < 0.85 and attributes:
+        found, other = rng.choice(attributes), rng.choice(attributes)
+        new = "" if rng.random() < 0.5 else other.group()
+        return text[: found.start()] + new + text[found.end() :]
+    spot = rng.randrange(len(text) + 1)
+    return text[:spot] + rng.choice(PIECES) + text[spot + rng.randrange(30) :]
+
+
+def _number(text: str, rng: random.Random) -> str:
+    spots = list(re.finditer(r'(?<==")[-+\d.e ]+(?=")', text))
+    if not spots:
+        return text
+    spot = rng.choice(spots)
+    words = spot.group().split() or [""]
+    place = rng.randrange(len(words))
+    factor = rng.choice((-1.0, 0.0, 1e-9, 1e-3, 0.1, 0.99, 1.01, 10.0, 1e3, 1e9))
+    try:
+        words[place] = repr(float(words[place]) * factor) if rng.random() < 0.4 else rng.choice(NASTY)
+    except ValueError:
+        words[place] = rng.choice(NASTY)
+    return text[: spot.start()] + " ".join(words) + text[spot.end() :]
+
+
+def _element(text: str, rng: random.Random) -> str:
+    """An element dropped, doubled or moved."""
+    elements = list(re.finditer(r"<(\w+)\b[^<>]*?(/>|>.*?</\1>)", text, re.S))
+    if not elements:
+        return text
+    found, kind = rng.choice(elements), rng.random()
+    rest = text[: found.start()] + text[found.end() :]
+    if kind < 0.4:
+        return rest
+    spot = found.start() if kind < 0.7 else rng.randrange(len(rest) + 1)
+    return rest[:spot] + found.group() * (2 if kind < 0.7 else 1) + rest[spot:]
+
+
+def verdict(suffix: str, data: bytes, folder: str) -> str:
+    """What became of one file: refused, accepted, or what is wrong."""
+    path = Path(folder) / f"arm-{os.getpid()}{suffix}"
+    path.write_bytes(data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            robot = load_robot(path)
+        except NbsPinError as error:
+            return "refused" if "\n" not in str(error) else "BAD refusal of several lines"
+        except Exception as error:
+            return f"BAD untyped {type(error).__name__}: {error}"[:200]
+        return fault(robot)
+
+
+def fault(robot: Robot) -> str:
+    """Why the arm is not sound, or that it is accepted."""
+    low, high = robot.one_turn_range
+    rng = np.random.default_rng(0)
+    data = robot.model.createData()
+    poses = rng.uniform(low, high, (12, robot.nv))
+    masses = [np.array(pin.crba(robot.model, data, q)) for q in poses]
+    if not np.isfinite(masses).all():
+        return "BAD M is not finite"
+    scale = np.sqrt(np.max([np.diag(mass) for mass in masses], axis=0))
+
+    def least(q: Any) -> float:
+        return float(np.linalg.eigvalsh(pin.crba(robot.model, data, np.clip(q, low, high)) / scale / scale[:, None])[0])
+
+    start = min(poses, key=least)
+    if robot.nv <= 8:
+        start = np.clip(minimize(least, start, method="Nelder-Mead", options={"maxfev": 60 * robot.nv}).x, low, high)
+    if not least(start) > 1e-12:
+        return f"BAD M is singular at {start.tolist()}"
+    try:
+        model = mujoco.MjModel.from_xml_string(robot.urdf.without_geometry().decode())
+    except ValueError as error:
+        return f"accepted, refused by MuJoCo ({' '.join(str(error).split())[:60]})"
+    state, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    order = [model.jnt_dofadr[model.joint(name).id] for name in robot.joint_names]
+    for q, mass in zip(poses, masses, strict=True):
+        state.qpos[[model.jnt_qposadr[model.joint(name).id] for name in robot.joint_names]] = q
+        mujoco.mj_forward(model, state)
+        mujoco.mj_fullM(model, state, full)
+        other = full[np.ix_(order, order)]
+        if np.abs(other - mass).max() > 1e-9 * np.abs(mass).max():
+            return "BAD M differs from MuJoCo's"
+    return "accepted"
+
+
+def batch(seed: int, count: int) -> list[tuple[str, str, bytes]]:
+    """Verdicts of `count` mutants."""
+    texts = [(".urdf", find(name).path.read_text()) for name in ROBOT_NAMES] + [(".xacro", XACRO)] * 4
+    stream = mutants(seed, texts)
+    with tempfile.TemporaryDirectory() as folder:
+        return [(verdict(suffix, data, folder), suffix, data) for suffix, data in (next(stream) for _ in range(count))]
+
+
+def main() -> int:
+    """Run and print; the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=20000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, help="folder for the bad files")
+    options = parser.parse_args()
+    size, counts = 100, collections.Counter[str]()
+    batches = [(options.seed * 1_000_000 + k, min(size, options.count - k)) for k in range(0, options.count, size)]
+    with ProcessPoolExecutor(max_workers=os.cpu_count()) as pool:
+        for found in track(pool.map(batch, *zip(*batches, strict=True)), "mutants", total=len(batches)):
+            for text, suffix, data in found:
+                counts[text] += 1
+                if text.startswith("BAD") and options.keep:
+                    options.keep.mkdir(parents=True, exist_ok=True)
+                    (options.keep / f"bad-{sum(counts.values())}{suffix}").write_bytes(data)
+    for text, number in counts.most_common():
+        print(f"{number:8d}  {text}")
+    return int(any(text.startswith("BAD") for text in counts))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
