@@ -20,6 +20,10 @@ class ArgumentError(NbsPinError, ValueError):
     """An argument that is not finite or has the wrong shape, type or range."""
 
 
+class NoSuchFile(ArgumentError, FileNotFoundError):
+    """The path of a file to read that does not exist."""
+
+
 class MissingExtra(NbsPinError, ImportError):
     """An optional dependency is not installed; names the extra that installs it."""
 

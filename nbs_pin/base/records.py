@@ -9,13 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.arguments import checked, readable, writable
 from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 
 RUN_FORMAT = "nbs_pin run 1"
 """Value of the entry `format` in a run file."""
-_PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+ROW_ARRAYS = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+"""Arrays of a run with a number for each instant, start and joint."""
 _PER_JOINT = ("effort_limit", "continuous", "joint_names")
 _JSON = ("robot_options", "info")
 
@@ -86,6 +88,7 @@ class Run:
         """Number of joints."""
         return int(self.q.shape[-1])
 
+    @checked(path=writable)
     def save(self, path: str | Path) -> None:
         """Write the run to an npz file atomically; missing folders are created.
 
@@ -97,6 +100,7 @@ class Run:
         write_npz(path, {name: np.asarray(value) for name, value in (values | texts).items()})
 
     @classmethod
+    @checked(path=readable)
     def load(cls, path: str | Path) -> "Run":
         """The run in an npz file written by `save`.
 
@@ -104,7 +108,7 @@ class Run:
             FileFormatError: If the file is damaged, a key is missing, a shape is wrong or a number is not finite.
         """
         data = {"robot_options": np.array("{}"), **read_npz(path)}  # absent in the oldest run files
-        require(data, path, {"format": "U", "t": "f", **dict.fromkeys(_PER_ROW, "f"), "effort_limit": "f"})
+        require(data, path, {"format": "U", "t": "f", **dict.fromkeys(ROW_ARRAYS, "f"), "effort_limit": "f"})
         require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", *_JSON), "U")})
         require(data, path, {"period": "f"})
         if str(data["format"]) != RUN_FORMAT:
@@ -112,7 +116,7 @@ class Run:
         _check_shapes(path, data)
         _check_numbers(path, data)
         return cls(
-            **{name: data[name] for name in ("t", *_PER_ROW, "effort_limit", "continuous")},
+            **{name: data[name] for name in ("t", *ROW_ARRAYS, "effort_limit", "continuous")},
             joint_names=tuple(str(name) for name in data["joint_names"]),
             period=float(data["period"]),
             robot=str(data["robot"]),
@@ -124,7 +128,7 @@ class Run:
 
 def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
     shape = data["q"].shape
-    expected = dict.fromkeys(_PER_ROW, shape) | dict.fromkeys(_PER_JOINT, shape[-1:]) | {"t": shape[:1], "period": ()}
+    expected = dict.fromkeys(ROW_ARRAYS, shape) | dict.fromkeys(_PER_JOINT, shape[-1:]) | {"t": shape[:1], "period": ()}
     for name, wanted in expected.items():
         if len(shape) < 2 or data[name].shape != wanted:
             raise FileFormatError(
@@ -134,7 +138,7 @@ def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
 
 
 def _check_numbers(path: str | Path, data: dict[str, np.ndarray]) -> None:
-    faults = {name: "numbers that are not finite" for name in ("t", *_PER_ROW) if not np.isfinite(data[name]).all()}
+    faults = {name: "numbers that are not finite" for name in ("t", *ROW_ARRAYS) if not np.isfinite(data[name]).all()}
     if not (data["effort_limit"] > 0.0).all():
         faults["effort_limit"] = "limits that are not > 0"
     if not 0.0 < data["period"] < np.inf:

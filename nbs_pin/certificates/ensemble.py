@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from nbs_pin.base.checks import PerJoint, positive
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.progress import tracked
-from nbs_pin.base.records import Reference, Run
+from nbs_pin.base.records import ROW_ARRAYS, Reference, Run
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
@@ -28,7 +28,6 @@ POSTURES = 7
 TIME_CONSTANTS, MOST_PERIODS = 7.0, 4000
 """Default duration: so many of the slowest time constants, at most so many periods."""
 _BATCH = 128  # motions in memory at once
-_PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
 
 
 class Peaks(NamedTuple):
@@ -116,7 +115,7 @@ class LoopEnsemble:
         with torch.no_grad():
             moved = motions(self.controller, batch, self.engine)
         many = recorded(moved, batch, type(self.controller).__name__)
-        return replace(many, **{name: getattr(many, name)[:, 0] for name in _PER_ROW}, info={**many.info, **info})
+        return replace(many, **{name: getattr(many, name)[:, 0] for name in ROW_ARRAYS}, info={**many.info, **info})
 
     def _errors(self, batch: Batch, tau_d: torch.Tensor | None = None) -> torch.Tensor:
         """z1 (count, rows, n); raises SimulationDiverged if it is not finite."""

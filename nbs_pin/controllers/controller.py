@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from typing import Any
 
+from nbs_pin.base.arguments import a
 from nbs_pin.base.arrays import Array, Vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
@@ -64,3 +65,7 @@ class MemorylessController(Controller):
     def step(self, memory: None, q: Vectors, v: Vectors, reference: Reference, period: float) -> tuple[Vectors, None]:
         """`torque` at the present state; memory and period are unused."""
         return self.torque(q, v, reference.q, reference.v, reference.a), None
+
+
+CONTROLLER = a(Controller, "a control law, such as NeuralBackstepping.for_robot(robot)")
+"""The check of an argument that is a controller."""

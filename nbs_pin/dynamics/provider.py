@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 
+from nbs_pin.base.arguments import a
 from nbs_pin.base.arrays import Matrices, Scalars, Vectors, array_namespace, matvec
 from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
@@ -72,3 +73,7 @@ class DynamicsProvider(ABC):
         """v̇ = M⁻¹(τ − C v − G) [rad/s²]."""
         net = tau - matvec(self.coriolis_matrix(q, v), v) - self.gravity(q)
         return array_namespace(net).linalg.solve(self.mass_matrix(q), net[..., None])[..., 0]
+
+
+MODEL = a(DynamicsProvider, "a model of the arm, such as PinocchioDynamics(robot)")
+"""The check of an argument that is a model."""

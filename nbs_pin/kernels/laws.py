@@ -206,7 +206,7 @@ def tree_law(
         tau: written [N·m].
 
     Returns:
-        Whether all are as long as tau, a multiple of n; nothing is done otherwise.
+        Whether all are as long as tau, a multiple of n, nothing being done otherwise, and tau is finite.
     """
     law, tree, size = Packed(layout[2:], weights), Packed(layout[layout[0] :], weights[layout[1] :]), len(tau)
     n = law.layout[at.JOINTS]
@@ -215,7 +215,10 @@ def tree_law(
     for k in range(size // n):
         target = Target(row(q_ref, k, n), row(v_ref, k, n), row(a_ref, k, n))
         torque_of(State(row(q, k, n), row(v, k, n)), target, law, tree, work, row(tau, k, n))
-    return True
+    nothing = 0.0
+    for x in tau:
+        nothing += 0.0 * x  # NaN if x is not finite
+    return nothing == 0.0
 
 
 @exact_kernel

@@ -9,11 +9,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from nbs_pin.base.checks import floats
+from nbs_pin.base.checks import LARGEST, SMALLEST, floats
 from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
+from nbs_pin.motions.references import instants
 
 FEWEST_SAMPLES = 4
 """Fewest samples of a not-a-knot cubic spline."""
@@ -69,7 +70,7 @@ class Sampled:
 
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
-        t = np.asarray(t, dtype=float)
+        t = instants(t)
         spline = self._spline
         inside = np.clip(t, self.t[0], self.t[-1])
         moving = (inside == t)[..., None]
@@ -117,9 +118,15 @@ def _fault(t: np.ndarray, q: np.ndarray, columns: list[str]) -> str:
         row, column = np.argwhere(~np.isfinite(table))[0]
         name = ["t", *columns][column]
         return f"row {row + 1}, column {name}: {table[row, column]} is not a finite number; fill the gap"
+    if not np.abs(table).max() <= LARGEST:
+        return f"a number is {np.abs(table).max():.3g}, expected at most {LARGEST:g} in [s] and [rad]; correct it"
     if not (np.diff(t) > 0.0).all():
         row = int(np.argmin(np.diff(t) > 0.0)) + 1
         return f"time must increase, but row {row + 1} ({t[row]:g}) is not after row {row} ({t[row - 1]:g}); sort it"
+    steep = ~(np.abs(np.diff(q, axis=0)) <= LARGEST * np.diff(t)[:, None]) | (np.diff(t)[:, None] < SMALLEST)
+    if steep.any():
+        row, joint = np.argwhere(steep)[0]
+        return f"{columns[joint]} changes too fast between row {row + 1} and the next to be interpolated; correct it"
     return ""
 
 

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ import pinocchio as pin
 from array_api_compat import device
 from jaxtyping import Bool, Float, Int
 
-from nbs_pin.base.arrays import JointArray, Vectors, array_namespace
-from nbs_pin.base.checks import PerJoint, floats
+from nbs_pin.base.arguments import a, checked, maybe, path, text, texts
+from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors
+from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError, RobotError
 from nbs_pin.base.storable import storable
 from nbs_pin.robots.catalogue import find
@@ -139,7 +141,7 @@ class Robot:
 
     def difference(self, q: Vectors, q_ref: Vectors) -> Vectors:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
-        return configuration_difference(q, q_ref, self.continuous)
+        return configuration_difference(*as_vectors(self.nv, q=q, q_ref=q_ref), self.continuous)
 
     def with_effort_limit(self, limit: PerJoint) -> "Robot":
         """The same arm with other effort limits; the XML of its URDF and its `sha256` stay the same.
@@ -151,14 +153,18 @@ class Robot:
             ArgumentError: If a limit is not > 0 or the number of limits is wrong.
         """
         effort = floats("effort limit", limit)
-        if effort.shape not in ((), (self.nv,)) or not (effort > 0.0).all():
+        if effort.shape not in ((), (self.nv,)) or not (effort >= SMALLEST).all():
             raise ArgumentError(
-                f"effort limit is {limit}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means no limit."
+                f"effort limit is {told(limit)}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means no limit."
             )
         by_name = dict(zip(self.joint_names, np.full(self.nv, effort).tolist(), strict=True))
         joints = tuple(replace(joint, effort=by_name[joint.name]) for joint in self.urdf.joints)
         urdf = replace(self.urdf, joints=joints)
         return replace(self, urdf=urdf, model=_with_limits(self.model.copy(), urdf))
+
+
+ARM = a(Robot, "an arm, as load_robot returns it")
+"""The check of an argument that is an arm."""
 
 
 def configuration_difference(q: Vectors, q_ref: Vectors, continuous: Bool[np.ndarray, " n"] | None) -> Vectors:
@@ -174,6 +180,7 @@ def configuration_difference(q: Vectors, q_ref: Vectors, continuous: Bool[np.nda
     return z1 - 2.0 * np.pi * turns * xp.asarray(continuous.astype(float), dtype=z1.dtype, device=device(z1))
 
 
+@checked(name_or_path=path, lock=maybe(texts), zero_limits=maybe(text))
 def load_robot(
     name_or_path: str | Path,
     *,
@@ -221,13 +228,12 @@ def load_robot(
 
 def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
     """The gravity vector in the base frame [m/s²]; raises ArgumentError unless it is one or three finite numbers."""
-    message = f"gravity is {gravity!r}, expected one finite number (downward) or three; give e.g. 9.81."
-    try:
-        vector = np.array(list(gravity) if isinstance(gravity, Iterable) else gravity, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(message) from error
-    if vector.shape not in ((), (3,)) or not np.isfinite(vector).all():
-        raise ArgumentError(message)
+    several = isinstance(gravity, Iterable) and not isinstance(gravity, np.ndarray | str)
+    vector = floats("gravity", list(islice(gravity, 4)) if several else gravity)
+    if vector.shape not in ((), (3,)) or not is_usual(vector):
+        raise ArgumentError(
+            f"gravity is {told(gravity)}, expected one finite number (downward) or three; give e.g. 9.81."
+        )
     return np.array([0.0, 0.0, -float(vector)]) if vector.ndim == 0 else vector
 
 

@@ -1,5 +1,6 @@
 """The closed loop as a differentiable function from parameters and starts to motions."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
@@ -10,7 +11,8 @@ from jaxtyping import Float
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from nbs_pin.base.checks import floats
+from nbs_pin.base.arguments import called
+from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import Controller
@@ -22,7 +24,7 @@ from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.robots.robot import configuration_difference
 from nbs_pin.simulation.costs import StageCost
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
-from nbs_pin.simulation.loop import Loop
+from nbs_pin.simulation.loop import MOST_RECORDED, Loop
 
 Engine: TypeAlias = Literal["kernels", "torch"]
 """Compiled kernels with hand-written adjoints, or the law and the plant in torch."""
@@ -67,6 +69,12 @@ class Batch:
         tau_d is a constant torque, a number or (n,). Raises ArgumentError if starts or torque do not match the loop.
         """
         _, leads, desired, target = loop.schedule(reference)
+        starts = math.prod(np.shape(q0)[:-1]) if q0 is not None else 1
+        if 8 * starts * loop.steps * loop.plant.nv > MOST_RECORDED:
+            raise ArgumentError(
+                f"{starts} motions of {loop.steps} periods have more than {MOST_RECORDED} numbers; give fewer starts"
+                " or a shorter duration."
+            )
         q, v = (np.array(x).reshape(-1, loop.plant.nv) for x in loop.start(reference, q0, v0))
         aim = np.stack([desired.a, target.q, target.v, target.a], axis=1)[:-1]
         aims, wanted = (np.tile(x, (len(q), 1, 1, 1)) for x in (aim, np.stack(desired, axis=1)))
@@ -137,7 +145,13 @@ def running_cost(motion: Motions, batch: Batch, cost: StageCost) -> Float[torch.
     robot = batch.loop.plant.robot
     q_ref, v_ref = (torch.as_tensor(batch.desired[:, 1:, k]).to(motion.q) for k in (0, 1))
     z1 = configuration_difference(motion.q[:, 1:], q_ref, None if robot is None else robot.continuous)
-    return batch.loop.period * cost(z1, motion.v[:, 1:] - v_ref, motion.command).sum(-1)
+    price = called("the cost", cost, z1, motion.v[:, 1:] - v_ref, motion.command)
+    if not isinstance(price, torch.Tensor) or price.shape != z1.shape[:-1]:
+        raise ArgumentError(
+            f"the cost of errors of shape {tuple(z1.shape)} is {told(price)}, expected a tensor of one number per"
+            f" instant, shape {tuple(z1.shape[:-1])}; sum over the joints alone."
+        )
+    return batch.loop.period * price.sum(-1)
 
 
 def recorded(motion: Motions, batch: Batch, controller: str) -> Run:
@@ -170,7 +184,7 @@ def _constant_torque(tau_d: Any, nv: int) -> np.ndarray:
     """The torque as an array; raises ArgumentError unless it is one finite number or one per joint."""
     torque = floats("disturbance", 0.0 if tau_d is None else tau_d)
     if torque.shape not in ((), (nv,)) or not np.isfinite(torque).all():
-        raise ArgumentError(f"disturbance is {tau_d}, expected one finite torque or {nv}, one per joint [N·m].")
+        raise ArgumentError(f"disturbance is {told(tau_d)}, expected one finite torque or {nv}, one per joint [N·m].")
     return torque
 
 
