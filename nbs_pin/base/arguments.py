@@ -1,8 +1,9 @@
 """One way to check the arguments of public functions: a kind for each argument, applied before the function runs.
 
-A kind takes the argument's name for the message and its value, and returns the value to use, converted where that loses
-nothing (`np.float64(0.001)` or a whole number for a time). Whatever does not fit raises ArgumentError with one sentence:
-what was given, what was expected, what to do. Work that grows with a number is limited, and the message names the limit.
+A kind takes the argument's name for the message and its value, and returns the value to use, converted where that
+loses nothing (`np.float64(0.001)` or a whole number for a time). Whatever does not fit raises ArgumentError with one
+sentence: what was given, what was expected, what to do. Work that grows with a number is limited, and the message names
+the limit.
 """
 
 import functools
@@ -220,14 +221,14 @@ def function(takes: int, remedy: str) -> Check:
 
 
 def many(check: Check, least: int = 0, most: int = 1_000_000, of: str = "") -> Check:
-    """A list or tuple of so many entries, each of which the check takes, as a list."""
+    """A list or tuple of so many entries, each of which the check takes, as a tuple."""
 
-    def check_all(name: str, value: Any) -> list[Any]:
+    def check_all(name: str, value: Any) -> tuple[Any, ...]:
         if isinstance(value, np.ndarray) and value.ndim == 1 and type(value) is np.ndarray:
             value = value.tolist()
         if isinstance(value, str | bytes) or not isinstance(value, Sequence) or not least <= len(value) <= most:
             raise ArgumentError(f"{name} is {told(value)}; give a list of {least} to {most} {of or 'entries'}.")
-        return [check(f"{name}[{k}]", entry) for k, entry in enumerate(value)]
+        return tuple(check(f"{name}[{k}]", entry) for k, entry in enumerate(value))
 
     return check_all
 
@@ -246,6 +247,19 @@ def numbers(
                 f"{name} is {told(value)}; give an array of shape ({sizes}) of"
                 f" {_range(above, least, LARGEST, math.inf, unit).replace('a finite number', 'finite numbers')}."
             )
+        return array
+
+    return check
+
+
+def numbers_or_one(least: float = -LARGEST, above: float = -math.inf, unit: str = "") -> Check:
+    """A number or an array of numbers of any shape, as a float array."""
+
+    def check(name: str, value: Any) -> np.ndarray:
+        array = floats(name, value)
+        if not _within(array, least, above, False):
+            what = _range(above, least, LARGEST, math.inf, unit)
+            raise ArgumentError(f"{name} is {told(value)}; give {what}, or an array of such numbers.")
         return array
 
     return check
@@ -301,7 +315,7 @@ def texts(name: str, value: Any) -> list[str]:
     """One text, or an iterable of at most 10,000 texts, as a list."""
     if isinstance(value, str):
         return [value]
-    found = list(islice(value, 10_001)) if isinstance(value, Iterable) else [None]
+    found: list[Any] = list(islice(value, 10_001)) if isinstance(value, Iterable) else [None]
     if len(found) > 10_000 or not all(isinstance(entry, str) for entry in found):
         raise ArgumentError(f"{name} is {told(value)}; give texts, at most 10000.")
     return found
@@ -314,6 +328,7 @@ def paths(name: str, value: Any) -> list[Path]:
     return [Path(path(f"{name}[{k}]", entry)) for k, entry in enumerate(value)]
 
 
+WIDTHS = many(count(1, 4096, "units"), 0, 64, "layers")
 SEED = count(0, 2**63 - 1)
 PERIOD = number(above=0.0, most=1000.0, unit="s")
 DURATION = number(above=0.0, most=1e7, unit="s")

@@ -7,7 +7,7 @@ import numpy as np
 from array_api_compat import array_namespace, is_torch_array
 from jaxtyping import Float
 
-from nbs_pin.base.checks import all_finite, floats, told
+from nbs_pin.base.checks import MOST_NUMBERS, all_finite, floats, told
 from nbs_pin.base.exceptions import ArgumentError
 
 Array: TypeAlias = Any
@@ -21,6 +21,8 @@ Scalars: TypeAlias = Float[Array, "*batch"]
 """One number per state, shape (...)."""
 JointArray: TypeAlias = Float[np.ndarray, " n"]
 """One number per joint, a numpy array of shape (n,)."""
+
+_FLOAT = np.dtype(float)
 
 __all__ = [
     "Array",
@@ -54,12 +56,13 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
     """
     given = tuple(vectors.values())
     shape = getattr(given[0], "shape", None)
-    if (
-        shape
-        and shape[-1] == nv
-        and all(type(x) is np.ndarray and x.shape == shape and x.dtype == float for x in given)
-    ):
-        return given  # fast path of the common case
+    if shape and shape[-1] == nv:
+        for x in given:
+            if type(x) is not np.ndarray or x.dtype is not _FLOAT or x.shape != shape:
+                break
+        else:
+            if x.size <= MOST_NUMBERS:
+                return given  # fast path of the common case
     arrays = [x if is_torch_array(x) else floats(name, x) for name, x in vectors.items()]
     if len({is_torch_array(x) for x in arrays}) > 1:
         kinds = ", ".join(f"{k} {type(x).__name__}" for k, x in vectors.items())

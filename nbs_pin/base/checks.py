@@ -68,7 +68,7 @@ def real(value: Any) -> float | None:
     try:
         return float(value)
     except OverflowError:
-        return math.copysign(math.inf, 1 if value > 0 else -1)
+        return math.inf if abs(value) == value else -math.inf
 
 
 def integral(value: Any) -> int | None:

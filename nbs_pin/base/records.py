@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nbs_pin.base.arguments import checked, readable, writable
+from nbs_pin.base.arguments import a, checked, readable, writable
 from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
@@ -124,6 +124,10 @@ class Run:
             robot_options=_parsed(path, data, "robot_options"),
             info=_parsed(path, data, "info"),
         )
+
+
+RUN = a(Run, "what simulate returned or Run.load read")
+"""The check of an argument that is a run."""
 
 
 def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:

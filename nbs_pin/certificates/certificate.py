@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.accuracy.mismatch import Mismatch
+from nbs_pin.base.arguments import a, checked, number, numbers_or_one
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.records import Reference
@@ -173,12 +174,14 @@ class Certificate:
         """V∞ [J]."""
         return self.level.storage
 
+    @checked(t=numbers_or_one(least=0.0, unit="s"), initial=number(least=0.0, unit="J"))
     def storage_bound(self, t: Float[np.ndarray, "*rows"], initial: float) -> Float[np.ndarray, "*rows"]:
         """Bound of V(t) from V(0) = `initial` [J]: the lesser of e^{−ct}V(0) + V∞ and max(V(0), V∞), t in [s]."""
         if self.bodies is not None:
             return np.full(t.shape, self.storage if initial <= self.bodies.start else np.inf)
         return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
 
+    @checked(initial=number(least=0.0, unit="J"))
     def from_start(self, initial: float) -> tuple[float, JointArray]:
         """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞)."""
         if initial <= (0.0 if self.bodies is None else self.bodies.start):
@@ -208,6 +211,10 @@ class Certificate:
             "conditions": [condition.plain() for condition in self.conditions],
             "assumptions": [{"assumption": text, "checked": checked} for text, checked in self.assumptions],
         }
+
+
+CERTIFICATE = a(Certificate, "a Certificate, as certify returns it")
+"""The check of an argument that is a certificate."""
 
 
 def _bounds(certificate: Certificate) -> tuple[Claim, ...]:

@@ -9,7 +9,7 @@ from nbs_pin.base.known_code import defines
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.kernels.layout import Packed, pack_law
 
 
@@ -26,6 +26,7 @@ class ModelLaw(MemorylessController, nn.Module):
 
     def __init__(self, dynamics: DynamicsProvider, friction: JointFriction | None) -> None:
         super().__init__()
+        MODEL(f"{type(self).__name__}: dynamics", dynamics)
         self.dynamics, self.friction = dynamics, friction_of_size(friction, dynamics.nv)
 
     @property

@@ -5,7 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from torch import nn
 
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, checked, maybe, number
 from nbs_pin.base.arrays import Array, JointArray, Vectors, array_namespace, as_vectors, constant_like, is_torch_array
+from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.records import Reference
@@ -15,7 +17,7 @@ from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, positiv
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.kernels.laws import compile_laws, pid
 from nbs_pin.kernels.layout import Packed, pack_pid
-from nbs_pin.robots.robot import Robot, configuration_difference
+from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 
 
 class PIDMemory(NamedTuple):
@@ -52,6 +54,7 @@ class PID(Controller, nn.Module):
         array([666.7, 666.7])
     """
 
+    @checked(filter_time=number(least=0.0, unit="s"), robot=maybe(ARM))
     def __init__(
         self,
         *,
@@ -64,13 +67,12 @@ class PID(Controller, nn.Module):
         robot: Robot | None = None,
     ) -> None:
         super().__init__()
-        nv = np.size(kp)
+        nv = floats("kp", kp).size
         self.gains = PositiveGains(nv, kp=kp, ki=ki, kd=kd)
         (self.effort_limit,) = positive_gains(nv, effort_limit=effort_limit)
-        if not 0.0 <= filter_time < np.inf:
-            raise ArgumentError(f"filter_time is {filter_time} s; give a finite time ≥ 0.")
         self.filter_time = filter_time
-        self.continuous = np.zeros(nv, dtype=bool) if continuous is None else np.asarray(continuous, dtype=bool)
+        told = np.zeros(nv) if continuous is None else floats("continuous", continuous, truths=True)
+        self.continuous = told.astype(bool)
         if self.continuous.shape != (nv,):
             raise ArgumentError(f"continuous has {self.continuous.size} entries, expected {nv}: one per joint.")
         if robot is not None and robot.nv != nv:
@@ -78,6 +80,7 @@ class PID(Controller, nn.Module):
         self.robot = robot
 
     @classmethod
+    @checked(robot=ARM, bandwidth=BANDWIDTH, period=PERIOD)
     def for_robot(cls, robot: Robot, *, bandwidth: float = 8.0, period: float = 0.001) -> "PID":
         """Gains of `pd_gains`, integral time 4/ω, and a derivative filter of two periods."""
         kp, kd = pd_gains(robot, PinocchioDynamics(robot), bandwidth=bandwidth, period=period)

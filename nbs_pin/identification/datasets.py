@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nbs_pin.base.arguments import SEED, check_fields, checked, mapping, number, readable, text, writable
+from nbs_pin.base.arguments import SEED, a, check_fields, checked, mapping, number, readable, text, writable
 from nbs_pin.base.checks import LARGEST, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
@@ -135,6 +135,10 @@ class Dataset:
             raise ArgumentError(f"about cannot be stored as JSON ({error}); keep numbers, text and lists.") from error
         arrays = {entry.name: np.asarray(getattr(self, entry.name)) for entry in fields(self) if entry.name != "about"}
         write_npz(path, {"format": np.array(DATASET_FORMAT), **arrays, "about": np.array(about)})
+
+
+DATA = a(Dataset, "a Dataset, as collect or load_log returns it")
+"""The check of an argument that is data."""
 
 
 @checked(path=readable)

@@ -8,13 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.arguments import MOST_JOINTS, checked, flag, many, maybe, number, readable
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz
 from nbs_pin.identification.compatibility import arm_fault
 from nbs_pin.identification.datasets import DATASET_FORMAT, Dataset, load_dataset, trajectory_slices
 from nbs_pin.identification.log_files import Columns, columns_of_arrays, columns_of_csv
 from nbs_pin.identification.measurement import ORDER, derivative
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 _SPAN = 0.05  # [s]; interval over which derivatives are integrated for comparison, to average sensor noise
 _DISAGREES = 0.3  # largest RMS error of a logged derivative, as a share of the RMS change
@@ -24,6 +25,13 @@ _OFTEN = 0.05  # share of samples that distinguishes degrees from outliers
 _EVEN = 1e-3  # tolerance of even spacing, as a share of the step
 
 
+@checked(
+    path=readable,
+    robot=maybe(ARM),
+    degrees=maybe(flag),
+    window=number(least=1e-6, most=1000.0, unit="s"),
+    prismatic=maybe(many(flag, 1, MOST_JOINTS, "joints")),
+)
 def load_log(
     path: str | Path,
     *,

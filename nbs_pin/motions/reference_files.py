@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from nbs_pin.base.arguments import MOST_JOINTS, checked, many, readable, text
 from nbs_pin.base.checks import LARGEST, SMALLEST, floats
 from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
@@ -78,6 +79,7 @@ class Sampled:
         return Reference(q, np.where(moving, v, 0.0), np.where(moving, a, 0.0))
 
 
+@checked(path=readable, joint_names=many(text, 1, MOST_JOINTS, "names of joints"))
 def load_reference(path: str | Path, joint_names: Sequence[str]) -> Sampled:
     """Load the motion of the joints `joint_names` from a CSV or NPZ file.
 

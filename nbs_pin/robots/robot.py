@@ -141,7 +141,8 @@ class Robot:
 
     def difference(self, q: Vectors, q_ref: Vectors) -> Vectors:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
-        return configuration_difference(*as_vectors(self.nv, q=q, q_ref=q_ref), self.continuous)
+        q, q_ref = as_vectors(self.nv, q=q, q_ref=q_ref)
+        return configuration_difference(q, q_ref, self.continuous)
 
     def with_effort_limit(self, limit: PerJoint) -> "Robot":
         """The same arm with other effort limits; the XML of its URDF and its `sha256` stay the same.
@@ -155,7 +156,7 @@ class Robot:
         effort = floats("effort limit", limit)
         if effort.shape not in ((), (self.nv,)) or not (effort >= SMALLEST).all():
             raise ArgumentError(
-                f"effort limit is {told(limit)}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means no limit."
+                f"effort limit is {told(limit)}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means none."
             )
         by_name = dict(zip(self.joint_names, np.full(self.nv, effort).tolist(), strict=True))
         joints = tuple(replace(joint, effort=by_name[joint.name]) for joint in self.urdf.joints)
@@ -228,8 +229,9 @@ def load_robot(
 
 def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
     """The gravity vector in the base frame [m/s²]; raises ArgumentError unless it is one or three finite numbers."""
-    several = isinstance(gravity, Iterable) and not isinstance(gravity, np.ndarray | str)
-    vector = floats("gravity", list(islice(gravity, 4)) if several else gravity)
+    if isinstance(gravity, Iterable) and not isinstance(gravity, np.ndarray | str):
+        gravity = list(islice(gravity, 4))
+    vector = floats("gravity", gravity)
     if vector.shape not in ((), (3,)) or not is_usual(vector):
         raise ArgumentError(
             f"gravity is {told(gravity)}, expected one finite number (downward) or three; give e.g. 9.81."

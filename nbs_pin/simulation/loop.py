@@ -60,18 +60,18 @@ class Loop:
         plant_step: float | None,
         effort_limit: Any,
         lookahead: float | None,
-        most: int = MOST_PERIODS,
+        most: float | None = None,
     ) -> "Loop":
         """The loop of a law for nv joints with `simulate`'s arguments; raises ArgumentError if they do not match.
 
-        It has at most `most` periods, each of at most `MOST_STEPS` plant steps.
+        It has at most `most` periods (None: `MOST_PERIODS`), each of at most `MOST_STEPS` plant steps.
         """
         if nv != plant.nv:
             raise ArgumentError(f"the controller has {nv} joints and the plant {plant.nv}; build both for one arm.")
         return cls(
             plant=plant,
             period=period,
-            steps=whole(duration, period, "duration", "period", float(most)),
+            steps=whole(duration, period, "duration", "period", float(MOST_PERIODS if most is None else most)),
             substeps=_substeps(period, plant_step),
             lead=0.5 * period if lookahead is None else lookahead,
             limit=_effort_limit(plant, effort_limit),
@@ -162,6 +162,6 @@ def _effort_limit(plant: Plant, given: Any) -> np.ndarray:
     limit = floats("effort_limit", given)
     if limit.shape not in ((), (plant.nv,)) or not (limit >= SMALLEST).all():
         raise ArgumentError(
-            f"effort_limit is {told(given)}, expected one number > 0 or {plant.nv} of them [N·m]; np.inf means no limit."
+            f"effort_limit is {told(given)}, expected one number > 0 or {plant.nv} of them [N·m]; np.inf means none."
         )
     return np.full(plant.nv, limit)

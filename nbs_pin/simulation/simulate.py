@@ -209,7 +209,7 @@ def _closed(
     effort_limit: Any,
     lookahead: float | None,
     disturbance: Disturbance | None,
-    most: int = MOST_PERIODS,
+    most: float | None = None,
 ) -> _Closed:
     settings = {"plant_step": plant_step, "effort_limit": effort_limit, "lookahead": lookahead}
     loop = Loop.of(plant, controller.nv, duration, period, **settings, most=most)

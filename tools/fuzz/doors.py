@@ -14,14 +14,29 @@ import torch
 
 import nbs_pin as nbs
 
-RESULTS = (
-    "Attack Certificate ModelErrors Monitored Training Proposal Verification Robot ArgumentError CertificateRefused "
-    "FileFormatError MissingExtra NbsPinError RobotError RobotNotFound SimulationDiverged Reference"
-).split()
+RESULTS = [
+    "Attack",
+    "Certificate",
+    "ModelErrors",
+    "Monitored",
+    "Training",
+    "Proposal",
+    "Verification",
+    "Robot",
+    "ArgumentError",
+    "CertificateRefused",
+    "FileFormatError",
+    "MissingExtra",
+    "NbsPinError",
+    "RobotError",
+    "RobotNotFound",
+    "SimulationDiverged",
+    "Reference",
+]
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
-INTERFACES = "Controller MemorylessController DynamicsProvider LyapunovLaw ModelLaw Plant".split()
+INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
 """Abstract classes: their methods are called on what derives from them."""
-INFINITE = "extra_stiffness extra_damping damping_share damping_slope stiffness_range stiffness_rate".split() + [
+INFINITE = ["extra_stiffness", "extra_damping", "damping_share", "damping_slope", "stiffness_range", "stiffness_rate"] + [
     "Admissible", "convergence_time", "slope", "share", "packed", "packed_law", "lyapunov", "structure_claims", "excess",
     "curvature", "curvature_range", "curvature_rate", "half_width", "resolution", "losses",
 ]  # fmt: skip
@@ -129,7 +144,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
     return {
         "AnalyticDynamics": {"masses": (1.0, 1.0), "lengths": (1.0, 1.0), "gravity": 9.8},
         "Admissible": {"box": np.ones(2), "radius": None},
-        "Dataset": {**{name: getattr(s.data, name) for name in "q v a tau t trajectory parents prismatic".split()},
+        "Dataset": {**{name: getattr(s.data, name) for name in ["q", "v", "a", "tau", "t", "trajectory", "parents", "prismatic"]},
                     "robot": "arm", "about": {}},
         "Damping": {"floor": np.eye(2), "gain": 0.2, "scale": np.ones(2), "ceiling": 1.0, "widths": (4,)},
         "Potential": {"stiffness": np.eye(2), "scale": np.ones(2), "widths": (4,)},
