@@ -2,12 +2,13 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check mutants monitor-campaign certificate-campaign bench-history clean
+.PHONY: help setup demo test check mutants fuzz monitor-campaign certificate-campaign bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make test           the test suite"
 	@echo "make check          ruff, mypy and the architecture test"
 	@echo "make mutants        how many of 60 seeded faults the tests find; about half an hour"
+	@echo "make fuzz           10,000 calls with hostile arguments at every public function; about half an hour"
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
 	@echo "make bench-history  append this machine's figures to bench-history.jsonl; leave it alone meanwhile"
@@ -33,6 +34,9 @@ check: $(READY)
 
 mutants: $(READY)
 	$(BIN)/python tools/mutants.py
+
+fuzz: $(READY)
+	$(BIN)/python tools/fuzz_api.py
 
 monitor-campaign: $(READY)
 	$(BIN)/python tools/monitor_campaign.py

@@ -342,7 +342,7 @@ def test_any_callable_is_a_reference_and_what_it_lacks_is_said():
         check_reference(lambda t: (still, np.zeros(2), still), robot, 1.0)
     with pytest.raises(ArgumentError, match="3 joints, the arm has 2"):
         check_reference(lambda t: (still, still, np.zeros((2001, 3))), robot, 1.0)
-    with pytest.raises(ArgumentError, match="the reference's q is up"):
+    with pytest.raises(ArgumentError, match="the reference's q is 'up', with text"):
         check_reference(lambda t: ("up", still, still), robot, 1.0)
 
 

@@ -56,7 +56,7 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
     """
     given = tuple(vectors.values())
     shape = getattr(given[0], "shape", None)
-    if shape and shape[-1] == nv:
+    if type(shape) is tuple and shape and shape[-1] == nv:
         for x in given:
             if type(x) is not np.ndarray or x.dtype is not _FLOAT or x.shape != shape:
                 break
@@ -68,6 +68,8 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
         kinds = ", ".join(f"{k} {type(x).__name__}" for k, x in vectors.items())
         raise ArgumentError(f"numpy and torch were mixed ({kinds}); give numpy arrays only or tensors only.")
     for name, x in zip(vectors, arrays, strict=True):
+        if is_torch_array(x) and (x.is_sparse or x.is_meta):
+            raise ArgumentError(f"{name} is {told(x)} without dense numbers; give {name}.to_dense().")
         if str(x.dtype) not in ("float64", "torch.float64"):
             raise ArgumentError(f"{name} is {told(x)}, expected float64; give {name}.double().")
         if x.ndim == 0 or x.shape[-1] != nv:
@@ -86,7 +88,11 @@ def finite_result(what: str, result: Array, *arguments: Array) -> Array:
 
     Where an argument itself is not finite, neither need the result be. Tensors are not looked at.
     """
-    if type(result) is np.ndarray and not all_finite(result) and all(all_finite(x) for x in arguments):
+    if (
+        isinstance(result, np.ndarray | np.float64)
+        and not all_finite(np.asarray(result))
+        and all(all_finite(x) for x in arguments)
+    ):
         largest = max((float(np.abs(x).max()) for x in arguments if x.size), default=0.0)
         raise ArgumentError(f"{what} is too large to be computed for numbers up to {largest:.3g}; give smaller ones.")
     return result

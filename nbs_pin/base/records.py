@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nbs_pin.base.arguments import a, checked, readable, writable
+from nbs_pin.base.arguments import PERIOD, a, check_fields, checked, mapping, readable, text, writable
 from nbs_pin.base.arrays import Array, JointArray
+from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 
@@ -82,6 +83,27 @@ class Run:
     """`Robot.options` of that arm."""
     info: dict[str, Any] = field(default_factory=dict)
     """Further metadata (controller, plant, seed, versions), stored as JSON."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, period=PERIOD, robot=text, robot_sha256=text, robot_options=mapping, info=mapping)
+        for name in ("t", *ROW_ARRAYS, "effort_limit"):
+            object.__setattr__(self, name, floats(f"Run: {name}", getattr(self, name)))
+        wraps = floats("Run: continuous", self.continuous, truths=True).astype(bool)
+        object.__setattr__(self, "continuous", wraps)
+        names = tuple(self.joint_names) if isinstance(self.joint_names, tuple | list) else ()
+        object.__setattr__(self, "joint_names", names)
+        shape = self.q.shape
+        expected = dict.fromkeys(ROW_ARRAYS, shape) | {"t": shape[:1], "effort_limit": shape[-1:]}
+        found = {name: getattr(self, name).shape for name in expected}
+        found, expected = found | {"continuous": wraps.shape}, expected | {"continuous": shape[-1:]}
+        wrong = [name for name in expected if len(shape) < 2 or 0 in shape or found[name] != expected[name]]
+        if wrong:
+            raise ArgumentError(
+                f"Run: {wrong[0]} has shape {found[wrong[0]]} beside q of shape {shape}, expected"
+                f" {expected[wrong[0]]}, where q is (rows, ..., joints); give arrays that fit."
+            )
+        if len(names) != shape[-1] or not all(isinstance(name, str) for name in names):
+            raise ArgumentError(f"Run: joint_names is {told(self.joint_names)}, expected {shape[-1]} texts; give them.")
 
     @property
     def nv(self) -> int:

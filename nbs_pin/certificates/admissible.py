@@ -48,6 +48,7 @@ class Admissible:
         check_fields(self, claims=many(a(Claim, "a Claim")))
 
     @classmethod
+    @checked(nv=count(1, MOST_JOINTS, "joints"))
     def of(cls, disturbance: "PerJoint | Admissible", nv: int) -> "Admissible":
         """The box of one bound per joint, the ball of a single number [N·m], or the given `Admissible` itself.
 

@@ -11,7 +11,7 @@ from array_api_compat import device
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arguments import MOST_JOINTS, SEED, SHARE, WIDTHS, checked, choice, count, maybe, number
+from nbs_pin.base.arguments import MOST_JOINTS, SEED, SHARE, WIDTHS, checked, choice, count, flag, maybe, number
 from nbs_pin.base.arrays import (
     Array,
     Matrices,
@@ -168,6 +168,7 @@ class Damping(nn.Module):
         """Whether the kernels implement all parts; False for a subclass."""
         return defines(self, "packed") and all(defines(network, "layers") for network in (self.diagonal, self.lower))
 
+    @checked(numpy=flag)
     def packed(self, *, numpy: bool = True) -> Packed:
         """Weights for the kernel of `force` (`kernels/damping.py`), as an array or a differentiable tensor."""
         networks = self.diagonal.layers(numpy=numpy), self.lower.layers(numpy=numpy)

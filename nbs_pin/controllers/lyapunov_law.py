@@ -120,6 +120,7 @@ class LyapunovLaw(ModelLaw):
     def losses(self, q: Array, e: Errors) -> tuple[Scalars, Scalars]:
         """∇ΦᵀΛ∇Φ and z2ᵀ(ωM + D)z2 − (1 − ζ)z2ᵀ∇Φ [W] for the signals e = `errors` of states at q."""
         a(Errors, "the signals that errors returned")("losses: e", e)
+        q, _, _ = as_vectors(self.nv, q=q, z2=e.z2, gradient=e.gradient)
         force = self.inertial_rate * matvec(self.dynamics.mass_matrix(q), e.z2) + self.damping_force(e.z2)
         force = force - (1.0 - self.coupling) * e.gradient
         return _dot(e.gradient, self.rate_like(e.gradient) * e.gradient), _dot(e.z2, force)

@@ -4,6 +4,7 @@ from typing import Any
 
 from torch import nn
 
+from nbs_pin.base.arguments import checked, flag
 from nbs_pin.base.arrays import Array
 from nbs_pin.base.known_code import defines
 from nbs_pin.controllers.compiled import CompiledController
@@ -41,6 +42,7 @@ class ModelLaw(MemorylessController, nn.Module):
         friction = self.friction is None or type(self.friction) is JointFriction
         return wraps and friction and defines(self, "_packed") and self._has_kernel
 
+    @checked(numpy=flag)
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """Constants and weights for the kernels (`Controller.packed_law`)."""
         return self._packed(numpy) if self.packable else super().packed_law(numpy=numpy)

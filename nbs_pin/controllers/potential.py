@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arguments import SEED, SHARE, WIDTHS, a, checked, choice, maybe, number, numbers
+from nbs_pin.base.arguments import SEED, SHARE, WIDTHS, a, checked, choice, flag, maybe, number, numbers
 from nbs_pin.base.arrays import (
     Array,
     JointArray,
@@ -135,6 +135,7 @@ class Potential(nn.Module):
         activation = self.network.activation
         return defines(self, "packed") and defines(self.network, "layers") and defines(activation, "kernel")
 
+    @checked(numpy=flag)
     def packed(self, *, numpy: bool = True) -> Packed:
         """Weights for the kernel of `terms`, as array or tensor; ArgumentError if the activation has no kernel."""
         activation = self.network.activation

@@ -99,10 +99,12 @@ class SlidingMode(SlotineLi):
 
     def damping_force(self, z2: Array) -> Vectors:
         """K z2 + η tanh(z2/ε) [N·m]."""
+        (z2,) = as_vectors(self.nv, z2=z2)
         return super().damping_force(z2) + self._switched(z2)
 
     def damping_matrix(self, z2: Array) -> Matrices:
         """K + diag(η tanh(z2/ε)/z2) [N·m·s/rad]."""
+        (z2,) = as_vectors(self.nv, z2=z2)
         xp, (steepest,) = array_namespace(z2), self.switching.like(z2)
         x = z2 / constant_like(z2, self.boundary)
         small = abs(x) < 1e-6

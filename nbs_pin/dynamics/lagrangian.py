@@ -143,7 +143,13 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         # The same array becomes the same tensor, since `torque` is cheaper when w is v.
         tensors = {id(x): torch.from_numpy(np.array(x)).to(device) for x in vectors}
         with torch.no_grad():
-            result = function(*(tensors[id(x)] for x in vectors)).numpy(force=True)
+            try:
+                result = function(*(tensors[id(x)] for x in vectors)).numpy(force=True)
+            except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+                names = ", ".join(arguments)
+                raise ArgumentError(
+                    f"the model has no M ≻ 0 for these {names} ({error!s:.80}); give others."
+                ) from error
         return finite_result("the result", result, *vectors)
 
 

@@ -116,7 +116,7 @@ class Dataset:
         """The samples selected by the numpy index `rows` (a slice, a mask, or increasing indices)."""
         try:
             index = np.arange(len(self))[rows if isinstance(rows, slice) else np.asarray(rows)]
-        except (IndexError, ValueError, TypeError) as error:
+        except (IndexError, ValueError, TypeError, OverflowError, RuntimeError) as error:
             raise ArgumentError(
                 f"rows is {told(rows)}, expected a slice, a mask or indices; {error!s:.100}."
             ) from error

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.verification.balls import Balls, arb, balls, certain, ctx, inverse, positive_definite, skew
 from nbs_pin.verification.document import is_unchanged, read_document
 from nbs_pin.verification.trees import Link, differences, stated_tree, urdf_tree
@@ -58,6 +59,9 @@ def verify(path: str | Path, *, urdf: str | Path | None = None) -> Verification:
         FileFormatError: If it is no certificate, or the URDF is not that of its arm.
         MissingExtra: If the extra `verify` is not installed.
     """
+    for name, given in (("path", path), ("urdf", urdf)):
+        if (given is not None or name == "path") and not isinstance(given, str | Path):
+            raise ArgumentError(f"verify: {name} is a {type(given).__name__}; give the path of a file.")
     document = read_document(Path(path))
     with ctx.workprec(BITS):
         tree, checks = _arm(document["arm"], urdf)

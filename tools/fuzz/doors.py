@@ -202,7 +202,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "monitor": {"start": 0},
         "paper_controller": {"m": 0.001},
         "plot_tracking": {"path": s.folder / "plot.png"},
-        "propose": {"error": 0.1, "disturbance": [1.0, 1.0], "duration": 1.0, "periods": (0.001,)},
+        "propose": {"error": 0.1, "disturbance": [1.0, 1.0], "duration": 0.5, "periods": (0.01,)},
         "replay": {"path": s.folder / "replay.html"},
         "simulate": {"disturbance": None, "q0": Q, "v0": Z, "workers": 1},
         "stream": {"disturbance": None, "q0": Q, "v0": Z, "block": 5},
