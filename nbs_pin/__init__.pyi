@@ -7,6 +7,7 @@ from .base.exceptions import (
     FileFormatError as FileFormatError,
     MissingExtra as MissingExtra,
     NbsPinError as NbsPinError,
+    NoSuchFile as NoSuchFile,
     RobotError as RobotError,
     RobotNotFound as RobotNotFound,
     SimulationDiverged as SimulationDiverged,

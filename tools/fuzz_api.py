@@ -4,10 +4,10 @@
     python tools/fuzz_api.py --count 500 --seed 3 --show
     python tools/fuzz_api.py --only simulate --show
 
-Each call takes good arguments and makes one or two of them hostile. Its outcome is one of
-typed (an `NbsPinError`), accepted, untyped (any other exception), non-finite (a result with NaN or inf from arguments
-without), memory (more than 1 GB), hang (longer than 5 s of processor time, or 60 s at all) and crash (the process died). Any of the last five is a fault:
-the exit code is 1, and the calls are listed with their numbers, by which `--call` repeats one.
+Each call takes good arguments and makes one or two of them hostile. Its outcome is one of typed (an `NbsPinError`),
+accepted, untyped (any other exception), non-finite (a result with NaN or inf from arguments without), memory (more than
+1 GB), hang (longer than 5 s of processor time, or 60 s at all) and crash (the process died). Any of the last five is a
+fault: the exit code is 1, and the calls are listed with their numbers, by which `--call` repeats one.
 """
 
 import argparse
@@ -231,7 +231,7 @@ class _Worker:
 
 
 def _serve(pipe: Connection, seed: int, only: str) -> None:
-    sys.stdout = sys.stderr = open(os.devnull, "w")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for door in _doors():  # so that nothing is left to import or to compile

@@ -315,8 +315,10 @@ def texts(name: str, value: Any) -> list[str]:
     """One text, or an iterable of at most 10,000 texts, as a list."""
     if isinstance(value, str):
         return [value]
-    is_many = isinstance(value, Iterable) and not (isinstance(value, np.ndarray) and value.ndim == 0)
-    found: list[Any] = list(islice(value, 10_001)) if is_many else [None]
+    try:
+        found: list[Any] = list(islice(value, 10_001)) if isinstance(value, Iterable) else [None]
+    except Exception as error:  # an iterable may raise anything
+        raise ArgumentError(f"{name} is {told(value)}, which cannot be iterated over; give texts.") from error
     if len(found) > 10_000 or not all(isinstance(entry, str) for entry in found):
         raise ArgumentError(f"{name} is {told(value)}; give texts, at most 10000.")
     return found

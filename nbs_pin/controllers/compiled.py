@@ -9,6 +9,7 @@ from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.kernels.laws import compile_laws, compile_tree_law, law_signals, law_workspace, pack_tree_law, tree_law
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.threads import Scratch, over_cores
@@ -63,7 +64,7 @@ class CompiledController(MemorylessController):
             tau = np.empty(self.nv)
             try:
                 fits = self._one(q, v, q_ref, v_ref, a_ref, tau)
-            except TypeError:  # not all contiguous float64 vectors: converted and checked below
+            except NOT_TAKEN:  # not all contiguous float64 vectors: converted and checked below
                 fits = False
             if fits:
                 return tau

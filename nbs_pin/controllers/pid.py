@@ -24,6 +24,7 @@ from nbs_pin.base.storable import storable
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, stored_gains
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.kernels.laws import compile_laws, pid
 from nbs_pin.kernels.layout import Packed, pack_pid
 from nbs_pin.robots.robot import ARM, Robot, configuration_difference
@@ -188,6 +189,8 @@ class CompiledPID(Controller):
     def initial_memory(self, q: Vectors) -> PIDMemory:
         """Zero integral and derivative."""
         (q,) = as_vectors(self.nv, q=q)
+        if is_torch_array(q):
+            raise ArgumentError("a compiled PID was given torch tensors, expected numpy arrays; call `PID`'s method.")
         return PIDMemory(np.zeros_like(q), np.zeros_like(q))
 
     def step(
@@ -200,7 +203,7 @@ class CompiledPID(Controller):
             out = np.empty((3, self.nv))
             try:
                 fits = pid(*memory, q, v, reference.q, reference.v, period, self.weights, out)
-            except (TypeError, AttributeError):  # not all contiguous float64 vectors: converted and checked below
+            except (AttributeError, *NOT_TAKEN):  # not all contiguous float64 vectors: converted and checked below
                 fits = False
             if fits:
                 return out[0], PIDMemory(out[1], out[2])

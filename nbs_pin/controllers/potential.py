@@ -127,7 +127,7 @@ class Potential(nn.Module):
         value, gradient, product = self._psi(r * z, r * dz)
         force, force_rate = 2.0 * matvec(s, z), 2.0 * matvec(s, dz)
         energy = finite_result("Φ", value + 0.5 * xp.sum(z * force, axis=-1), z, dz)
-        return energy, r * gradient + force, r * product + force_rate
+        return energy, r * gradient + force, finite_result("∇²Φ dz", r * product + force_rate, z, dz)
 
     @property
     def is_packable(self) -> bool:

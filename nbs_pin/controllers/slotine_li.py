@@ -100,12 +100,12 @@ class SlotineLi(LyapunovLaw):
         rate, gain = self.gains.like(z1)
         gradient = 2.0 * rate * gain * z1
         value = finite_result("Φ", 0.5 * array_namespace(z1).sum(gradient * z1, axis=-1), z1)
-        return value, gradient, 2.0 * rate * gain * dz
+        return value, gradient, finite_result("∇²Φ dz", 2.0 * rate * gain * dz, dz)
 
     def damping_force(self, z2: Array) -> Vectors:
         """K z2 [N·m]."""
         (z2,) = as_vectors(self.nv, z2=z2)
-        return self.gains.like(z2)[1] * z2
+        return finite_result("K z2", self.gains.like(z2)[1] * z2, z2)
 
     def damping_matrix(self, z2: Array) -> Matrices:
         """K [N·m·s/rad]."""

@@ -95,15 +95,18 @@ class Loop:
         desired, target = (at_times(reference, t, self.plant.nv) for t in (times, seen))
         return Schedule(times, seen - times, desired, target)
 
+    def check_size(self, starts: int) -> None:
+        """Raise ArgumentError if the run from so many starts has more than `MOST_RECORDED` numbers."""
+        if len(ROW_ARRAYS) * (self.steps + 1) * starts * self.plant.nv > MOST_RECORDED:
+            raise ArgumentError(
+                f"{starts} motions of {self.steps} periods have more than {MOST_RECORDED} numbers; give a shorter"
+                " duration or fewer starts, or record one motion in blocks (stream)."
+            )
+
     def blank_run(self, times: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray, controller: str) -> Run:
         """A run with the times, references (rows, n) or (rows, *batch, n) and start (*batch, n), else zeros."""
         rows, n = len(times), self.plant.nv
         shape, robot = (rows, *q0.shape), self.plant.robot
-        if len(ROW_ARRAYS) * math.prod(shape) > MOST_RECORDED:
-            raise ArgumentError(
-                f"a run of {rows} instants and {math.prod(q0.shape[:-1])} starts has more than {MOST_RECORDED} numbers;"
-                " make it shorter, give fewer starts, or record it in blocks (stream)."
-            )
         aligned = (x if x.ndim == len(shape) else x.reshape(rows, *(1,) * (q0.ndim - 1), n) for x in desired)
         q_ref, v_ref, a_ref = (np.array(np.broadcast_to(x, shape)) for x in aligned)
         run = Run(

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from nbs_pin.base.arguments import DURATION, checked, choice, either, maybe
-from nbs_pin.base.arrays import Matrices, Vectors, as_vectors
+from nbs_pin.base.arrays import Matrices, Vectors, as_vectors, finite_result
 from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.dynamics.friction import FRICTION, JointFriction, friction_of_size
@@ -127,14 +127,17 @@ class MujocoPlant(Plant):
 
     def acceleration(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ [rad/s²] for the torque τ [N·m], by MuJoCo's forward dynamics."""
+        q, v, tau = self._vectors(q=q, v=v, tau=tau)
         with self._lock:
-            return _stack(lambda *row: self._forward(*row).qacc[self._at_v].copy(), *self._vectors(q=q, v=v, tau=tau))
+            a = _stack(lambda *row: self._forward(*row).qacc[self._at_v].copy(), q, v, tau)
+        return finite_result("v̇", a, q, v, tau)
 
     def bias(self, q: Vectors, v: Vectors) -> Vectors:
         """C(q, v) v + G(q) [N·m], without joint friction."""
         q, v = self._vectors(q=q, v=v)
         with self._lock:
-            return _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v].copy(), q, v, np.zeros_like(v))
+            torque = _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v].copy(), q, v, np.zeros_like(v))
+        return finite_result("the bias", torque, q, v)
 
     def mass_matrix(self, q: Vectors) -> Matrices:
         """M(q) [kg·m²]."""
@@ -145,6 +148,8 @@ class MujocoPlant(Plant):
     def _vectors(self, **vectors: Vectors) -> tuple[np.ndarray, ...]:
         """The vectors as float arrays of one shape (..., nv)."""
         arrays = as_vectors(self._nv, **vectors)
+        if arrays[0].shape[0] == 0:
+            raise ArgumentError(f"{self!r} was given no states, arrays of shape {arrays[0].shape}; give at least one.")
         if type(arrays[0]) is not np.ndarray:
             raise ArgumentError(f"{self!r} was given torch tensors, expected numpy arrays; give x.numpy().")
         return arrays

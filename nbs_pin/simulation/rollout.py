@@ -1,6 +1,5 @@
 """The closed loop as a differentiable function from parameters and starts to motions."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
@@ -24,7 +23,7 @@ from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.robots.robot import configuration_difference
 from nbs_pin.simulation.costs import StageCost
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
-from nbs_pin.simulation.loop import MOST_RECORDED, Loop
+from nbs_pin.simulation.loop import Loop
 
 Engine: TypeAlias = Literal["kernels", "torch"]
 """Compiled kernels with hand-written adjoints, or the law and the plant in torch."""
@@ -68,14 +67,9 @@ class Batch:
 
         tau_d is a constant torque, a number or (n,). Raises ArgumentError if starts or torque do not match the loop.
         """
-        _, leads, desired, target = loop.schedule(reference)
-        starts = math.prod(np.shape(q0)[:-1]) if q0 is not None else 1
-        if 8 * starts * loop.steps * loop.plant.nv > MOST_RECORDED:
-            raise ArgumentError(
-                f"{starts} motions of {loop.steps} periods have more than {MOST_RECORDED} numbers; give fewer starts"
-                " or a shorter duration."
-            )
         q, v = (np.array(x).reshape(-1, loop.plant.nv) for x in loop.start(reference, q0, v0))
+        loop.check_size(len(q))
+        _, leads, desired, target = loop.schedule(reference)
         aim = np.stack([desired.a, target.q, target.v, target.a], axis=1)[:-1]
         aims, wanted = (np.tile(x, (len(q), 1, 1, 1)) for x in (aim, np.stack(desired, axis=1)))
         torque = np.zeros((len(q), loop.steps, loop.plant.nv)) + _constant_torque(tau_d, loop.plant.nv)

@@ -96,6 +96,7 @@ def simulate(
     """
     loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
     start = loop.start(reference, q0, v0)
+    loop.check_size(math.prod(start[0].shape[:-1]))
     if workers > 1:
         return _shared(loop, reference, start, workers)
     return _block(loop, reference, 0, loop.steps, start, None, progress)[0]

@@ -14,32 +14,19 @@ import torch
 
 import nbs_pin as nbs
 
-RESULTS = [
-    "Attack",
-    "Certificate",
-    "ModelErrors",
-    "Monitored",
-    "Training",
-    "Proposal",
-    "Verification",
-    "Robot",
-    "ArgumentError",
-    "CertificateRefused",
-    "FileFormatError",
-    "MissingExtra",
-    "NbsPinError",
-    "RobotError",
-    "RobotNotFound",
-    "SimulationDiverged",
-    "Reference",
-]
+RESULTS = (
+    "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
+    "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra", "NbsPinError", "NoSuchFile", "RobotError",
+    "RobotNotFound", "SimulationDiverged",
+)  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
 """Abstract classes: their methods are called on what derives from them."""
-INFINITE = ["extra_stiffness", "extra_damping", "damping_share", "damping_slope", "stiffness_range", "stiffness_rate"] + [
-    "Admissible", "convergence_time", "slope", "share", "packed", "packed_law", "lyapunov", "structure_claims", "excess",
-    "curvature", "curvature_range", "curvature_rate", "half_width", "resolution", "losses",
-]  # fmt: skip
+INFINITE = (
+    "extra_stiffness", "extra_damping", "damping_share", "damping_slope", "stiffness_range", "stiffness_rate",
+    "Admissible", "convergence_time", "slope", "share", "packed", "packed_law", "lyapunov", "structure_claims",
+    "excess", "curvature", "curvature_range", "curvature_rate", "half_width", "resolution", "losses",
+)  # fmt: skip
 """Doors whose documented result may be infinite, or does not consist of numbers of the motion."""
 
 
@@ -62,46 +49,46 @@ class Stock:
         self.folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
 
     def __getattr__(self, name: str) -> Any:
-        made = getattr(Stock, f"make_{name}")(self)
+        made = getattr(Stock, f"_{name}")(self)
         setattr(self, name, made)
         return made
 
-    def make_robot(self) -> Any:
+    def _robot(self) -> Any:
         return nbs.load_robot("two_link")
 
-    def make_model(self) -> Any:
+    def _model(self) -> Any:
         return nbs.PinocchioDynamics(self.robot)
 
-    def make_law(self) -> Any:
+    def _law(self) -> Any:
         return nbs.NeuralBackstepping.for_robot(self.robot)
 
-    def make_friction(self) -> Any:
+    def _friction(self) -> Any:
         return nbs.JointFriction([0.1, 0.1], [0.2, 0.1])
 
-    def make_plant(self) -> Any:
+    def _plant(self) -> Any:
         return nbs.DynamicsPlant(self.model)
 
-    def make_motion(self) -> Any:
+    def _motion(self) -> Any:
         return nbs.Sinusoid.for_robot(self.robot)
 
-    def make_run(self) -> Any:
+    def _run(self) -> Any:
         return nbs.simulate(self.plant, self.law, self.motion, 0.02, 0.001)
 
-    def make_certificate(self) -> Any:
+    def _certificate(self) -> Any:
         return nbs.certify(self.law, [5.0, 5.0])
 
-    def make_data(self) -> Any:
+    def _data(self) -> Any:
         return nbs.collect(self.robot, "uniform", 60)
 
-    def make_learned(self) -> Any:
+    def _learned(self) -> Any:
         return nbs.fit(self.data, "chain", robot=self.robot, starts=1)
 
-    def make_residual(self) -> Any:
+    def _residual(self) -> Any:
         from nbs_pin.dynamics.residual import ResidualNetwork
 
         return nbs.ResidualDynamics(ResidualNetwork(self.model, widths=(4,)))
 
-    def make_identified(self) -> Any:
+    def _identified(self) -> Any:
         return nbs.identify(self.data, self.robot)
 
     def path(self, name: str, write: Callable[[Path], Any]) -> Path:
@@ -130,7 +117,8 @@ def _common(s: Stock) -> dict[str, Any]:
         "q": Q, "v": V, "a": V, "tau": V, "v_r": V, "a_r": V, "q_ref": Z, "v_ref": Z, "a_ref": Z, "t": 0.5, "z": Q,
         "z1": Q, "z2": V, "dz": V, "dz1": V, "x": Q, "tau_d": V, "direction": V, "radius": 0.5, "radii": np.ones(2),
         "weights": np.ones(2), "nv": 2, "n": 2, "gain": 3.0, "rate": 2.0, "kp": 9.0, "ki": 1.0, "kd": 3.0, "limit": 5.0,
-        "metric": np.eye(2), "initial": 0.5, "share": 0.3, "rows": slice(0, 10), "start": 0, "samples": 50, "progress": False,
+        "metric": np.eye(2), "initial": 0.5, "share": 0.3, "rows": slice(0, 10), "start": 0, "samples": 50,
+        "progress": False,
     }  # fmt: skip
 
 
@@ -144,8 +132,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
     return {
         "AnalyticDynamics": {"masses": (1.0, 1.0), "lengths": (1.0, 1.0), "gravity": 9.8},
         "Admissible": {"box": np.ones(2), "radius": None},
-        "Dataset": {**{name: getattr(s.data, name) for name in ["q", "v", "a", "tau", "t", "trajectory", "parents", "prismatic"]},
-                    "robot": "arm", "about": {}},
+        "Dataset": {**{name: getattr(s.data, name) for name in _COLUMNS}, "robot": "arm", "about": {}},
         "Damping": {"floor": np.eye(2), "gain": 0.2, "scale": np.ones(2), "ceiling": 1.0, "widths": (4,)},
         "Potential": {"stiffness": np.eye(2), "scale": np.ones(2), "widths": (4,)},
         "NeuralBackstepping": {"potential": s.law.potential, "damping": s.law.damping, "rate": np.ones(2)},
@@ -299,6 +286,7 @@ def _door(name: str, function: Callable[..., Any], common: dict[str, Any], own: 
     return Door(name, function, good, tuple(taken))
 
 
+_COLUMNS = ("q", "v", "a", "tau", "t", "trajectory", "parents", "prismatic")
 _LAWS = ("ComputedTorque", "NeuralBackstepping", "PD", "SlidingMode", "SlotineLi", "CompiledController")
 _FULL = (
     "simulate",
