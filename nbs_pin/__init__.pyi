@@ -11,6 +11,7 @@ from .base.exceptions import (
     RobotError as RobotError,
     RobotNotFound as RobotNotFound,
     SimulationDiverged as SimulationDiverged,
+    TooLarge as TooLarge,
 )
 from .base.records import Reference as Reference, Run as Run
 from .certificates.admissible import Admissible as Admissible

@@ -147,10 +147,8 @@ def path(name: str, value: Any) -> Any:
     """The path of a file: a text or a `Path`, without a null character."""
     if not isinstance(value, str | os.PathLike) or not isinstance(os.fspath(value), str):
         raise ArgumentError(f"{name} is {told(value)}; give the path of a file.")
-    if not os.fspath(value) or "\0" in os.fspath(value):
-        raise ArgumentError(
-            f"{name} is {os.fspath(value)!r:.80}; give the path of a file, not empty, no null character."
-        )
+    if "\0" in os.fspath(value):
+        raise ArgumentError(f"{name} is {os.fspath(value)!r:.80}; give the path of a file, without a null character.")
     return value
 
 

@@ -8,7 +8,7 @@ from array_api_compat import array_namespace, is_torch_array
 from jaxtyping import Float
 
 from nbs_pin.base.checks import MOST_NUMBERS, all_finite, floats, told
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.exceptions import ArgumentError, TooLarge
 
 Array: TypeAlias = Any
 """A `numpy.ndarray` or a `torch.Tensor`; shapes are annotated with jaxtyping around it."""
@@ -23,6 +23,8 @@ JointArray: TypeAlias = Float[np.ndarray, " n"]
 """One number per joint, a numpy array of shape (n,)."""
 
 _FLOAT = np.dtype(float)
+_LARGE = 1e50
+"""Smaller numbers overflow no product of a few of them."""
 
 __all__ = [
     "Array",
@@ -84,9 +86,10 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
 
 
 def finite_result(what: str, result: Array, *arguments: Array) -> Array:
-    """The result; raises ArgumentError if finite numpy arguments gave one that is not, since they are too large.
+    """The result; raises TooLarge if finite numpy arguments gave one that is not, since they are too large.
 
-    Where an argument itself is not finite, neither need the result be. Tensors are not looked at.
+    Where an argument itself is not finite, neither need the result be, nor where a model is not finite for numbers of
+    usual size. Tensors are not looked at.
     """
     if (
         isinstance(result, np.ndarray | np.float64)
@@ -94,7 +97,9 @@ def finite_result(what: str, result: Array, *arguments: Array) -> Array:
         and all(all_finite(x) for x in arguments)
     ):
         largest = max((float(np.abs(x).max()) for x in arguments if x.size), default=0.0)
-        raise ArgumentError(f"{what} is too large to be computed for numbers up to {largest:.3g}; give smaller ones.")
+        if largest < _LARGE:
+            return result  # not for its arguments
+        raise TooLarge(f"{what} is too large to be computed for numbers up to {largest:.3g}; give smaller ones.")
     return result
 
 

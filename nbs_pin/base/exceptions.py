@@ -20,6 +20,10 @@ class ArgumentError(NbsPinError, ValueError):
     """An argument that is not finite or has the wrong shape, type or range."""
 
 
+class TooLarge(ArgumentError, OverflowError):
+    """Finite arguments whose result is too large to be a number."""
+
+
 class NoSuchFile(ArgumentError, FileNotFoundError):
     """The path of a file to read that does not exist."""
 

@@ -7,7 +7,7 @@ import numpy as np
 from nbs_pin.base.arguments import DURATION, checked, choice, maybe
 from nbs_pin.base.arrays import Array, Vectors, as_vectors, is_torch_array
 from nbs_pin.base.checks import all_finite
-from nbs_pin.base.exceptions import SimulationDiverged
+from nbs_pin.base.exceptions import SimulationDiverged, TooLarge
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
@@ -84,13 +84,17 @@ class DynamicsPlant(Plant):
             net = tau if friction is None else tau - friction.torque(v)
             return dynamics.forward_dynamics(q, v, net)
 
-        with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below
-            q, v = self._step(acceleration, q, v, duration)
+        far = (
+            f"{self!r} diverged to a state that is not finite in a step of {duration:g} s; "
+            "take a shorter plant step, or check the controller."
+        )
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below
+                q, v = self._step(acceleration, q, v, duration)
+        except TooLarge as error:
+            raise SimulationDiverged(far) from error
         if not (_finite(q) and _finite(v)):
-            raise SimulationDiverged(
-                f"{self!r} diverged to a state that is not finite in a step of {duration:g} s; "
-                "take a shorter plant step, or check the controller."
-            )
+            raise SimulationDiverged(far)
         return q, v
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from nbs_pin.base.arguments import DURATION, MOST_PERIODS, PERIOD, called, checked, count, flag, function, maybe, number
 from nbs_pin.base.checks import all_finite, floats
-from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged, TooLarge
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import CONTROLLER, Controller
@@ -250,7 +250,10 @@ def _control(loop: _Closed, run: Run, k: int, lead: float, target: Reference, me
     """The torque of row k, evaluated `lead` [s] ahead and recorded in the run, and the memory after it."""
     q, v, tau, dv = run.q[k], run.v[k], run.tau[k], lead * run.a_ref[k]
     aim = Reference(target.q[k], target.v[k], target.a[k])
-    command, memory = loop.law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, loop.period)
+    try:
+        command, memory = loop.law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, loop.period)
+    except TooLarge as error:
+        raise SimulationDiverged(f"the loop has diverged at t = {float(run.t[k]):g} s: {loop.name}: {error}") from error
     # Checked before clipping, which can turn NaN into full effort.
     run.tau_command[k] = command = _checked(command, q.shape, loop.name, float(run.t[k]))
     np.maximum(np.minimum(command, loop.limit, out=tau), -loop.limit, out=tau)

@@ -17,7 +17,7 @@ import nbs_pin as nbs
 RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra", "NbsPinError", "NoSuchFile", "RobotError",
-    "RobotNotFound", "SimulationDiverged",
+    "RobotNotFound", "SimulationDiverged", "TooLarge",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
