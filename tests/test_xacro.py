@@ -64,7 +64,9 @@ def test_a_xacro_file_that_a_file_names_is_expanded_only_if_the_user_gives_it(tm
     run = moving_run(robot)
     link = tmp_path / "arm.urdf"
     link.symlink_to(arm)
-    for source in (str(arm), "arm.xacro", str(tmp_path / "." / "arm.XACRO"), str(link)):
+    other = write(tmp_path, arm.read_text(), "other.urdf")  # what is in it counts, not the ending of its name
+    monkeypatch.chdir(tmp_path)
+    for source in (str(arm), "arm.xacro", str(link), str(other)):
         named = replace(run, robot=source)
         with pytest.raises(RobotError, match=r"a xacro file, .* give it yourself if you trust it, as robot=load_robot"):
             replay(named, tmp_path / "page.html")

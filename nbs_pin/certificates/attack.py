@@ -21,7 +21,7 @@ from nbs_pin.base.units import several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.ensemble import LoopEnsemble, Peaks, law_of
 from nbs_pin.certificates.torque_waves import FASTEST, SLOWEST, constant, in_step, random_disturbances, square
-from nbs_pin.controllers.controller import CONTROLLER, Controller
+from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.motions.references import DesiredMotion
 
@@ -51,7 +51,6 @@ class Attack:
 
 
 @checked(
-    controller=CONTROLLER,
     plant_dynamics=maybe(MODEL),
     duration=maybe(DURATION),
     period=PERIOD,
