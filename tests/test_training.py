@@ -336,7 +336,7 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence():
     for given, message in (
         ({"optimiser": "sgd"}, "optimiser 'sgd' is unknown"),
         ({"epochs": 0}, "epochs is 0"),
-        ({"starts": 0}, "at least one"),
+        ({"starts": 0}, "the number of starts is 0; give a whole number from 1"),
         ({"patience": 0}, "patience is 0"),
         ({"start_error": -1.0}, "start_error"),
         ({"disturbance": np.nan}, "disturbance"),

@@ -31,6 +31,10 @@ class FreeMotion(NamedTuple):
         return float(self.drift.max()) if np.isfinite(self.drift).all() else np.inf
 
 
+_FAR = 1e50
+"""Numbers beyond this count as not finite."""
+
+
 def free_motion(
     model: DynamicsProvider,
     truth: DynamicsProvider,
@@ -54,13 +58,16 @@ def free_motion(
 def _motion(
     dynamics: DynamicsProvider, q: np.ndarray, v: np.ndarray, steps: int, step: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(q, v) over time, (steps + 1, starts, n) each."""
+    """(q, v) over time, (steps + 1, starts, n) each, NaN once numbers exceed `_FAR`."""
     nothing = np.zeros_like(q)
+
+    def near(q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        gone = ~((np.abs(q) <= _FAR) & (np.abs(v) <= _FAR)).all(axis=-1, keepdims=True)
+        return np.where(gone, np.nan, q), np.where(gone, np.nan, v)
+
     states = [(q, v)]
     for _ in range(steps):
-        q, v = rk4(lambda q, v: dynamics.forward_dynamics(q, v, nothing), q, v, step)
-        gone = ~(np.isfinite(q).all(axis=-1) & np.isfinite(v).all(axis=-1))
-        q[gone] = v[gone] = np.nan
+        q, v = near(*rk4(lambda q, v: dynamics.forward_dynamics(*near(q, v), nothing), q, v, step))
         states.append((q, v))
     positions, velocities = zip(*states, strict=True)
     return np.array(positions), np.array(velocities)
