@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arguments import MOST_JOINTS, a, check_fields, checked, count, many, numbers
+from nbs_pin.base.arguments import MOST_JOINTS, a, check_fields, checked, count, many, numbers, text
 from nbs_pin.base.arrays import JointArray, Vectors
 from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.claims import Claim, Label, weakest
@@ -122,8 +122,11 @@ class Admissible:
             raise ArgumentError(f"{name} has shape {x.shape}, expected (..., {n}); give one number per joint.")
         return x
 
+    @checked(units=many(text, 1, MOST_JOINTS, "units"))
     def told(self, units: Sequence[str]) -> str:
         """The bound in words, with the unit of every joint's torque."""
+        if self.box is not None and len(units) != len(self.box):
+            raise ArgumentError(f"{len(units)} units were given for {len(self.box)} joints; give one per joint.")
         if self.box is None:
             return f"‖τ_d‖ ≤ {self.radius:g} {several(units)}"
         if len({*zip(self.box.tolist(), units, strict=True)}) == 1:

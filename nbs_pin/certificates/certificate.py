@@ -200,10 +200,12 @@ class Certificate:
             return np.full(t.shape, held)
         return np.minimum(initial * np.exp(-self.level.c * t) + self.storage, max(initial, self.storage))
 
+    @checked(initial=number(least=0.0, unit="J"))
     def held_storage(self, initial: float) -> float:
         """Bound of V at the control instants with held torques, from V(0) = `initial` [J]; inf if none is proved."""
         return math.inf if self.held is None else self.held.storage(initial, self.constants.nu)
 
+    @checked(initial=number(least=0.0, unit="J"))
     def is_continuous_from(self, initial: float) -> bool:
         """Whether bounds with held torques are proved from other starts, but not from V(0) = `initial` [J]."""
         return self.held is not None and self.held.is_proved and not math.isfinite(self.held_storage(initial))

@@ -53,6 +53,8 @@ def verify(path: str | Path, *, urdf: str | Path | None = None, robot: Arm | Non
     for name, given in (("path", path), ("urdf", urdf)):
         if (given is not None or name == "path") and not isinstance(given, str | Path):
             raise ArgumentError(f"verify: {name} is a {type(given).__name__}; give the path of a file.")
+    if robot is not None and not all(hasattr(robot, name) for name in ("name", "sha256", "joint_names")):
+        raise ArgumentError(f"verify: robot is a {type(robot).__name__}; give an arm, as load_robot returns it.")
     document = read_document(Path(path))
     if robot is not None:
         check_arm(Path(path), document["arm"], robot)

@@ -26,6 +26,7 @@ INFINITE = (
     "extra_stiffness", "extra_damping", "damping_share", "damping_slope", "stiffness_range", "stiffness_rate",
     "Admissible", "convergence_time", "slope", "share", "packed", "packed_law", "lyapunov", "structure_claims",
     "excess", "curvature", "curvature_range", "curvature_rate", "half_width", "resolution", "losses",
+    "held_storage",
 )  # fmt: skip
 """Doors whose documented result may be infinite, or does not consist of numbers of the motion."""
 
@@ -131,6 +132,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
     tensor = torch.zeros(4, 2, dtype=torch.float64)
     return {
         "AnalyticDynamics": {"masses": (1.0, 1.0), "lengths": (1.0, 1.0), "gravity": 9.8},
+        "Admissible.told": {"units": ["N·m", "N·m"]},
         "Admissible": {"box": np.ones(2), "radius": None},
         "Dataset": {**{name: getattr(s.data, name) for name in _COLUMNS}, "robot": "arm", "about": {}},
         "Damping": {"floor": np.eye(2), "gain": 0.2, "scale": np.ones(2), "ceiling": 1.0, "widths": (4,)},
