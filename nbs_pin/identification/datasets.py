@@ -115,6 +115,10 @@ class Dataset:
 
     def take(self, rows: Any) -> "Dataset":
         """The samples selected by the numpy index `rows` (a slice, a mask, or increasing indices)."""
+        if isinstance(rows, range) and len(rows) > len(self):
+            raise ArgumentError(
+                f"rows is a range of {len(rows)}, expected at most the {len(self)} samples; correct it."
+            )
         try:
             index = np.arange(len(self))[rows if isinstance(rows, slice) else np.asarray(rows)]
         except (IndexError, ValueError, TypeError, OverflowError, RuntimeError) as error:

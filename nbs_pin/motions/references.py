@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from nbs_pin.base.arguments import DURATION, MOST_JOINTS, called, checked, count, function, number
+from nbs_pin.base.arguments import DURATION, MOST_JOINTS, called, checked, choice, count, function, number
 from nbs_pin.base.checks import LARGEST, SMALLEST, PerJoint, floats, is_usual, per_joint, told
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
@@ -231,8 +231,7 @@ def check_reference(
     Raises:
         ArgumentError: If a limit is exceeded; names the joint, the time, the value, the limit and the remedy.
     """
-    if joint_friction not in ("drop", "keep"):
-        raise ArgumentError(f"joint_friction is {told(joint_friction)}; give 'drop' or 'keep'.")
+    choice("drop", "keep")("check_reference: joint_friction", joint_friction)
     t = np.linspace(0.0, duration, samples)
     desired = at_times(reference, t, robot.nv)
     degrees = " (are these degrees?)" if np.median(np.max(np.abs(desired.q), axis=-1)) > 2.0 * np.pi else ""

@@ -14,7 +14,7 @@ import pinocchio as pin
 from array_api_compat import device
 from jaxtyping import Bool, Float, Int
 
-from nbs_pin.base.arguments import a, checked, path
+from nbs_pin.base.arguments import a, checked, mapping, maybe, path
 from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors
 from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
 from nbs_pin.base.doors import option
@@ -182,7 +182,7 @@ def configuration_difference(q: Vectors, q_ref: Vectors, continuous: Bool[np.nda
     return z1 - 2.0 * np.pi * turns * xp.asarray(continuous.astype(float), dtype=z1.dtype, device=device(z1))
 
 
-@checked(name_or_path=path)
+@checked(name_or_path=path, xacro_args=maybe(mapping))
 def load_robot(
     name_or_path: str | Path,
     *,
