@@ -2,14 +2,16 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check mutants fuzz-files fuzz-descriptions monitor-campaign certificate-campaign bench-history clean
+.PHONY: help setup demo test check mutants fuzz fuzz-calls fuzz-files fuzz-descriptions monitor-campaign certificate-campaign bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make test           the test suite"
 	@echo "make check          ruff, mypy and the architecture test"
 	@echo "make mutants        how many of 60 seeded faults the tests find; about half an hour"
+	@echo "make fuzz           the next three: every door of the package, broken at random; about half an hour"
+	@echo "make fuzz-calls     10,000 calls with hostile arguments at every public function"
 	@echo "make fuzz-files     10,000 damaged files at every reader; about five minutes"
-	@echo "make fuzz-descriptions  20,000 broken URDF and xacro files; about 10 minutes"
+	@echo "make fuzz-descriptions  20,000 broken URDF and xacro files; about ten minutes"
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
 	@echo "make bench-history  append this machine's figures to bench-history.jsonl; leave it alone meanwhile"
@@ -35,6 +37,11 @@ check: $(READY)
 
 mutants: $(READY)
 	$(BIN)/python tools/mutants.py
+
+fuzz: fuzz-calls fuzz-files fuzz-descriptions
+
+fuzz-calls: $(READY)
+	$(BIN)/python tools/fuzz_api.py
 
 fuzz-files: $(READY)
 	$(BIN)/python tools/fuzz_files.py

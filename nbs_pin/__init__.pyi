@@ -7,9 +7,11 @@ from .base.exceptions import (
     FileFormatError as FileFormatError,
     MissingExtra as MissingExtra,
     NbsPinError as NbsPinError,
+    NoSuchFile as NoSuchFile,
     RobotError as RobotError,
     RobotNotFound as RobotNotFound,
     SimulationDiverged as SimulationDiverged,
+    TooLarge as TooLarge,
 )
 from .base.records import Reference as Reference, Run as Run
 from .certificates.admissible import Admissible as Admissible

@@ -322,19 +322,22 @@ UR5 = PinocchioDynamics(load_robot("ur5"))
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda r, d: NeuralBackstepping.for_robot(r, bandwidth=-1.0), "must be positive and finite"),
+        (lambda r, d: NeuralBackstepping.for_robot(r, bandwidth=-1.0), "bandwidth is -1.0; give a finite number > 0"),
         (lambda r, d: NeuralBackstepping.for_robot(r, bandwidth=900.0), "at most 500 rad/s"),
-        (lambda r, d: NeuralBackstepping.for_robot(r, damping="none"), "choose one of inertial, bounded, paper"),
-        (lambda r, d: NeuralBackstepping.for_robot(r, potential="none"), "choose one of paper, smooth"),
+        (lambda r, d: NeuralBackstepping.for_robot(r, damping="none"), "give one of inertial, bounded, paper"),
+        (lambda r, d: NeuralBackstepping.for_robot(r, potential="none"), "give one of paper, smooth"),
         (lambda r, d: NeuralBackstepping(d, Potential(np.eye(3)), Damping(2, floor=np.eye(2))), "2, 3 and 2 joints"),
         (lambda r, d: NeuralBackstepping(d, *NETWORKS, rate=np.zeros(2)), "rate Λ is"),
-        (lambda r, d: NeuralBackstepping(d, *NETWORKS, inertial_rate=-1.0), "inertial rate ω is -1.0"),
+        (lambda r, d: NeuralBackstepping(d, *NETWORKS, inertial_rate=-1.0), "inertial_rate is -1.0"),
         (lambda r, d: NeuralBackstepping.for_robot(r, UR5), "the dynamics has 6 joints and two_link 2"),
-        (lambda r, d: nbs.PD(d, feedforward="all", kp=1.0, kd=1.0), "choose one of gravity, reference"),
+        (lambda r, d: nbs.PD(d, feedforward="all", kp=1.0, kd=1.0), "give one of gravity, reference"),
         (lambda r, d: nbs.PD(d, feedforward="gravity", kp=np.array([1.0, -1.0]), kd=1.0), "kp is"),
         (lambda r, d: nbs.SlotineLi(d, rate=np.ones(3), gain=1.0), "rate is"),
         (lambda r, d: nbs.ComputedTorque(d, kp=np.nan, kd=1.0), "kp is nan"),
-        (lambda r, d: PID(kp=np.ones(2), ki=1.0, kd=1.0, effort_limit=1.0, filter_time=-1.0), "filter_time is -1.0 s"),
+        (
+            lambda r, d: PID(kp=np.ones(2), ki=1.0, kd=1.0, effort_limit=1.0, filter_time=-1.0),
+            "filter_time is -1.0; give",
+        ),
         (lambda r, d: nbs.paper_controller(d).torque(*[np.zeros(3)] * 5), r"q has shape \(3,\), expected \(.*, 2\)"),
     ],
 )

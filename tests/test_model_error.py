@@ -440,7 +440,7 @@ def test_sample_sizes_are_drawn_by_medians(tmp_path, monkeypatch):
     ("arguments", "words"),
     [
         ({"model": TWO}, "the model has 2 joints and the truth 3"),
-        ({"samples": 1}, "samples is 1, expected a whole number of at least 2"),
+        ({"samples": 1}, "samples is 1; give a whole number from 2"),
         ({"speed": -1.0}, "is empty; give lower < upper and speeds > 0"),
         ({"speed": [1.0, 2.0]}, "give one finite number, or 3 of them"),
         ({"box": (1.0, -1.0)}, "is empty"),

@@ -394,11 +394,11 @@ def test_a_run_of_another_arm_is_refused(law, certificate):
 
 def test_what_is_no_certificate_or_no_run_is_refused(law, certificate, without_type_checks):
     run = run_of(law, duration=0.01)
-    with pytest.raises(ArgumentError, match="give the certificate"):
+    with pytest.raises(ArgumentError, match="certificate is a NeuralBackstepping; give a Certificate"):
         monitor(run, law)
     with pytest.raises(ArgumentError, match="give the certificate"):
         Watch(law)
-    with pytest.raises(ArgumentError, match="is not a Run"):
+    with pytest.raises(ArgumentError, match="run is a Certificate; give what simulate returned"):
         monitor(certificate, certificate)
 
 

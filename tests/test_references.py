@@ -327,7 +327,7 @@ def test_a_motion_beyond_the_arms_limits_is_refused_with_joint_and_time():
     check_reference(Sinusoid([0.05, 0, 0, 0, 0, 0, 0], 43.0, 0.0, q), robot.with_effort_limit(np.inf), 3.0)
     with pytest.raises(ArgumentError, match="are these degrees"):
         check_reference(Hold(np.full(7, 45.0)), robot, 3.0)
-    with pytest.raises(ArgumentError, match="2 joints, panda has 7"):
+    with pytest.raises(ArgumentError, match="2 joints, the arm has 7"):
         check_reference(paper_reference(2), robot, 3.0)
     with pytest.raises(ArgumentError, match="duration"):
         check_reference(Hold(q), robot, -1.0)
@@ -340,9 +340,9 @@ def test_any_callable_is_a_reference_and_what_it_lacks_is_said():
     check_reference(lambda t: (still.tolist(), still.tolist(), still.tolist()), robot, 1.0)
     with pytest.raises(ArgumentError, match=r"gave v of shape \(2,\), expected \(2001, 2\); let it take arrays"):
         check_reference(lambda t: (still, np.zeros(2), still), robot, 1.0)
-    with pytest.raises(ArgumentError, match="3 joints, two_link has 2"):
+    with pytest.raises(ArgumentError, match="3 joints, the arm has 2"):
         check_reference(lambda t: (still, still, np.zeros((2001, 3))), robot, 1.0)
-    with pytest.raises(ArgumentError, match="the reference's q is up"):
+    with pytest.raises(ArgumentError, match="the reference's q is 'up', with text"):
         check_reference(lambda t: ("up", still, still), robot, 1.0)
 
 

@@ -192,7 +192,7 @@ def test_a_stream_is_the_run_in_pieces(law):
     for name in ("t", "q", "v", "tau", "tau_command", "disturbance", "q_ref"):
         joined = np.concatenate([*(getattr(piece, name)[:-1] for piece in pieces), getattr(pieces[-1], name)[-1:]])
         np.testing.assert_array_equal(joined, getattr(whole, name))
-    with pytest.raises(ArgumentError, match="block is 0 periods"):
+    with pytest.raises(ArgumentError, match="block is 0; give a whole number of periods"):
         next(stream(PLANT, controller, MOVING, 1.0, 0.01, block=0))
 
 
@@ -289,7 +289,7 @@ def test_the_default_plant_step_is_the_longest_within_a_millisecond():
         ({"plant_step": 0.003}, "times the plant_step"),
         ({"plant_step": 0.02}, "times the plant_step"),
         ({"plant_step": -0.001}, "plant_step is"),
-        ({"lookahead": -0.1}, r"lookahead is -0\.1 s"),
+        ({"lookahead": -0.1}, r"lookahead is -0\.1; give a finite number ≥ 0"),
         ({"q0": [1.0, 2.0, 3.0]}, "q0 has shape"),
         ({"q0": 1.0}, "q0 has shape"),
         ({"q0": np.zeros((0, 2))}, "q0 has shape"),
@@ -298,13 +298,13 @@ def test_the_default_plant_step_is_the_longest_within_a_millisecond():
         ({"q0": np.zeros((2, 2)), "v0": np.zeros((3, 2))}, "do not broadcast"),
         ({"q0": np.zeros(2), "workers": 2}, r"q0 has shape \(2,\); give q0 of shape \(starts, \.\.\., nv\)"),
         ({"q0": np.zeros((4, 2)), "v0": np.zeros((3, 2)), "workers": 2}, "the starts do not broadcast"),
-        ({"q0": np.zeros((4, 2)), "workers": 0}, "workers is 0, expected a whole number"),
+        ({"q0": np.zeros((4, 2)), "workers": 0}, "workers is 0; give a whole number"),
         ({"effort_limit": -1.0}, "effort_limit"),
         ({"effort_limit": [1.0, np.nan]}, "effort_limit"),
         ({"effort_limit": [1.0, 1.0, 1.0]}, "effort_limit"),
-        ({"reference": Hold([0.0])}, "one value for each of the 2 joints"),
+        ({"reference": Hold([0.0])}, "the reference has 1 joints, the arm has 2"),
         ({"reference": lambda t: Reference(np.zeros(2), np.zeros(2), np.zeros(2))}, "arrays of times"),
-        ({"reference": lambda t: Reference(*np.full((3, *t.shape, 2), np.nan))}, "not finite"),
+        ({"reference": lambda t: Reference(*np.full((3, *t.shape, 2), np.nan))}, "expected a finite number"),
         ({"controller": Law(lambda q, v, ref: q, nv=3)}, "3 joints and the plant 2"),
         ({"disturbance": lambda t, q, v: np.zeros(3)}, "the disturbance at t = 0 s has shape"),
     ],

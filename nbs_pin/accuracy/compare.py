@@ -10,12 +10,13 @@ from jaxtyping import Float
 from nbs_pin.accuracy.energy_drift import FreeMotion, free_motion
 from nbs_pin.accuracy.mismatch import Mismatch, accelerations, mismatch
 from nbs_pin.accuracy.relative_errors import Box, Errors, check_joints, judge, share
+from nbs_pin.base.arguments import SEED, a, checked, count, maybe
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.records import Run
-from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.base.records import RUN, Run
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Multiples of the box's speed in `ModelErrors.by_speed`."""
@@ -95,6 +96,16 @@ class ModelErrors:
         return Errors(self.mass_matrix, self.coriolis, self.gravity, self.inverse, self.forward)
 
 
+@checked(
+    model=MODEL,
+    truth=MODEL,
+    samples=count(2, 1_000_000),
+    seed=SEED,
+    box=maybe(a((list, tuple, np.ndarray), "(lower, upper)")),
+    run=maybe(RUN),
+    motions=count(0, 100_000),
+    friction=maybe(FRICTION),
+)
 def compare(
     model: DynamicsProvider,
     truth: DynamicsProvider,
@@ -128,8 +139,6 @@ def compare(
         0.075
     """
     check_joints(model, truth)
-    if samples < 2 or samples != int(samples):
-        raise ArgumentError(f"samples is {samples}, expected a whole number of at least 2; 2000 is usual.")
     chosen = box_of(model, truth, box, speed)
     rng = np.random.default_rng(seed)
     state = chosen.states(rng, samples)
@@ -163,8 +172,8 @@ def box_of(model: DynamicsProvider, truth: DynamicsProvider, box: Sequence[PerJo
     """The box of `compare` for these arguments."""
     if box is None:
         return Box.of_robot(truth.robot or model.robot, truth.nv, speed)
-    if len(box) != 2:
-        raise ArgumentError(f"the box has {len(box)} parts, expected two; give (lower, upper).")
+    if np.ndim(box) == 0 or len(box) != 2:
+        raise ArgumentError(f"the box has {np.size(box)} parts, expected two; give (lower, upper).")
     return Box.of(box[0], box[1], speed, truth.nv)
 
 

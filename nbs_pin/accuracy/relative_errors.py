@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray, Vectors, matvec
-from nbs_pin.base.checks import PerJoint, floats
+from nbs_pin.base.checks import PerJoint, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -55,8 +55,8 @@ class Box:
         given = {"the lower end": lower, "the upper end": upper, "the speed": speed}
         arrays = {name: floats(f"{name} of the box", value) for name, value in given.items()}
         for name, x in arrays.items():
-            if x.shape not in ((), (nv,)) or not np.isfinite(x).all():
-                raise ArgumentError(f"{name} of the box is {x.tolist()}; give one finite number, or {nv} of them.")
+            if x.shape not in ((), (nv,)) or not is_usual(x):
+                raise ArgumentError(f"{name} of the box is {told(x)}; give one finite number, or {nv} of them.")
         low, high, fast = (np.full(nv, x) for x in arrays.values())
         if not ((low < high).all() and (fast > 0.0).all()):
             raise ArgumentError(

@@ -7,7 +7,8 @@ import numpy as np
 from array_api_compat import array_namespace, is_torch_array
 from jaxtyping import Float
 
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.checks import MOST_NUMBERS, all_finite, floats, told
+from nbs_pin.base.exceptions import ArgumentError, TooLarge
 
 Array: TypeAlias = Any
 """A `numpy.ndarray` or a `torch.Tensor`; shapes are annotated with jaxtyping around it."""
@@ -21,6 +22,10 @@ Scalars: TypeAlias = Float[Array, "*batch"]
 JointArray: TypeAlias = Float[np.ndarray, " n"]
 """One number per joint, a numpy array of shape (n,)."""
 
+_FLOAT = np.dtype(float)
+_LARGE = 1e50
+"""Smaller numbers overflow no product of a few of them."""
+
 __all__ = [
     "Array",
     "JointArray",
@@ -30,6 +35,7 @@ __all__ = [
     "array_namespace",
     "as_vectors",
     "constant_like",
+    "finite_result",
     "is_torch_array",
     "matvec",
     "over_rows",
@@ -47,24 +53,27 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
     Lists and numbers become float64 numpy arrays; tensors stay tensors.
 
     Raises:
-        ArgumentError: If numpy and torch are mixed, a tensor is not float64, a last axis is not nv, or the batch shapes
-            do not broadcast.
+        ArgumentError: If one is not made of real numbers (`checks.floats`), numpy and torch are mixed, a tensor is not
+            float64, a last axis is not nv, or the batch shapes do not broadcast.
     """
     given = tuple(vectors.values())
-    shape = np.shape(given[0])
-    if (
-        shape
-        and shape[-1] == nv
-        and all(type(x) is np.ndarray and x.shape == shape and x.dtype == float for x in given)
-    ):
-        return given  # fast path of the common case
-    arrays = [x if is_torch_array(x) else np.asarray(x, dtype=float) for x in vectors.values()]
+    shape = getattr(given[0], "shape", None)
+    if type(shape) is tuple and shape and shape[-1] == nv:
+        for x in given:
+            if type(x) is not np.ndarray or x.dtype is not _FLOAT or x.shape != shape:
+                break
+        else:
+            if x.size <= MOST_NUMBERS:
+                return given  # fast path of the common case
+    arrays = [x if is_torch_array(x) else floats(name, x) for name, x in vectors.items()]
     if len({is_torch_array(x) for x in arrays}) > 1:
         kinds = ", ".join(f"{k} {type(x).__name__}" for k, x in vectors.items())
         raise ArgumentError(f"numpy and torch were mixed ({kinds}); give numpy arrays only or tensors only.")
     for name, x in zip(vectors, arrays, strict=True):
+        if is_torch_array(x) and (x.is_sparse or x.is_meta):
+            raise ArgumentError(f"{name} is {told(x)} without dense numbers; give {name}.to_dense().")
         if str(x.dtype) not in ("float64", "torch.float64"):
-            raise ArgumentError(f"{name} is a {x.dtype} tensor, expected float64; give {name}.double().")
+            raise ArgumentError(f"{name} is {told(x)}, expected float64; give {name}.double().")
         if x.ndim == 0 or x.shape[-1] != nv:
             raise ArgumentError(f"{name} has shape {tuple(x.shape)}, expected (..., {nv}): one number per joint.")
     if len({tuple(x.shape) for x in arrays}) == 1:
@@ -74,6 +83,24 @@ def as_vectors(nv: int, **vectors: Array) -> tuple[Array, ...]:
     except (ValueError, RuntimeError) as error:
         shapes = ", ".join(f"{k} {tuple(x.shape)}" for k, x in zip(vectors, arrays, strict=True))
         raise ArgumentError(f"batch shapes do not broadcast ({shapes}); give equal leading axes.") from error
+
+
+def finite_result(what: str, result: Array, *arguments: Array) -> Array:
+    """The result; raises TooLarge if finite numpy arguments gave one that is not, since they are too large.
+
+    Where an argument itself is not finite, neither need the result be, nor where a model is not finite for numbers of
+    usual size. Tensors are not looked at.
+    """
+    if (
+        isinstance(result, np.ndarray | np.float64)
+        and not all_finite(np.asarray(result))
+        and all(all_finite(x) for x in arguments)
+    ):
+        largest = max((float(np.abs(x).max()) for x in arguments if x.size), default=0.0)
+        if largest < _LARGE:
+            return result  # not for its arguments
+        raise TooLarge(f"{what} is too large to be computed for numbers up to {largest:.3g}; give smaller ones.")
+    return result
 
 
 def constant_like(x: Array, constant: np.ndarray) -> Array:

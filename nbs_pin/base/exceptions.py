@@ -20,6 +20,14 @@ class ArgumentError(NbsPinError, ValueError):
     """An argument that is not finite or has the wrong shape, type or range."""
 
 
+class TooLarge(ArgumentError, OverflowError):
+    """Finite arguments whose result is too large to be a number."""
+
+
+class NoSuchFile(ArgumentError, FileNotFoundError):
+    """The path of a file to read that does not exist."""
+
+
 class MissingExtra(NbsPinError, ImportError):
     """An optional dependency is not installed; names the extra that installs it."""
 

@@ -10,14 +10,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nbs_pin.base.archives import parse_json
+from nbs_pin.base.arguments import PERIOD, a, check_fields, checked, mapping, readable, text, writable
 from nbs_pin.base.arrays import Array, JointArray
+from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 from nbs_pin.base.units import JointUnits, units_of
 
 RUN_FORMAT = "nbs_pin run 1"
 """Value of the entry `format` in a run file."""
-_PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+ROW_ARRAYS = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
+"""Arrays of a run with a number for each instant, start and joint."""
 _PER_JOINT = ("effort_limit", "continuous", "joint_names")
 _JSON = ("robot_options", "info")
 
@@ -85,6 +88,27 @@ class Run:
     prismatic: Bool[np.ndarray, " n"] | None = None
     """True for joints that slide, with q in [m] and a force tau [N]; None, as in older files, is for no joint."""
 
+    def __post_init__(self) -> None:
+        check_fields(self, period=PERIOD, robot=text, robot_sha256=text, robot_options=mapping, info=mapping)
+        for name in ("t", *ROW_ARRAYS, "effort_limit"):
+            object.__setattr__(self, name, floats(f"Run: {name}", getattr(self, name)))
+        wraps = floats("Run: continuous", self.continuous, truths=True).astype(bool)
+        object.__setattr__(self, "continuous", wraps)
+        names = tuple(self.joint_names) if isinstance(self.joint_names, tuple | list) else ()
+        object.__setattr__(self, "joint_names", names)
+        shape = self.q.shape
+        expected = dict.fromkeys(ROW_ARRAYS, shape) | {"t": shape[:1], "effort_limit": shape[-1:]}
+        found = {name: getattr(self, name).shape for name in expected}
+        found, expected = found | {"continuous": wraps.shape}, expected | {"continuous": shape[-1:]}
+        wrong = [name for name in expected if len(shape) < 2 or 0 in shape or found[name] != expected[name]]
+        if wrong:
+            raise ArgumentError(
+                f"Run: {wrong[0]} has shape {found[wrong[0]]} beside q of shape {shape}, expected"
+                f" {expected[wrong[0]]}, where q is (rows, ..., joints); give arrays that fit."
+            )
+        if len(names) != shape[-1] or not all(isinstance(name, str) for name in names):
+            raise ArgumentError(f"Run: joint_names is {told(self.joint_names)}, expected {shape[-1]} texts; give them.")
+
     @property
     def nv(self) -> int:
         """Number of joints."""
@@ -100,6 +124,7 @@ class Run:
         """The units of every joint."""
         return units_of(self.slides)
 
+    @checked(path=writable)
     def save(self, path: str | Path) -> None:
         """Write the run to an npz file atomically; missing folders are created.
 
@@ -112,6 +137,7 @@ class Run:
         write_npz(path, {name: np.asarray(value) for name, value in (values | texts).items()})
 
     @classmethod
+    @checked(path=readable)
     def load(cls, path: str | Path) -> "Run":
         """The run in an npz file written by `save`.
 
@@ -120,7 +146,7 @@ class Run:
         """
         names = {entry.name for entry in dataclasses.fields(cls)} | {"format"}
         data = {"robot_options": np.array("{}"), **read_npz(path, names)}  # absent in the oldest run files
-        require(data, path, {"format": "U", "t": "f", **dict.fromkeys(_PER_ROW, "f"), "effort_limit": "f"})
+        require(data, path, {"format": "U", "t": "f", **dict.fromkeys(ROW_ARRAYS, "f"), "effort_limit": "f"})
         require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", *_JSON), "U")})
         require(data, path, {"period": "f", **({"prismatic": "b"} if "prismatic" in data else {})})
         if str(data["format"]) != RUN_FORMAT:
@@ -128,8 +154,7 @@ class Run:
         _check_shapes(path, data)
         _check_numbers(path, data)
         return cls(
-            **{name: data[name].astype(float, copy=False) for name in ("t", *_PER_ROW, "effort_limit")},
-            continuous=data["continuous"],
+            **{name: data[name] for name in ("t", *ROW_ARRAYS, "effort_limit", "continuous")},
             joint_names=tuple(str(name) for name in data["joint_names"]),
             period=float(data["period"]),
             robot=str(data["robot"]),
@@ -140,10 +165,14 @@ class Run:
         )
 
 
+RUN = a(Run, "what simulate returned or Run.load read")
+"""The check of an argument that is a run."""
+
+
 def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
     shape = data["q"].shape
     joints = (*_PER_JOINT, *(["prismatic"] if "prismatic" in data else []))
-    expected = dict.fromkeys(_PER_ROW, shape) | dict.fromkeys(joints, shape[-1:]) | {"t": shape[:1], "period": ()}
+    expected = dict.fromkeys(ROW_ARRAYS, shape) | dict.fromkeys(joints, shape[-1:]) | {"t": shape[:1], "period": ()}
     for name, wanted in expected.items():
         if len(shape) < 2 or 0 in shape or data[name].shape != wanted:
             raise FileFormatError(
@@ -153,7 +182,7 @@ def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
 
 
 def _check_numbers(path: str | Path, data: dict[str, np.ndarray]) -> None:
-    faults = {name: "numbers that are not finite" for name in ("t", *_PER_ROW) if not np.isfinite(data[name]).all()}
+    faults = {name: "numbers that are not finite" for name in ("t", *ROW_ARRAYS) if not np.isfinite(data[name]).all()}
     if not (data["effort_limit"] > 0.0).all():
         faults["effort_limit"] = "limits that are not > 0"
     if not 0.0 < data["period"] < np.inf:

@@ -7,8 +7,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arguments import MOST_JOINTS, a, check_fields, checked, count, many, numbers
 from nbs_pin.base.arrays import JointArray, Vectors
-from nbs_pin.base.checks import PerJoint, floats
+from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.claims import Claim, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.units import TURNING, several, with_units
@@ -37,15 +38,19 @@ class Admissible:
     """How the bound is known where it was computed, as from a payload; none for bounds that are given."""
 
     def __post_init__(self) -> None:
-        given = np.asarray(self.radius if self.box is None else self.box, dtype=float)
+        is_one = (self.box is None) != (self.radius is None)
+        given = floats("disturbance", self.radius if self.box is None else self.box) if is_one else np.zeros(0)
         usable = (given == 0.0) | ((given >= _LEAST) & (given <= _GREATEST))  # its square is a number > 0
-        if (self.box is None) == (self.radius is None) or given.ndim > 1 or not usable.all():
+        if given.ndim != (self.radius is None) or given.size == 0 or not usable.all():
             raise ArgumentError(
-                f"disturbance has the box {self.box} and the radius {self.radius} N·m, expected one of the two, each "
-                f"bound 0 or from {_LEAST:g} to {_GREATEST:g}; correct it."
+                f"disturbance has the box {told(self.box)} and the radius {told(self.radius)} N·m, expected one of the"
+                f" two, each bound 0 or from {_LEAST:g} to {_GREATEST:g}; correct it."
             )
+        object.__setattr__(self, *(("radius", float(given)) if self.box is None else ("box", given)))
+        check_fields(self, claims=many(a(Claim, "a Claim")))
 
     @classmethod
+    @checked(nv=count(1, MOST_JOINTS, "joints"))
     def of(cls, disturbance: "PerJoint | Admissible", nv: int) -> "Admissible":
         """The box of one bound per joint, the ball of a single number [N·m], or the given `Admissible` itself.
 
@@ -61,7 +66,7 @@ class Admissible:
         given = floats("disturbance", disturbance)
         if given.shape not in ((), (nv,)):
             raise ArgumentError(
-                f"disturbance is {disturbance}, expected one bound on ‖τ_d‖ or {nv}, one on each |τ_d,i| [N·m]."
+                f"disturbance is {told(disturbance)}, expected one bound on ‖τ_d‖ or {nv}, one on each |τ_d,i| [N·m]."
             )
         return cls(radius=float(given)) if given.ndim == 0 else cls(box=given)
 
@@ -70,13 +75,17 @@ class Admissible:
         """The weakest label of its claims; PROVED for bounds that are given, as these are an assumption."""
         return weakest(*(claim.label for claim in self.claims))
 
+    @checked(nv=count(1, MOST_JOINTS, "joints"))
     def largest(self, nv: int) -> JointArray:
         """Largest |τ_d| of each of the joints [N·m]."""
         return np.full(nv, self.radius) if self.box is None else self.box
 
+    @checked(metric=numbers(None, None))
     def energy(self, metric: Float[np.ndarray, "n n"]) -> float:
         """Upper bound of τ_dᵀAτ_d over the set for A ≻ 0, rounded up; the supremum for a ball or a diagonal A."""
         n = len(metric)
+        if metric.shape != (n, n) or (self.box is not None and len(self.box) != n):
+            raise ArgumentError(f"A has shape {metric.shape}, expected (n, n) for the {n} joints; correct it.")
         if self.box is not None:
             value = float(self.box @ np.abs(metric) @ self.box)
         else:
@@ -92,16 +101,26 @@ class Admissible:
 
     def contains(self, tau_d: Vectors) -> bool:
         """Whether every torque is admissible, up to a relative tolerance of 1e-12."""
+        tau_d = self._torques("tau_d", tau_d)
         if self.box is not None:
             return bool((np.abs(tau_d) <= self.box * (1.0 + 1e-12)).all())
         return bool((np.linalg.norm(tau_d, axis=-1) <= (self.radius or 0.0) * (1.0 + 1e-12)).all())
 
     def towards(self, direction: Vectors) -> Vectors:
         """The admissible torque with the greatest inner product with each direction g: box·sign(g), or radius·g/‖g‖."""
+        direction = self._torques("direction", direction)
         if self.box is not None:
             return self.box * np.sign(direction)
         size = np.linalg.norm(direction, axis=-1, keepdims=True)
         return (self.radius or 0.0) * direction / np.where(size > 0.0, size, 1.0)
+
+    def _torques(self, name: str, value: Vectors) -> Vectors:
+        """The value as an array (..., n)."""
+        x = floats(name, value)
+        if x.ndim == 0 or (self.box is not None and x.shape[-1] != len(self.box)):
+            n = "n" if self.box is None else len(self.box)
+            raise ArgumentError(f"{name} has shape {x.shape}, expected (..., {n}); give one number per joint.")
+        return x
 
     def told(self, units: Sequence[str]) -> str:
         """The bound in words, with the unit of every joint's torque."""

@@ -7,11 +7,11 @@ lower bound of the worst error, never an upper one.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from numbers import Integral
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nbs_pin.base.arguments import DURATION, PERIOD, SEED, checked, count, flag, maybe
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.exceptions import ArgumentError
@@ -22,7 +22,7 @@ from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.ensemble import LoopEnsemble, Peaks, law_of
 from nbs_pin.certificates.torque_waves import FASTEST, SLOWEST, constant, in_step, random_disturbances, square
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.motions.references import DesiredMotion
 
 __all__ = ["Attack", "Peaks", "attack", "random_disturbances", "worst_of"]
@@ -50,6 +50,15 @@ class Attack:
     """Control period [s]."""
 
 
+@checked(
+    plant_dynamics=maybe(MODEL),
+    duration=maybe(DURATION),
+    period=PERIOD,
+    rounds=count(0, 10_000),
+    starts=count(1, 100_000),
+    seed=SEED,
+    progress=flag,
+)
 def attack(
     controller: Controller,
     disturbance: PerJoint | Admissible,
@@ -96,8 +105,6 @@ def attack(
         >>> found.error < nbs.certify(controller, [5.0, 5.0]).error
         True
     """
-    for name, value, least in (("rounds", rounds, 0), ("starts", starts, 1), ("seed", seed, 0)):
-        _check_count(name, value, least)
     ensemble = LoopEnsemble.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
     admissible, rng = Admissible.of(disturbance, controller.nv), np.random.default_rng(seed)
     names, motion, waves = _waves(ensemble, admissible, rng)
@@ -124,6 +131,7 @@ def attack(
     )
 
 
+@checked(plant_dynamics=maybe(MODEL), period=PERIOD, seed=SEED, progress=flag)
 def worst_of(
     controller: Controller,
     disturbances: Float[np.ndarray, "count steps n"],
@@ -137,7 +145,6 @@ def worst_of(
 ) -> Peaks:
     """Largest errors under each held disturbance [N·m]; arguments as in `attack`, several motions are used in turn."""
     law_of(controller)
-    _check_count("seed", seed, 0)
     disturbances = floats("disturbances", disturbances)
     if disturbances.ndim != 3 or disturbances.shape[-1] != controller.nv or 0 in disturbances.shape:
         raise ArgumentError(
@@ -148,11 +155,6 @@ def worst_of(
     duration = disturbances.shape[1] * period
     ensemble = LoopEnsemble.of(controller, reference, plant_dynamics, duration, period, effort_limit, seed)
     return ensemble.peaks(np.arange(len(disturbances)) % len(ensemble.scenes), disturbances, progress)
-
-
-def _check_count(name: str, value: int, least: int) -> None:
-    if not isinstance(value, Integral) or value < least:
-        raise ArgumentError(f"{name} is {value!s:.80}, expected a whole number ≥ {least}; correct it.")
 
 
 def _waves(

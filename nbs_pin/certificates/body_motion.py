@@ -12,7 +12,7 @@ from nbs_pin.certificates.body_regressor import BodyRegressor
 from nbs_pin.certificates.body_response import Response, instants
 from nbs_pin.certificates.constants import Constants, above_inverse
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
-from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.motions.references import DesiredMotion, at_times
 
 _OUTWARD = 1.0 + 1e-9
 
@@ -72,7 +72,7 @@ class AlongReference:
     ) -> "AlongReference":
         """The bounds for a law with the model whose errors the regressor holds."""
         t = instants(duration)
-        states = tuple(np.asarray(x, dtype=float) for x in reference(t))
+        states = at_times(reference, t, law.nv)
         found = [regressor.at(*state) for state in zip(*states, strict=True)]
         torque, slope, errors, coriolis = (np.array([x[i] for x in found]) for i in range(4))
         mass, christoffel = law.dynamics.mass_matrix(states[0]), law.dynamics.coriolis_matrix(states[0], states[1])

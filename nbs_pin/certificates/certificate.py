@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.accuracy.mismatch import Mismatch
+from nbs_pin.base.arguments import a, checked, number, numbers_or_one
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.records import Reference
@@ -187,6 +188,7 @@ class Certificate:
         """V∞ [J]."""
         return self.level.storage
 
+    @checked(t=numbers_or_one(least=0.0, unit="s"), initial=number(least=0.0, unit="J"))
     def storage_bound(self, t: Float[np.ndarray, "*rows"], initial: float) -> Float[np.ndarray, "*rows"]:
         """Bound of V(t) from V(0) = `initial` [J]: the lesser of e^{−ct}V(0) + V∞ and max(V(0), V∞), t in [s].
 
@@ -206,6 +208,7 @@ class Certificate:
         """Whether bounds with held torques are proved from other starts, but not from V(0) = `initial` [J]."""
         return self.held is not None and self.held.is_proved and not math.isfinite(self.held_storage(initial))
 
+    @checked(initial=number(least=0.0, unit="J"))
     def from_start(self, initial: float) -> tuple[float, JointArray]:
         """Bounds of ‖z1‖ and each |z1_i| at all times [rad] from V(0) = `initial` [J], as Φ ≤ max(V(0), Φ∞).
 
@@ -237,6 +240,10 @@ class Certificate:
             "conditions": [condition.plain() for condition in self.conditions],
             "assumptions": [{"assumption": text, "checked": checked} for text, checked in self.assumptions],
         }
+
+
+CERTIFICATE = a(Certificate, "a Certificate, as certify returns it")
+"""The check of an argument that is a certificate."""
 
 
 def _bounds(certificate: Certificate) -> tuple[Claim, ...]:

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from nbs_pin.base.arguments import checked, writable
 from nbs_pin.base.claims import Claim, Group
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.plain import plain
 from nbs_pin.base.rounding import down
 from nbs_pin.base.versions import versions
-from nbs_pin.certificates.certificate import Certificate
+from nbs_pin.certificates.certificate import CERTIFICATE, Certificate
 from nbs_pin.certificates.comparison_system import polygon, reach
 from nbs_pin.certificates.constants import rigid_arm
 from nbs_pin.certificates.error_bounds import radians
@@ -33,6 +34,7 @@ _FORMS = (("D0", "largest"), ("D0", "least"), ("I", "largest"), ("I", "least"))
 _PREMISES = (Group.LOADS, Group.FRICTION, Group.MODEL_ERROR, Group.STRUCTURE)
 
 
+@checked(certificate=CERTIFICATE, path=writable)
 def write_certificate(certificate: Certificate, path: str | Path) -> Path:
     """Write a certificate with all constants, multipliers, edges and conditions to a JSON file, for `verify`.
 

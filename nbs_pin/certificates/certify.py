@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from nbs_pin.accuracy.mismatch import Mismatch
+from nbs_pin.base.arguments import DURATION, PERIOD, a, checked, maybe, number
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.checks import PerJoint, floats, positive
+from nbs_pin.base.checks import PerJoint, floats, is_usual, told
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.records import Reference
@@ -37,13 +38,13 @@ from nbs_pin.certificates.model_structure import EXACT, is_exact, torque_differe
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.certificates.structure import lyapunov_law
 from nbs_pin.certificates.uncertainty import Uncertainty
-from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.analytic import AnalyticDynamics
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.motions.references import DesiredMotion
-from nbs_pin.robots.robot import Robot
+from nbs_pin.motions.references import MOTION, DesiredMotion, at_times
+from nbs_pin.robots.robot import ARM, Robot
 
 _NO_ERROR = ModelError(0.0, 0.0, 0.0, (), ())
 _UNBOUNDED = "taken as 0, but nothing bounds it: give mismatch=compare(…).mismatch, or --against ARM"
@@ -51,6 +52,17 @@ _UNKNOWN = Claim("error of the model", math.inf, "N·m", Label.EMPIRICAL, _UNBOU
 _UNKNOWN_ERROR = ModelError(0.0, 0.0, 0.0, (_UNKNOWN,), ())
 
 
+@checked(
+    controller=CONTROLLER,
+    reference=maybe(MOTION),
+    duration=maybe(DURATION),
+    mismatch=maybe(a(Mismatch, "compare(…).mismatch")),
+    period=maybe(PERIOD),
+    lookahead=maybe(number(least=0.0, most=1000.0, unit="s")),
+    robot=maybe(ARM),
+    friction=maybe(FRICTION),
+    uncertainty=maybe(a(Uncertainty, "an Uncertainty, such as Uncertainty(inertia=0.05)")),
+)
 def certify(
     controller: Controller,
     disturbance: PerJoint | Admissible,
@@ -169,14 +181,8 @@ def _check_arguments(
     period: float | None,
 ) -> Start | None:
     """The start, None without one."""
-    if duration is not None:
-        positive("duration", duration, "s")
-    if period is not None:
-        positive("period", period, "s")
     if robot is not None and robot.nv != law.nv:
         raise ArgumentError(f"the controller has {law.nv} joints and {robot.name} {robot.nv}; give its own arm.")
-    if reference is not None and not callable(reference):
-        raise ArgumentError(f"reference is {reference!s:.100}, expected a motion such as nbs.Sinusoid; correct it.")
     if reference is None and (mismatch is not None or q0 is not None or v0 is not None):
         raise ArgumentError("q0, v0 and mismatch refer to a motion; give the reference too.")
     if q0 is None and v0 is not None:
@@ -185,9 +191,9 @@ def _check_arguments(
         return None
     start = floats("q0", q0), np.zeros(law.nv) if v0 is None else floats("v0", v0)
     for name, x in zip(("q0", "v0"), start, strict=True):
-        if x.shape != (law.nv,) or not np.isfinite(x).all():
-            raise ArgumentError(f"{name} is {x!s:.200}, expected {law.nv} finite numbers, one per joint; correct it.")
-    begin = Reference(*(np.asarray(x)[0] for x in reference(np.zeros(1))))
+        if x.shape != (law.nv,) or not is_usual(x):
+            raise ArgumentError(f"{name} is {told(x)}, expected {law.nv} finite numbers, one per joint; correct it.")
+    begin = Reference(*(x[0] for x in at_times(reference, np.zeros(1), law.nv)))
     return Start(*start, begin, float(law.storage(*start, begin.q, begin.v)))
 
 

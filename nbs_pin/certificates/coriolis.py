@@ -2,6 +2,7 @@
 
 Norms: |x|² = xᵀD₀x for velocities, |f|_* = √(fᵀD₀⁻¹f) for torques, |x|_M² = xᵀMx. With ±∂_iM ⪯ γ_iM and
 ±∂_iM ⪯ γ'_iD₀ (`inertia/derivatives.py`), C(q, v)z is the sum of three terms ½xᵀ∂_vM z, ½xᵀ∂_zM v, −½vᵀ∂_xM z.
+Σ γ_i|v_i| and Σ γ'_i|v_i| stand for the least bounds known of ±∂_vM by M and by D₀, those by rates of links included.
 """
 
 import math
@@ -19,7 +20,7 @@ from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
 from nbs_pin.inertia.bounds import largest_diagonal, largest_inertia_bound, least_inertia_bound
-from nbs_pin.inertia.derivatives import inertia_derivatives, rate_bound, single_rates
+from nbs_pin.inertia.derivatives import inertia_derivatives, link_derivatives, link_rates, rate_bound, single_rates
 from nbs_pin.robots.robot import Robot
 
 MOST_JOINTS = 8
@@ -78,6 +79,18 @@ class CoriolisBounds:
     """Σ γ_i|v_i| ≤ spread·|v|."""
     spread_d: float
     """Σ γ'_i|v_i| ≤ spread_d·|v|."""
+    pull: float
+    """Σ γ_i|(Λf)_i| ≤ pull·√(fᵀΛf)."""
+    pull_d: float
+    """Σ γ'_i|(Λf)_i| ≤ pull_d·√(fᵀΛf)."""
+    pull_sum: float
+    """Σ |(Λf)_i| ≤ pull_sum·√(fᵀΛf)."""
+    links: Float[np.ndarray, "n n"]
+    """B of the rates a = Bv of links."""
+    link_relative: JointArray
+    """γ of ∂_vM for the rates of links."""
+    link_floor: JointArray
+    """γ' of ∂_vM for the rates of links."""
     diagonal: JointArray
     """max M_ii [kg·m²]."""
     single: JointArray
@@ -102,6 +115,10 @@ class CoriolisBounds:
         turn, turn_d = min(self.turn * energy, self.spread * speed), min(self.turn_d * energy, self.spread_d * speed)
         return Sizes(turn, turn_d, energy, speed)
 
+    @property
+    def _by_links(self) -> tuple[JointArray, JointArray]:
+        return self.link_relative, self.link_floor
+
     def motion(self, motion: SampledMotion, floor: Float[np.ndarray, "n n"], jerk: JointArray) -> MotionBounds:
         """The bounds of a reference with |ȧ_d,i| ≤ jerk_i, at and between its samples."""
         largest = [float(np.sqrt(np.einsum("ti,ij,tj->t", x, floor, x).max())) for x in (motion.v, motion.a)]
@@ -109,6 +126,9 @@ class CoriolisBounds:
         largest[1] += motion.half * largest[2]
         fastest = np.abs(motion.v).max(axis=0) + motion.half * (np.abs(motion.a).max(axis=0) + motion.half * jerk)
         speeds = [float(w @ fastest) for w in (self.relative, self.by_floor, np.ones(len(floor)))]
+        between = np.abs(self.links) @ (np.abs(motion.a).max(axis=0) + motion.half * jerk)
+        turning = np.abs(motion.v @ self.links.T).max(axis=0) + motion.half * between
+        speeds[:2] = (min(s, float(w @ turning)) for s, w in zip(speeds, self._by_links, strict=False))
         largest[0] += motion.half * largest[1]
         return MotionBounds(*speeds, *largest)
 
@@ -137,43 +157,62 @@ class _Arm(NamedTuple):
     turn: float
     sum_m: float
     diagonal: JointArray
+    links: Float[np.ndarray, "n n"]
+    link_relative: JointArray
+    by_links: JointArray
+    """`single` for the rates of links."""
 
 
 @lru_cache(maxsize=8)
 def _arm(key: _Key) -> _Arm:
-    tree, n = RigidTree.of(key.robot), key.robot.nv
+    tree, n, links = RigidTree.of(key.robot), key.robot.nv, link_rates(key.robot)
     relative, single = inertia_derivatives(tree), single_rates(tree)
+    by_links = single if np.array_equal(links, np.eye(n)) else single_rates(tree, links)
+    link_relative = link_derivatives(tree, relative)
     turn, sum_m = (rate_bound(tree, weights, single) for weights in (relative, np.ones(n)))
-    return _Arm(relative, single, turn, sum_m, largest_diagonal(tree))
+    turn = min(turn, rate_bound(tree, link_relative, by_links, links))
+    return _Arm(relative, single, turn, sum_m, largest_diagonal(tree), links, link_relative, by_links)
 
 
 @lru_cache(maxsize=8)
-def _of_shape(key: _Key, shape_bytes: bytes, n: int) -> JointArray:
-    return inertia_derivatives(key.robot, np.frombuffer(shape_bytes).reshape(n, n))
+def _of_shape(key: _Key, shape_bytes: bytes, n: int) -> tuple[JointArray, JointArray]:
+    return _both(key, np.frombuffer(shape_bytes).reshape(n, n))
 
 
-def _by_floor(key: _Key, floor: Float[np.ndarray, "n n"]) -> JointArray:
-    """γ', from that of the same floor in other units: designs of one arm differ by a factor, and a search takes long.
+def _both(key: _Key, floor: Float[np.ndarray, "n n"]) -> tuple[JointArray, JointArray]:
+    by_floor = inertia_derivatives(key.robot, floor)
+    return by_floor, link_derivatives(key.robot, by_floor, floor)
 
-    ±∂_iM ⪯ γ'F and F ⪯ D₀/s(1 − ε) give γ'/s(1 − ε) for D₀.
+
+def _by_floor(key: _Key, floor: Float[np.ndarray, "n n"]) -> tuple[JointArray, JointArray]:
+    """γ' of joints and of links, from those of the same floor in other units: designs of one arm differ by a factor.
+
+    ±∂_iM ⪯ γ'F and F ⪯ D₀/s(1 − ε) give γ'/s(1 − ε) for D₀; a search takes long.
     """
     size = float(floor[0, 0])
     shape = np.round(floor / size, 10)
     if least_eigenvalue(floor / size - (1.0 - _SHAPE) * shape) <= 0.0:
-        return inertia_derivatives(key.robot, floor)
-    return np.asarray(_of_shape(key, shape.tobytes(), len(floor)) / (size * (1.0 - _SHAPE)) * (1.0 + SLACK))
+        return _both(key, floor)
+    joints, links = _of_shape(key, shape.tobytes(), len(floor))
+    scale = (1.0 + SLACK) / (size * (1.0 - _SHAPE))
+    return joints * scale, links * scale
 
 
 @lru_cache(maxsize=8)
 def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> CoriolisBounds:
     floor, rate = np.frombuffer(floor_bytes).reshape(n, n), np.frombuffer(rate_bytes)
     tree, inverse = RigidTree.of(key.robot), np.abs(np.linalg.inv(floor))
-    relative, single, turn, sum_m, diagonal = _arm(key)
+    relative, single, turn, sum_m, diagonal, links, link_relative, by_links = _arm(key)
     heaviest = largest_inertia_bound(tree, floor).value
-    by_floor = np.minimum(_by_floor(key, floor), relative * heaviest)
+    own = (relative, link_relative)
+    by_floor, link_floor = (np.minimum(x, y * heaviest) for x, y in zip(_by_floor(key, floor), own, strict=True))
+    turn_d = min(rate_bound(tree, by_floor, single), rate_bound(tree, link_floor, by_links, links))
 
     def largest(weights: JointArray) -> float:
         return math.sqrt(weights @ inverse @ weights)
+
+    def pulled(weights: JointArray) -> float:
+        return math.sqrt(weights**2 @ rate)
 
     weight = np.linalg.norm(key.robot.model.gravity.linear) * np.sqrt(_carried(tree) * diagonal)
     slowness = np.diag(1.0 / rate)
@@ -181,11 +220,17 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
         relative=relative,
         by_floor=by_floor,
         turn=turn,
-        turn_d=rate_bound(tree, by_floor, single),
+        turn_d=turn_d,
         sum_m=sum_m,
         sum=largest(np.ones(n)),
         spread=largest(relative),
         spread_d=largest(by_floor),
+        pull=pulled(relative),
+        pull_d=pulled(by_floor),
+        pull_sum=pulled(np.ones(n)),
+        links=links,
+        link_relative=link_relative,
+        link_floor=link_floor,
         diagonal=diagonal,
         single=single,
         weight=weight,

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arguments import PERIOD, check_fields, checked, count, number
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.certificates.certificate import Certificate
+from nbs_pin.certificates.certificate import CERTIFICATE, Certificate
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.kernels import verdicts as at
 
@@ -39,20 +39,22 @@ class Encoders:
     """Encoder step as a share of a turn (of 1 m for a prismatic joint), such as 2**-16."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.step < 0.5:
-            raise ArgumentError(f"Encoders was given the step {self.step} of a turn, expected a share in [0, 0.5).")
+        check_fields(self, step=number(least=0.0, below=0.5, unit="of a turn"))
 
     @classmethod
+    @checked(bits=count(2, 300))
     def of_bits(cls, bits: int) -> "Encoders":
         """Encoders of that many bits per turn."""
         return cls(2.0**-bits)
 
+    @checked(certificate=CERTIFICATE)
     def resolution(self, certificate: Certificate) -> JointArray:
         """The encoder step of each joint [rad, m]."""
         robot, n = certificate.robot, certificate.controller.nv
         turn = np.full(n, 2.0 * np.pi) if robot is None else np.where(robot.prismatic, 1.0, 2.0 * np.pi)
         return np.asarray(self.step * turn)
 
+    @checked(certificate=CERTIFICATE, period=PERIOD)
     def half_width(self, certificate: Certificate, period: float) -> int:
         """m of the shortest window that tells torques to a quarter of their bound, at most `LONGEST` long [periods].
 

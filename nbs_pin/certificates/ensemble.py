@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from nbs_pin.base.checks import PerJoint, positive
+from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.progress import tracked
-from nbs_pin.base.records import Reference, Run
+from nbs_pin.base.records import ROW_ARRAYS, Run
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.motions.references import DesiredMotion, Hold, Sinusoid
+from nbs_pin.motions.references import MOTION, DesiredMotion, Hold, Sinusoid, at_times
 from nbs_pin.robots.robot import configuration_difference
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.loop import Loop
@@ -28,7 +28,6 @@ POSTURES = 7
 TIME_CONSTANTS, MOST_PERIODS = 7.0, 4000
 """Default duration: so many of the slowest time constants, at most so many periods."""
 _BATCH = 128  # motions in memory at once
-_PER_ROW = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "a_ref")
 
 
 class Peaks(NamedTuple):
@@ -62,7 +61,6 @@ class LoopEnsemble:
     ) -> "LoopEnsemble":
         """The loop for the arguments of `attack`; raises ArgumentError if they do not fit."""
         law = law_of(controller)
-        positive("period", period, "s")
         truth = law.dynamics if plant_dynamics is None else plant_dynamics
         followed = motions_of(law.dynamics, reference, seed)
         if duration is None:
@@ -116,7 +114,7 @@ class LoopEnsemble:
         with torch.no_grad():
             moved = motions(self.controller, batch, self.engine)
         many = recorded(moved, batch, type(self.controller).__name__)
-        return replace(many, **{name: getattr(many, name)[:, 0] for name in _PER_ROW}, info={**many.info, **info})
+        return replace(many, **{name: getattr(many, name)[:, 0] for name in ROW_ARRAYS}, info={**many.info, **info})
 
     def _errors(self, batch: Batch, tau_d: torch.Tensor | None = None) -> torch.Tensor:
         """z1 (count, rows, n); raises SimulationDiverged if it is not finite."""
@@ -152,21 +150,13 @@ def motions_of(
         if not followed:
             raise ArgumentError("reference is an empty list, expected at least one motion; omit it for the arm's own.")
         for motion in followed:
-            _check_motion(motion)
+            MOTION("reference", motion)
+            at_times(motion, np.zeros(1), dynamics.nv)
         return followed
     rng, robot, n = np.random.default_rng(seed), dynamics.robot, dynamics.nv
     low, high = (np.full(n, -np.pi), np.full(n, np.pi)) if robot is None else robot.sampling_range
     own: list[DesiredMotion] = [Hold(np.zeros(n)) if robot is None else Sinusoid.for_robot(robot, 1.0)]
     return own + [Hold(rng.uniform(low, high)) for _ in range(POSTURES)]
-
-
-def _check_motion(motion: Any) -> None:
-    sampled = motion(np.zeros(1)) if callable(motion) else None
-    if not isinstance(sampled, tuple) or len(sampled) != len(Reference._fields):
-        raise ArgumentError(
-            f"the reference {motion!s:.80} is not a motion, expected a function of time that returns a Reference "
-            "(q, v, a); take Hold, Sinusoid or one from a file."
-        )
 
 
 def slowest_rate(controller: ModelLaw, reference: DesiredMotion) -> float:
@@ -179,7 +169,7 @@ def slowest_rate(controller: ModelLaw, reference: DesiredMotion) -> float:
     n, zero = controller.nv, np.zeros(controller.nv)
     eye = np.eye(n)
     hessian = controller.potential_terms(np.zeros((n, n)), eye)[2]
-    mass = controller.dynamics.mass_matrix(np.asarray(reference(np.zeros(1)).q)[0])
+    mass = controller.dynamics.mass_matrix(at_times(reference, np.zeros(1), n).q[0])
     damping = controller.inertial_rate * eye + np.linalg.solve(mass, controller.damping_matrix(zero))
     above = np.hstack([-controller.rate_like(zero)[:, None] * hessian, eye])
     loop = np.vstack([above, np.hstack([-controller.coupling * np.linalg.solve(mass, hessian), -damping])])

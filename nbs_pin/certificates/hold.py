@@ -15,6 +15,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.rounding import diagonal_below, largest_eigenvalue, least_eigenvalue
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.coriolis import CoriolisBounds, MotionBounds
+from nbs_pin.certificates.coriolis_terms import Coriolis, Norms, Velocity
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 
 UP = 1.0 + 1e-9
@@ -142,19 +143,6 @@ class Bent(NamedTuple):
     """Σ|·_i|."""
 
 
-class Coriolis(NamedTuple):
-    """Bounds of C(q, v)."""
-
-    by_speed: float
-    """|C(q, v)z|_* ≤ by_speed·|z|."""
-    by_energy: float
-    """|C(q, v)z|_* ≤ by_energy·|z|_M."""
-    slow: float
-    """|C(q, φ)b|_* ≤ slow·|b|_M, with φ in place of v."""
-    form: float
-    """|aᵀC(q, v)b| ≤ form·|a|_M|b|_M."""
-
-
 @dataclass(frozen=True, eq=False)
 class Hold:
     """A hold that begins in {V' ≤ level}, by numbers that bound it whatever it does."""
@@ -226,7 +214,9 @@ def _numbers(loop: SampledLaw, level: float, curve: Curvature, sups: Suprema) ->
     rest_m = min(isk * rest, arm.loss_m * curve.rest_loss / math.sqrt(k.delta))
     rest_f = min(isk * rest * k.nu, arm.loss_m * curve.rest_loss * arm.loss_inverse * snu)
     turning = curve.centre + rest
-    turn = motion.turn + arm.turn * sups.rate_m
+    norms = Norms(isk, snu, math.sqrt(loop.loss_of_speed))
+    velocity = Velocity(arm, motion, norms, sups.rate, sups.rate_m, sups.speed_m, sups.loss)
+    turn = velocity.turn
     bend = 0.5 * lead**2 * motion.acceleration
     exponent = 2.0 * (turn * (h + lead) + arm.spread * bend)
     if exponent > 1.0:
@@ -242,17 +232,6 @@ def _numbers(loop: SampledLaw, level: float, curve: Curvature, sups: Suprema) ->
     share = loop.law.damping_share((sups.speed + lag * sups.rate + late) * UP)
     if not math.isfinite(share):
         return None
-    slow, slow_m = motion.speed + math.sqrt(loop.loss_of_speed) * loss, isk * motion.speed + arm.loss_m * loss
-    turned = motion.turn_d + min(arm.turn_d * sups.rate_m, arm.spread_d * sups.rate)
-    mixed = min(arm.turn_d, arm.spread_d * snu)
-    angle = motion.turn + min(arm.turn * sups.rate_m, arm.spread * sups.rate)
-    slow_angle = motion.turn + min(arm.turn * arm.loss_m, arm.spread * math.sqrt(loop.loss_of_speed)) * loss
-    coriolis = Coriolis(
-        0.5 * (turned + 2.0 * arm.spread_d * speed),
-        0.5 * (isk * angle + mixed * speed + arm.spread * speed_m),
-        0.5 * (isk * slow_angle + mixed * slow + arm.spread * slow_m),
-        0.5 * (turn + 2.0 * arm.turn * speed_m),
-    )
     return Hold(
         loop=loop,
         level=level,
@@ -266,7 +245,7 @@ def _numbers(loop: SampledLaw, level: float, curve: Curvature, sups: Suprema) ->
         turn=turn,
         speed=speed,
         speed_m=speed_m,
-        speed_1=motion.speed_1 + min(arm.sum_m * sups.rate_m, arm.sum * sups.rate),
+        speed_1=velocity.sum,
         stretch=stretch,
         half=max(lead, h - lead),
         mean=(0.5 * h * h - h * lead + lead * lead) / h if lead <= h else lead - 0.5 * h,
@@ -274,7 +253,7 @@ def _numbers(loop: SampledLaw, level: float, curve: Curvature, sups: Suprema) ->
             0.5 * h * h * moved + bend, 0.5 * h * h * moved_m + isk * bend, arm.sum * (0.5 * h * h * moved + bend)
         ),
         share=share,
-        coriolis=coriolis,
+        coriolis=velocity.coriolis(loss),
     )
 
 
@@ -286,7 +265,8 @@ def predicted(b: Hold) -> tuple[float, float]:
 def lagging(b: Hold, time: float) -> tuple[float, float]:
     """What joints turn between q and q̂, in Σ γ_i|·_i| and in Σ |·_i|, for a bound of |t − t̂| or its mean."""
     arm = b.loop.arm
-    return time * b.turn + arm.turn * b.bent.energy, time * b.speed_1 + b.bent.total
+    bent = min(arm.turn * b.bent.energy, arm.spread * b.bent.speed)
+    return time * b.turn + bent, time * b.speed_1 + b.bent.total
 
 
 def changed(b: Hold, time: float) -> float:
@@ -321,8 +301,8 @@ def _force(b: Hold) -> tuple[Float[np.ndarray, " 7"], float]:
     constant += isk * (swing * angle * (extra + isk * motion.acceleration) + isk * motion.jerk * b.half)
     constant += b.loop.arm.gravity * sum_1
     # −C z2, and the change of C(q, v)φ
-    by_speed, by_speed_m, slow, _ = b.coriolis
-    row = row + (by_speed + b.loop.viscous) * S + b.loop.alpha * L + swing * slow * h * (snu * F + turned)
+    by_speed, here, by_speed_m, slow, _ = b.coriolis
+    row = row + (here + b.loop.viscous) * S + b.loop.alpha * L + swing * slow * h * (snu * F + turned)
     constant += swing * isk * motion.acceleration * (slow * (h + b.loop.lead) + by_speed_m * b.half)
     row = row + swing * by_speed_m * (
         b.half * turned + 0.5 * h * h * (curve.centre * (snu * F + turned) + b.rest_f * F + b.rest_m * b.turning * R)

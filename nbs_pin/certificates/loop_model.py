@@ -16,6 +16,7 @@ from nbs_pin.kernels import periods, watching as at
 from nbs_pin.kernels.laws import pack_tree_law
 from nbs_pin.kernels.layout import LAW, LawCode
 from nbs_pin.kernels.periods import compile_periods
+from nbs_pin.kernels.threads import Scratch
 from nbs_pin.kernels.watching import compile_watching
 
 
@@ -63,38 +64,39 @@ class CompiledModel(LoopModel):
         compile_periods()
         law, tree = controller.packed_law(), controller.dynamics.packed_tree()
         assert tree is not None
-        self._law, self._size = pack_tree_law(law, tree), at.watch_workspace(law, tree)
+        self._packed, self._scratch = tuple(pack_tree_law(law, tree)), Scratch(at.watch_workspace(law, tree))
         self._n = controller.nv
-
-    @property
-    def _packed(self) -> tuple[np.ndarray, ...]:
-        """The law with scratch space of this call alone: a `Watch` may be used from several threads."""
-        return (*self._law, np.empty(self._size))
 
     def storage(self, sample: Float[np.ndarray, "7 n"]) -> float:
         """As in `LoopModel`."""
-        return float(periods.storage(sample, *self._packed))
+        work = self._scratch.take()
+        value = float(periods.storage(sample, *self._packed, work))
+        self._scratch.give(work)
+        return value
 
     def period(
         self, before: Float[np.ndarray, "7 n"], after: Float[np.ndarray, "7 n"], h: float, last: float
     ) -> tuple[Float[np.ndarray, " terms"], Float[np.ndarray, "4 n"]]:
         """As in `LoopModel`."""
-        terms, vectors = np.empty(periods.TERMS), np.empty((periods.VECTORS, self._n))
-        periods.period_terms(before, after, h, last, *self._packed, terms, vectors)
+        terms, vectors, work = np.empty(periods.TERMS), np.empty((periods.VECTORS, self._n)), self._scratch.take()
+        periods.period_terms(before, after, h, last, *self._packed, work, terms, vectors)
+        self._scratch.give(work)
         return terms, vectors
 
     def observe(self, samples: Float[np.ndarray, "3 7 n"], period: float) -> Float[np.ndarray, "8 n"]:
         """As in `LoopModel`."""
-        out = np.empty((at.SIGNALS, self._n))
-        at.observe(samples, period, *self._packed, out)
+        out, work = np.empty((at.SIGNALS, self._n)), self._scratch.take()
+        at.observe(samples, period, *self._packed, work, out)
+        self._scratch.give(work)
         return out
 
     def centre(
         self, mean: Float[np.ndarray, "8 n"], q: JointArray, resolution: JointArray, width: float
     ) -> tuple[Float[np.ndarray, "4"], JointArray]:
         """As in `LoopModel`."""
-        out, share = np.empty(at.CENTRE), np.empty(self._n)
-        at.centre(mean, q, resolution, width, *self._packed, out, share)
+        out, share, work = np.empty(at.CENTRE), np.empty(self._n), self._scratch.take()
+        at.centre(mean, q, resolution, width, *self._packed, work, out, share)
+        self._scratch.give(work)
         return out, share
 
 

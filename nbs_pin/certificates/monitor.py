@@ -6,8 +6,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.arguments import a, checked, count, maybe
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.records import Run
+from nbs_pin.base.records import RUN, Run
 from nbs_pin.certificates.assumptions import (
     JUMPS,
     Promise,
@@ -28,7 +29,7 @@ from nbs_pin.certificates.assumptions import (
     stops,
     summed,
 )
-from nbs_pin.certificates.certificate import Certificate
+from nbs_pin.certificates.certificate import CERTIFICATE, Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, storage_of
@@ -110,6 +111,12 @@ class Monitored:
         return said + looks_like(self.suspects) + self.basis
 
 
+@checked(
+    run=RUN,
+    certificate=CERTIFICATE,
+    start=count(0),
+    encoders=maybe(a(Encoders, "Encoders, such as Encoders.of_bits(16)")),
+)
 def monitor(run: Run, certificate: Certificate, *, start: int = 0, encoders: Encoders | None = None) -> Monitored:
     """Check a run, simulated or logged, against a certificate of its controller.
 

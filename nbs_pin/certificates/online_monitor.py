@@ -3,11 +3,13 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from nbs_pin.base.arguments import a, check_fields, maybe
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.checks import floats, real, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.assumptions import JUMPS, LARGEST, check_certificate, listed, looks_like, not_finite, sentence
@@ -18,6 +20,8 @@ from nbs_pin.certificates.energy_balance import Balance, LoopSamples
 from nbs_pin.certificates.glance import Glance
 from nbs_pin.certificates.period_watch import PeriodWatch, WatchMemory
 from nbs_pin.certificates.window_watch import WindowMemory, WindowWatch
+
+_ROWS = ("q", "v", "the reference's q", "the reference's v", "the reference's a", "tau", "tau_command")
 
 
 class Watched(NamedTuple):
@@ -78,6 +82,7 @@ class Watch:
 
     def __post_init__(self) -> None:
         check_certificate(self.certificate)
+        check_fields(self, encoders=maybe(a(Encoders, "Encoders, such as Encoders.of_bits(16)")))
 
     @cached_property
     def _way(self) -> PeriodWatch | WindowWatch:
@@ -99,18 +104,22 @@ class Watch:
         instant and is left out of the memory. Any number of threads may use one Watch, each loop with its own memory.
         Raises ArgumentError unless t is finite and after the previous instant.
         """
-        if not abs(t) <= LARGEST:
-            raise ArgumentError(f"the instant is t = {t} s, expected a finite time; give the time of the sample.")
-        way: Any = self._way
-        if memory is not None and isinstance(memory, WatchMemory) != (self.encoders is None):
+        instant = real(t)
+        if instant is None or not abs(instant) <= LARGEST:
+            raise ArgumentError(f"the instant is t = {told(t)} s, expected a finite time; give the time of the sample.")
+        t, way = instant, cast(Any, self._way)
+        if memory is not None and type(memory) is not (WindowMemory if self.encoders else WatchMemory):
             raise ArgumentError("the memory is that of a Watch of another kind; give the one that this Watch returned.")
-        rows, n = (q, v, *reference, tau, tau_command), self.certificate.controller.nv
-        if any(np.shape(row) != (n,) for row in rows):
+        if not isinstance(reference, tuple) or len(reference) != len(Reference._fields):
+            raise ArgumentError(f"the reference is {told(reference)}, expected a Reference of q, v and a; give one.")
+        n = self.certificate.controller.nv
+        rows = [floats(name, row) for name, row in zip(_ROWS, (q, v, *reference, tau, tau_command), strict=True)]
+        if any(row.shape != (n,) for row in rows):
             raise ArgumentError(
-                f"the sample has rows of shapes {[np.shape(row) for row in rows]}, expected ({n},) each: q, v, the "
+                f"the sample has rows of shapes {[row.shape for row in rows]}, expected ({n},) each: q, v, the "
                 "reference's q, v and a, tau and tau_command; give one number per joint."
             )
-        sample = np.array(rows, dtype=float)
+        sample = np.array(rows)
         if not (np.abs(sample) <= LARGEST).all():
             _, what = not_finite(LoopSamples(np.zeros(1), *sample[:, None]), self.certificate.joint_names)
             return self._lost(memory, what, t), None if memory is None else way.lost(memory)

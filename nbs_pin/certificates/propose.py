@@ -9,12 +9,12 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 
+from nbs_pin.base.arguments import DURATION, PERIOD, SEED, checked, many, maybe
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.checks import PerJoint, floats, positive
+from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.units import units
 from nbs_pin.certificates.admissible import Admissible
@@ -26,9 +26,9 @@ from nbs_pin.controllers.gains import Gains, effective_inertia, largest_inertia
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.motions.references import DesiredMotion, Sinusoid
-from nbs_pin.robots.robot import Robot
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
+from nbs_pin.motions.references import MOTION, DesiredMotion, Sinusoid
+from nbs_pin.robots.robot import ARM, Robot
 
 PERIODS = (0.01, 0.005, 0.002, 0.001, 0.0005, 0.00025)
 """Default control periods to choose from, the longest first [s]."""
@@ -70,6 +70,14 @@ class Proposal:
     """ωh, at most `FAST`."""
 
 
+@checked(
+    robot=ARM,
+    reference=maybe(MOTION),
+    duration=DURATION,
+    periods=many(PERIOD, 1, 1000, "control periods [s]"),
+    dynamics=maybe(MODEL),
+    seed=SEED,
+)
 def propose(
     robot: Robot,
     disturbance: PerJoint | Admissible,
@@ -106,10 +114,14 @@ def propose(
         >>> design.period, design.error <= 0.05
         (0.01, True)
     """
-    _check_kinds(robot, reference, dynamics)
+    if dynamics is not None and dynamics.nv != robot.nv:
+        raise ArgumentError(
+            f"dynamics is a {type(dynamics).__name__} of {dynamics.nv} joints, expected a model of the {robot.nv} "
+            f"joints of {robot.name}; leave it out for Pinocchio's."
+        )
     admissible = Admissible.of(disturbance, robot.nv)
     wanted = _wanted(error, robot.nv)
-    choice = _periods(periods)
+    choice = sorted(periods, reverse=True)
     motion = Sinusoid.for_robot(robot) if reference is None else reference
     arm = _Arm.of(robot, dynamics, admissible, motion, duration)
     _check_limits(robot, arm)
@@ -268,44 +280,13 @@ def _proposal(
     )
 
 
-def _check_kinds(robot: Any, reference: Any, dynamics: Any) -> None:
-    """Raises ArgumentError unless they are an arm, a motion and a model of its joints."""
-    if not isinstance(robot, Robot):
-        raise ArgumentError(
-            f"robot is {_shown(robot)}, expected an arm; give load_robot(…), or the dynamics.robot of a controller."
-        )
-    if reference is not None and not callable(reference):
-        raise ArgumentError(f"the reference is {_shown(reference)}, expected a motion like Sinusoid.for_robot(robot).")
-    if dynamics is not None and not (isinstance(dynamics, DynamicsProvider) and dynamics.nv == robot.nv):
-        raise ArgumentError(
-            f"dynamics is {_shown(dynamics)}, expected a model of the {robot.nv} joints of {robot.name}; leave it out "
-            "for Pinocchio's."
-        )
-
-
-def _shown(value: Any) -> str:
-    """A value for a message: itself if it is short, else its type."""
-    return f"'{value}'" if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
-
-
-def _periods(periods: Any) -> list[float]:
-    """The control periods to choose from [s], the longest first."""
-    choice = floats("periods", periods)
-    if choice.ndim != 1:
-        raise ArgumentError(f"periods is {_shown(periods)}, expected a list to choose from: periods=(0.001,) [s].")
-    if not choice.size:
-        raise ArgumentError("no control period was given to choose from; give at least one [s].")
-    for period in choice.tolist():
-        positive("a period", period, "s")
-    return sorted(choice.tolist(), reverse=True)
-
-
 def _wanted(error: PerJoint, nv: int) -> np.ndarray:
     """The wanted error of every joint [rad]."""
     wanted = floats("the wanted error", error)
-    if wanted.shape not in ((), (nv,)) or not (np.isfinite(wanted).all() and (wanted > 0.0).all()):
+    if wanted.shape not in ((), (nv,)) or not ((wanted >= 1e-9).all() and (wanted <= 1e3).all()):
         raise ArgumentError(
-            f"the wanted error is {error}; give one number > 0, or {nv}, one per joint [rad, m where it slides]."
+            f"the wanted error is {told(error)}; give one number > 0, or {nv}, one per joint, from 1e-9 to 1000 "
+            "[rad, m where it slides]."
         )
     return np.full(nv, wanted)
 

@@ -120,7 +120,7 @@ def _excess(
     k, curve, motion, h, arm = b.loop.constants, b.curve, b.loop.motion, b.loop.h, b.loop.arm
     snu, isk, swing, y_m = math.sqrt(k.nu) * b.stretch, b.isk, b.stretch**2, mean_m(b)
     force, rate = sup.force, sup.rate
-    by_speed, by_speed_m, _, all_m = b.coriolis
+    by_speed, here, by_speed_m, _, all_m = b.coriolis
     turned = curve.centre * sup.rate_m + b.rest_m * rate
     phi_m = isk * motion.acceleration * ONE + turned
     v_dot = snu * force + phi_m
@@ -149,7 +149,7 @@ def _excess(
     q.add((1.0 - k.coupling) / math.sqrt(k.delta) + b.loop.alpha, Y, X)
     q.add(b.loop.viscous, Y, drift)
     _add_held(b, sup, q, turned, v_dot, seen)
-    spread = h / math.sqrt(12.0) * (k.nu * (sup.gradient + (by_speed + b.loop.viscous) * Y) + k.omega * Y)
+    spread = h / math.sqrt(12.0) * (k.nu * (sup.gradient + (here + b.loop.viscous) * Y) + k.omega * Y)
     ends = _Form()
     ends.add(h * h / 12.0 * curve.steepest, rate, rate)
     ends.add(h * h / 12.0, sup.gradient, k.nu * force + b.turning * rate)
@@ -170,7 +170,7 @@ def _add_held(
     """Adds ȳᵀ⟨e⟩: the law at the predicted state against the law along the hold."""
     k, curve, motion, h, arm = b.loop.constants, b.curve, b.loop.motion, b.loop.h, b.loop.arm
     snu, isk, swing, y_m, omega = math.sqrt(k.nu) * b.stretch, b.isk, b.stretch**2, mean_m(b), k.omega
-    by_speed, by_speed_m, slow, _ = b.coriolis
+    by_speed, _, by_speed_m, slow, _ = b.coriolis
     force, rate = sup.force, sup.rate
     angle, sum_1 = lagging(b, b.mean)
     acceleration = k.nu * force + b.turning * rate

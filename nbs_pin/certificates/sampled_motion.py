@@ -7,10 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.checks import positive
-from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
-from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.motions.references import DesiredMotion, at_times
 from nbs_pin.robots.robot import configuration_difference
 
 STEP = 0.005
@@ -35,12 +33,8 @@ class SampledMotion(NamedTuple):
     @classmethod
     def of(cls, reference: DesiredMotion, nv: int, duration: float) -> "SampledMotion":
         """The reference over `duration` [s]; raises ArgumentError if it is no finite motion of `nv` joints."""
-        positive("duration", duration, "s")
         t = np.linspace(0.0, duration, min(max(INSTANTS, math.ceil(duration / STEP) + 1), _MOST))
-        rows = Reference(*(np.asarray(x, dtype=float) for x in reference(t)))
-        if any(x.shape != (len(t), nv) or not np.isfinite(x).all() for x in rows):
-            raise ArgumentError(f"the reference is not a finite motion of the arm's {nv} joints; correct it.")
-        return cls(t, *rows)
+        return cls(t, *at_times(reference, t, nv))
 
     def contradiction(self) -> tuple[float, float, float, int]:
         """Where the motion contradicts its derivatives most: the change left over, that allowed, time [s] and joint."""

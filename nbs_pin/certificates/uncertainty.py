@@ -1,17 +1,15 @@
 """What is known of the bodies and the friction of the true arm: shares of the model's numbers, and a payload."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from jaxtyping import Float, Int
 
-from nbs_pin.base.checks import positive
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.arguments import a, check_fields, checked, maybe, number, text
 from nbs_pin.certificates.loads import place_of
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 
 @dataclass(frozen=True)
@@ -30,9 +28,9 @@ class Payload:
     """The link that carries it; None takes the arm's end (`loads.tool_frame`)."""
 
     def __post_init__(self) -> None:
-        positive("the payload", self.mass, "kg")
-        if not 0.0 <= self.radius < math.inf:
-            raise ArgumentError(f"the payload's radius is {self.radius}; give a finite number ≥ 0 [m].")
+        check_fields(
+            self, mass=number(above=0.0, unit="kg"), radius=number(least=0.0, most=1e50, unit="m"), link=maybe(text)
+        )
 
 
 @dataclass(frozen=True)
@@ -59,15 +57,15 @@ class Uncertainty:
     """Share by which the Coulomb friction of each joint may differ from that stated."""
 
     def __post_init__(self) -> None:
-        for name in ("inertia", "viscous", "coulomb"):
-            if not 0.0 <= getattr(self, name) < 1.0:
-                raise ArgumentError(f"{name} is known to ±{getattr(self, name)} of its value; give a share in [0, 1).")
+        share, payload = number(least=0.0, below=1.0), a(Payload, "a Payload, such as Payload(2.0, radius=0.05)")
+        check_fields(self, inertia=share, payload=maybe(payload), viscous=share, coulomb=share)
 
     @property
     def of_bodies(self) -> bool:
         """Whether bodies, and not friction alone, are uncertain."""
         return self.inertia > 0.0 or self.payload is not None
 
+    @checked(robot=ARM, model=a(pin.Model, "the Pinocchio model of that arm, such as robot.model"))
     def errors(self, robot: Robot, model: pin.Model) -> "BodyErrors":
         """The errors that bodies of `model`, a model of the arm, may have.
 

@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arguments import check_fields, number
 from nbs_pin.base.arrays import Array, array_namespace
-from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
@@ -50,8 +50,7 @@ class SmoothedReLU(Activation):
     d: float = 0.01
 
     def __post_init__(self) -> None:
-        if not self.d > 0.0:
-            raise ArgumentError(f"the smoothing width d is {self.d}; give a positive number.")
+        check_fields(self, d=number(above=0.0))
 
     def derivatives(self, x: Float[Array, "*shape"]) -> _Derivatives:
         """σ, σ', σ''; at 0 and d, where σ'' jumps, σ'' = 0."""
@@ -80,8 +79,7 @@ class Squareplus(Activation):
     b: float = 1.0
 
     def __post_init__(self) -> None:
-        if not self.b > 0.0:
-            raise ArgumentError(f"the curvature b is {self.b}; give a positive number.")
+        check_fields(self, b=number(above=0.0))
 
     def derivatives(self, x: Float[Array, "*shape"]) -> _Derivatives:
         """σ, σ', σ''."""

@@ -4,13 +4,15 @@ from typing import Any
 
 import numpy as np
 
-from nbs_pin.base.arrays import Array, Vectors, as_vectors, is_torch_array
+from nbs_pin.base.arrays import Array, Vectors, as_vectors, finite_result, is_torch_array
+from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.kernels.laws import compile_laws, compile_tree_law, law_signals, law_workspace, pack_tree_law, tree_law
 from nbs_pin.kernels.layout import Packed
-from nbs_pin.kernels.threads import over_cores
+from nbs_pin.kernels.threads import Scratch, over_cores
 
 
 class CompiledController(MemorylessController):
@@ -29,11 +31,12 @@ class CompiledController(MemorylessController):
         self.law, self.dynamics, self._tree = law, dynamics, dynamics.packed_tree()
         if self._tree is None:
             compile_laws()
-            self._packed: tuple[np.ndarray, ...] = (*law, np.empty(law_workspace(law)))
-            self._signals = np.empty((3, dynamics.nv))
+            self._packed: tuple[np.ndarray, ...] = tuple(law)
+            self._scratch = Scratch(law_workspace(law))
         else:
             compile_tree_law()
-            self._packed = (*pack_tree_law(law, self._tree), np.empty(law_workspace(law, self._tree)))
+            self._packed = tuple(pack_tree_law(law, self._tree))
+            self._scratch = Scratch(law_workspace(law, self._tree))
         one, two = np.zeros(dynamics.nv), np.zeros((2, dynamics.nv))
         for x in (one, two):  # so that nothing is left to compile inside a control loop
             self.torque(x, x, x, x, x)
@@ -43,7 +46,7 @@ class CompiledController(MemorylessController):
         return type(self), (self.law, self.dynamics)
 
     def compile(self) -> "CompiledController":
-        """The same law with its own scratch space, for another `simulate` or thread."""
+        """The same law again."""
         return type(self)(self.law, self.dynamics)
 
     @property
@@ -61,7 +64,7 @@ class CompiledController(MemorylessController):
             tau = np.empty(self.nv)
             try:
                 fits = self._one(q, v, q_ref, v_ref, a_ref, tau)
-            except TypeError:  # not all contiguous float64 vectors: converted and checked below
+            except NOT_TAKEN:  # not all contiguous float64 vectors: converted and checked below
                 fits = False
             if fits:
                 return tau
@@ -70,14 +73,20 @@ class CompiledController(MemorylessController):
     def _one(
         self, q: np.ndarray, v: np.ndarray, q_ref: np.ndarray, v_ref: np.ndarray, a_ref: np.ndarray, tau: np.ndarray
     ) -> bool:
-        """Write the torque of one state to tau; False, with nothing written, unless all have length nv."""
+        """Write the torque of one state to tau; False unless all have length nv and the torque is finite."""
+        work = self._scratch.take()
         if self._tree is not None:
-            return tree_law(q, v, q_ref, v_ref, a_ref, *self._packed, tau)
-        if not law_signals(q, v, q_ref, v_ref, a_ref, *self._packed, self._signals):
+            fits: bool = tree_law(q, v, q_ref, v_ref, a_ref, *self._packed, work, tau)
+            self._scratch.give(work)
+            return fits
+        signals = np.empty((3, self.nv))
+        fits = law_signals(q, v, q_ref, v_ref, a_ref, *self._packed, work, signals)
+        self._scratch.give(work)
+        if not fits:
             return False
-        v_r, a_r, feedback = self._signals
+        v_r, a_r, feedback = signals
         tau[:] = self.dynamics.reference_torque(q, v, v_r, a_r) + feedback
-        return True
+        return all_finite(tau)
 
     def _torques(self, *states: Array) -> Vectors:
         if is_torch_array(states[0]):
@@ -87,15 +96,19 @@ class CompiledController(MemorylessController):
             )
         shape, n = states[0].shape, self.nv
         rows = [np.array(x, dtype=float, order="C").reshape(-1, n) for x in states]
-        tau, (*packed, work) = np.empty(rows[0].shape), self._packed
+        tau = np.empty(rows[0].shape)
         if self._tree is not None:
 
             def evaluate(part: slice) -> None:
-                tree_law(*(x[part].ravel() for x in rows), *packed, np.empty_like(work), tau[part].ravel())
+                work = self._scratch.take()
+                tree_law(*(x[part].ravel() for x in rows), *self._packed, work, tau[part].ravel())
+                self._scratch.give(work)
 
             over_cores(evaluate, len(tau))
-            return tau.reshape(shape)
-        signals = np.empty((3, tau.size))
-        law_signals(*(x.ravel() for x in rows), *packed, work, signals)
+            return finite_result("the torque", tau, *rows).reshape(shape)
+        signals, work = np.empty((3, tau.size)), self._scratch.take()
+        law_signals(*(x.ravel() for x in rows), *self._packed, work, signals)
+        self._scratch.give(work)
         v_r, a_r, feedback = signals.reshape(3, *tau.shape)
-        return (self.dynamics.reference_torque(rows[0], rows[1], v_r, a_r) + feedback).reshape(shape)
+        tau = self.dynamics.reference_torque(rows[0], rows[1], v_r, a_r) + feedback
+        return finite_result("the torque", tau, *rows).reshape(shape)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, checked, maybe
+from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors, finite_result
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.gains import (
@@ -14,11 +15,11 @@ from nbs_pin.controllers.gains import (
     warn_if_too_fast,
 )
 from nbs_pin.controllers.model_law import ModelLaw
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.kernels.layout import LawCode, Packed
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 
 @known_code
@@ -49,6 +50,7 @@ class ComputedTorque(ModelLaw):
         self.gains = PositiveGains(dynamics.nv, kp=kp, kd=kd)
 
     @classmethod
+    @checked(robot=ARM, dynamics=maybe(MODEL), bandwidth=BANDWIDTH, period=PERIOD, friction=maybe(FRICTION))
     def for_robot(
         cls,
         robot: Robot,
@@ -81,7 +83,8 @@ class ComputedTorque(ModelLaw):
         kp, kd = self.gains.like(q)
         a = a_ref - kd * (v - v_ref) - kp * self.dynamics.difference(q, q_ref)
         tau = self.dynamics.reference_torque(q, v, v, a)
-        return tau if self.friction is None else tau + self.friction.torque(v_ref)
+        tau = tau if self.friction is None else tau + self.friction.torque(v_ref)
+        return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
 
     def _packed(self, numpy: bool) -> Packed:
         kp, kd = self.gains.value(numpy=numpy)

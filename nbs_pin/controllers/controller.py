@@ -3,7 +3,9 @@
 from abc import ABC, abstractmethod
 from typing import Any
 
+from nbs_pin.base.arguments import a, checked, flag
 from nbs_pin.base.arrays import Array, Vectors
+from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.kernels.layout import Packed
@@ -30,6 +32,7 @@ class Controller(ABC):
         """Whether the law has a compiled form (`packed_law`, `compile`)."""
         return False
 
+    @checked(numpy=flag)
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """Constants and weights of the law in the layout of the kernels (`kernels/layout.py`).
 
@@ -63,4 +66,12 @@ class MemorylessController(Controller):
 
     def step(self, memory: None, q: Vectors, v: Vectors, reference: Reference, period: float) -> tuple[Vectors, None]:
         """`torque` at the present state; memory and period are unused."""
-        return self.torque(q, v, reference.q, reference.v, reference.a), None
+        try:
+            aim = reference.q, reference.v, reference.a
+        except AttributeError as error:
+            raise ArgumentError(f"reference is {told(reference)}, expected a Reference of q, v and a.") from error
+        return self.torque(q, v, *aim), None
+
+
+CONTROLLER = a(Controller, "a control law, such as NeuralBackstepping.for_robot(robot)")
+"""The check of an argument that is a controller."""

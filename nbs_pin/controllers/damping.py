@@ -11,7 +11,18 @@ from array_api_compat import device
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, Matrices, Vectors, array_namespace, is_torch_array, matvec
+from nbs_pin.base.arguments import MOST_JOINTS, SEED, SHARE, WIDTHS, checked, choice, count, flag, maybe, number
+from nbs_pin.base.arrays import (
+    Array,
+    Matrices,
+    Vectors,
+    array_namespace,
+    as_vectors,
+    finite_result,
+    is_torch_array,
+    matvec,
+)
+from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import OUTWARD, Interval, Numbers
 from nbs_pin.base.known_code import defines, known_code
@@ -61,6 +72,16 @@ class Damping(nn.Module):
     scale: torch.Tensor
     ceiling: torch.Tensor | None
 
+    @checked(
+        nv=count(1, MOST_JOINTS, "joints"),
+        form=choice(*DAMPINGS),
+        m=number(above=0.0),
+        widths=WIDTHS,
+        ceiling=maybe(number(above=0.0)),
+        gain=number(least=0.0),
+        least_share=SHARE,
+        seed=SEED,
+    )
     def __init__(
         self,
         nv: int,
@@ -76,16 +97,12 @@ class Damping(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if form not in DAMPINGS:
-            raise ArgumentError(f"damping '{form}' is unknown; choose one of {', '.join(DAMPINGS)}.")
         if (form == "bounded") != (floor is not None):
-            raise ArgumentError(f"damping '{form}' was given floor {floor}; 'bounded' needs one, 'paper' has none.")
-        if not m > 0.0:
-            raise ArgumentError(f"m is {m}; give a positive number, the smallest diagonal entry of T.")
-        if ceiling is not None and (form == "paper" or not 0.0 < ceiling < math.inf):
             raise ArgumentError(
-                f"damping '{form}' was given ceiling {ceiling}; give 'bounded' a positive number or None."
+                f"damping '{form}' was given floor {told(floor)}; 'bounded' needs one, 'paper' has none."
             )
+        if ceiling is not None and form == "paper":
+            raise ArgumentError(f"damping 'paper' was given ceiling {ceiling}; 'bounded' alone has one.")
         self.form, self.m = form, m
         d0 = None if floor is None else positive_definite("the floor D₀", floor)
         self.floor = None if d0 is None else Gain(d0, least_share=least_share, name="the floor D₀")
@@ -105,6 +122,10 @@ class Damping(nn.Module):
 
     def factor(self, x: Vectors) -> Matrices:
         """T at the scaled velocity error x = Rz, lower triangular."""
+        (x,) = as_vectors(self.nv, x=x)
+        return finite_result("T", self._factor(x), x)
+
+    def _factor(self, x: Vectors) -> Matrices:
         xp = array_namespace(x)
         diagonal = self.diagonal.output(x)
         if self.form == "paper":
@@ -119,16 +140,19 @@ class Damping(nn.Module):
 
     def matrix(self, z: Vectors) -> Matrices:
         """D(z)."""
+        (z,) = as_vectors(self.nv, z=z)
         xp = array_namespace(z)
         d0, r = self._constants(numpy=not is_torch_array(z))
-        t = self.factor(r * z) * r
-        return d0 + xp.matrix_transpose(t) @ t
+        t = self._factor(r * z) * r
+        return finite_result("D(z)", d0 + xp.matrix_transpose(t) @ t, z)
 
     def force(self, z: Vectors) -> Vectors:
         """D(z) z [N·m]."""
+        (z,) = as_vectors(self.nv, z=z)
         d0, r = self._constants(numpy=not is_torch_array(z))
-        t = self.factor(r * z)
-        return matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
+        t = self._factor(r * z)
+        force = matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
+        return finite_result("D(z)z", force, z)
 
     @property
     def stretch(self) -> float:
@@ -144,14 +168,18 @@ class Damping(nn.Module):
         """Whether the kernels implement all parts; False for a subclass."""
         return defines(self, "packed") and all(defines(network, "layers") for network in (self.diagonal, self.lower))
 
+    @checked(numpy=flag)
     def packed(self, *, numpy: bool = True) -> Packed:
         """Weights for the kernel of `force` (`kernels/damping.py`), as an array or a differentiable tensor."""
         networks = self.diagonal.layers(numpy=numpy), self.lower.layers(numpy=numpy)
         d0, r = self._constants(numpy=numpy)
         return pack_damping(networks, self.form, self.m, r, d0, None if self.ceiling is None else float(self.ceiling))
 
+    @checked(radius=number(least=0.0))
     def excess(self, radius: float) -> Interval:
         """Bounds of T(z)² for |z| ≤ radius [rad/s], for one joint [N·m·s/rad], by interval arithmetic."""
+        if self.nv != 1:
+            raise ArgumentError(f"Damping.excess is for one joint, and this has {self.nv}; take share.")
         scale = float(self.scale[0])
         x = Interval.cells(scale * radius, _CELLS)
         layers = self.diagonal.layers(numpy=True)
@@ -162,6 +190,7 @@ class Damping(nn.Module):
         limited = Interval(self._limited(square.low), self._limited(square.high))
         return limited.times(scale * scale).widened(OUTWARD)
 
+    @checked(radius=number(least=0.0, most=math.inf))
     def share(self, radius: float) -> float:
         """n with D(z) ⪯ (1 + n) D₀ while zᵀD₀z ≤ radius² [W], for the present weights; inf if there is no D₀.
 

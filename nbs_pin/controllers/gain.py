@@ -1,11 +1,14 @@
 """Trainable gains that stay at or above a share of their initial value."""
 
+import math
+
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import nn
 
+from nbs_pin.base.arguments import SHARE
 from nbs_pin.base.arrays import Array, array_namespace, is_torch_array
-from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.tensors import positive_definite, positive_scale
 
@@ -34,10 +37,11 @@ class Gain(nn.Module):
         self, nominal: Float[Array, " n"] | Float[Array, "n n"], *, least_share: float = 0.0, name: str = "the gain"
     ) -> None:
         super().__init__()
-        if not 0.0 <= least_share < 1.0:
-            raise ArgumentError(f"least_share of {name} is {least_share}; give a number in [0, 1).")
-        matrix = len(nominal.shape) == 2
-        checked = positive_definite(name, nominal) if matrix else positive_scale(name, nominal, len(nominal))
+        SHARE(f"least_share of {name}", least_share)
+        matrix = len(np.shape(nominal)) == 2
+        checked = (
+            positive_definite(name, nominal) if matrix else positive_scale(name, nominal, math.prod(np.shape(nominal)))
+        )
         self.register_buffer("nominal", checked)
         self.register_buffer("least_share", torch.tensor(least_share, dtype=torch.float64))
         self.change = nn.Parameter(torch.zeros(len(checked), dtype=torch.float64))

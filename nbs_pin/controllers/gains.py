@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from torch import nn
 
+from nbs_pin.base.arguments import a
 from nbs_pin.base.arrays import Array, JointArray, is_torch_array
+from nbs_pin.base.checks import SMALLEST, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import Tensors
@@ -37,6 +39,10 @@ class Gains:
     def rate(self) -> JointArray:
         """Diagonal of Λ = ωK⁻¹ [rad/s per N·m]."""
         return self.bandwidth / self.stiffness
+
+
+GAINS = a(Gains, "Gains, as of gains_for_robot")
+"""The check of an argument that is gains."""
 
 
 def gains_for_robot(
@@ -119,16 +125,16 @@ def warn_if_too_fast(robot: Robot, dynamics: DynamicsProvider, bandwidth: float,
             f"at a bandwidth of {bandwidth:g} rad/s joint '{robot.joint_names[worst]}' of {robot.name} needs"
             f" {asked[worst]:.1f} times its effort limit from an error of {start_error} {unit} and may not converge;"
             f" take at most {bandwidth * np.sqrt(6.0 / asked[worst]):.3g} rad/s, or start on the reference.",
-            stacklevel=3,
+            stacklevel=4,  # past the law and the check of its arguments
         )
 
 
 def positive_gains(nv: int, **gains: PerJoint) -> tuple[JointArray, ...]:
     """The gains as float arrays (nv,), single numbers broadcast; raises ArgumentError unless all are positive."""
-    arrays = {name: np.asarray(gain, dtype=float) for name, gain in gains.items()}
+    arrays = {name: floats(name, gain) for name, gain in gains.items()}
     for name, gain in arrays.items():
-        if gain.shape not in ((), (nv,)) or not (gain > 0.0).all():
-            raise ArgumentError(f"{name} is {gain.tolist()}; give one positive number, or {nv}, one per joint.")
+        if gain.shape not in ((), (nv,)) or not (gain >= SMALLEST).all() or not is_usual(gain):
+            raise ArgumentError(f"{name} is {told(gain)}; give one positive number, or {nv}, one per joint.")
     return tuple(np.full(nv, gain) for gain in arrays.values())
 
 

@@ -7,7 +7,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, JointArray, Matrices, Scalars, Vectors, array_namespace, as_vectors, matvec
+from nbs_pin.base.arguments import a
+from nbs_pin.base.arrays import (
+    Array,
+    JointArray,
+    Matrices,
+    Scalars,
+    Vectors,
+    array_namespace,
+    as_vectors,
+    finite_result,
+    matvec,
+)
 from nbs_pin.base.claims import Claim
 from nbs_pin.base.intervals import Interval
 from nbs_pin.controllers.model_law import ModelLaw
@@ -97,16 +108,19 @@ class LyapunovLaw(ModelLaw):
         """V = Φ(z1) + ½z2ᵀM(q)z2 [J], the Lyapunov function of the closed loop."""
         q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
         e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
-        return e.value + 0.5 * _dot(e.z2, matvec(self.dynamics.mass_matrix(q), e.z2))
+        value = e.value + 0.5 * _dot(e.z2, matvec(self.dynamics.mass_matrix(q), e.z2))
+        return finite_result("V", value, q, v, q_ref, v_ref)
 
     def dissipation(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Scalars:
         """−V̇ without disturbance and friction [W]: the sum of `losses`."""
         q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
         in_potential, in_damping = self.losses(q, self._errors(q, v, q_ref, v_ref, 0.0 * v_ref))
-        return in_potential + in_damping
+        return finite_result("−V̇", in_potential + in_damping, q, v, q_ref, v_ref)
 
     def losses(self, q: Array, e: Errors) -> tuple[Scalars, Scalars]:
-        """∇ΦᵀΛ∇Φ and z2ᵀ(ωM + D)z2 − (1 − ζ)z2ᵀ∇Φ [W]."""
+        """∇ΦᵀΛ∇Φ and z2ᵀ(ωM + D)z2 − (1 − ζ)z2ᵀ∇Φ [W] for the signals e = `errors` of states at q."""
+        a(Errors, "the signals that errors returned")("losses: e", e)
+        q, _, _ = as_vectors(self.nv, q=q, z2=e.z2, gradient=e.gradient)
         force = self.inertial_rate * matvec(self.dynamics.mass_matrix(q), e.z2) + self.damping_force(e.z2)
         force = force - (1.0 - self.coupling) * e.gradient
         return _dot(e.gradient, self.rate_like(e.gradient) * e.gradient), _dot(e.z2, force)

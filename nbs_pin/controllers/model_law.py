@@ -4,12 +4,13 @@ from typing import Any
 
 from torch import nn
 
+from nbs_pin.base.arguments import checked, flag
 from nbs_pin.base.arrays import Array
 from nbs_pin.base.known_code import defines
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.kernels.layout import Packed, pack_law
 
 
@@ -26,6 +27,7 @@ class ModelLaw(MemorylessController, nn.Module):
 
     def __init__(self, dynamics: DynamicsProvider, friction: JointFriction | None) -> None:
         super().__init__()
+        MODEL(f"{type(self).__name__}: dynamics", dynamics)
         self.dynamics, self.friction = dynamics, friction_of_size(friction, dynamics.nv)
 
     @property
@@ -40,6 +42,7 @@ class ModelLaw(MemorylessController, nn.Module):
         friction = self.friction is None or type(self.friction) is JointFriction
         return wraps and friction and defines(self, "_packed") and self._has_kernel
 
+    @checked(numpy=flag)
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """Constants and weights for the kernels (`Controller.packed_law`)."""
         return self._packed(numpy) if self.packable else super().packed_law(numpy=numpy)

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, as_vectors
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, SHARE, a, checked, choice, maybe, number
+from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, as_vectors, finite_result
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import first_foreign, known_code
@@ -15,7 +16,7 @@ from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.base.tensors import positive_scale
 from nbs_pin.controllers.damping import Damping
 from nbs_pin.controllers.gain import Gain
-from nbs_pin.controllers.gains import Gains, gains_for_robot, warn_if_too_fast
+from nbs_pin.controllers.gains import GAINS, Gains, gains_for_robot, warn_if_too_fast
 from nbs_pin.controllers.lyapunov_law import Lyapunov, LyapunovLaw
 from nbs_pin.controllers.part_claims import (
     check_kind,
@@ -25,12 +26,12 @@ from nbs_pin.controllers.part_claims import (
     potential_claims,
     rate_claims,
 )
-from nbs_pin.controllers.potential import Potential
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.controllers.potential import POTENTIALS, Potential
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.kernels.layout import LawCode, Packed
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 DAMPINGS = ("inertial", "bounded", "paper")
 
@@ -60,6 +61,12 @@ class NeuralBackstepping(LyapunovLaw):
         ArgumentError: If the numbers of joints differ, or Λ or ω is out of range.
     """
 
+    @checked(
+        dynamics=MODEL,
+        potential=a(Potential, "a Potential"),
+        damping=a(Damping, "a Damping"),
+        inertial_rate=number(least=0.0, unit="1/s"),
+    )
     def __init__(
         self,
         dynamics: DynamicsProvider,
@@ -77,13 +84,24 @@ class NeuralBackstepping(LyapunovLaw):
             raise ArgumentError(
                 f"dynamics, potential and damping have {nv}, {potential.nv} and {damping.nv} joints; make them equal."
             )
-        if not 0.0 <= inertial_rate < np.inf:
-            raise ArgumentError(f"the inertial rate ω is {inertial_rate}; give a number ≥ 0 [1/s].")
         self.potential, self.damping = potential, damping
         self.inertial_rate = inertial_rate
         self.rate = Gain(positive_scale("the rate Λ", rate, nv), least_share=least_share, name="the rate Λ")
 
     @classmethod
+    @checked(
+        robot=ARM,
+        dynamics=maybe(MODEL),
+        bandwidth=BANDWIDTH,
+        period=PERIOD,
+        friction=maybe(FRICTION),
+        potential=choice(*POTENTIALS),
+        damping=choice(*DAMPINGS),
+        gains=maybe(GAINS),
+        damping_ceiling=maybe(number(above=0.0)),
+        least_share=SHARE,
+        seed=SEED,
+    )
     def for_robot(
         cls,
         robot: Robot,
@@ -123,8 +141,6 @@ class NeuralBackstepping(LyapunovLaw):
             >>> law.nv, law.inertial_rate
             (7, 8.0)
         """
-        if damping not in DAMPINGS:
-            raise ArgumentError(f"damping '{damping}' is unknown; choose one of {', '.join(DAMPINGS)}.")
         dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
         chosen = gains_for_robot(robot, dynamics, bandwidth=bandwidth, period=period) if gains is None else gains
         warn_if_too_fast(robot, dynamics, chosen.bandwidth)
@@ -160,7 +176,8 @@ class NeuralBackstepping(LyapunovLaw):
         e = self._errors(q, v, q_ref, v_ref, a_ref)
         feedforward = self.dynamics.reference_torque(q, v, e.v_r, e.a_r - self.inertial_rate * e.z2)
         tau = feedforward - e.gradient - self.damping.force(e.z2)
-        return tau if self.friction is None else tau + self.friction.torque(e.v_r)
+        tau = tau if self.friction is None else tau + self.friction.torque(e.v_r)
+        return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
 
     def potential_terms(self, z1: Array, dz: Array) -> tuple[Array, Array, Array]:
         """Φ(z1) [J], ∇Φ(z1) [N·m] and ∇²Φ(z1) dz of the potential network."""
@@ -231,6 +248,7 @@ class NeuralBackstepping(LyapunovLaw):
         return self._pack(LawCode.BACKSTEPPING, (rate, 0.0 * rate), inertial_rate=self.inertial_rate, **parts)
 
 
+@checked(dynamics=MODEL, m=number(above=0.0), seed=SEED)
 def paper_controller(dynamics: DynamicsProvider, *, m: float = 0.001, seed: int = 0) -> NeuralBackstepping:
     """The paper's controller as set up in its section V-A: S = I, Λ = I, three layers of 32 in ψ, D = TᵀT.
 

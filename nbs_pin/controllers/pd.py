@@ -1,16 +1,16 @@
 """PD control with a model: gravity compensation or PD+ feedforward."""
 
-from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, checked, choice, maybe
+from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors, finite_result
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, stored_gains
 from nbs_pin.controllers.model_law import ModelLaw
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.kernels.layout import LawCode, Packed
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 FEEDFORWARDS = ("gravity", "reference")
 
@@ -36,6 +36,7 @@ class PD(ModelLaw):
         array([81.6, 36.5])
     """
 
+    @checked(feedforward=choice(*FEEDFORWARDS))
     def __init__(
         self,
         dynamics: DynamicsProvider,
@@ -45,13 +46,19 @@ class PD(ModelLaw):
         kd: PerJoint,
         friction: JointFriction | None = None,
     ) -> None:
-        if feedforward not in FEEDFORWARDS:
-            raise ArgumentError(f"feedforward '{feedforward}' is unknown; choose one of {', '.join(FEEDFORWARDS)}.")
         super().__init__(dynamics, friction)
         self.feedforward = feedforward
         self.gains = PositiveGains(dynamics.nv, kp=kp, kd=kd)
 
     @classmethod
+    @checked(
+        robot=ARM,
+        dynamics=maybe(MODEL),
+        bandwidth=BANDWIDTH,
+        period=PERIOD,
+        friction=maybe(FRICTION),
+        feedforward=choice(*FEEDFORWARDS),
+    )
     def for_robot(
         cls,
         robot: Robot,
@@ -87,7 +94,8 @@ class PD(ModelLaw):
             tau = tau + self.dynamics.gravity(q)
         else:
             tau = tau + self.dynamics.reference_torque(q, v, v_ref, a_ref)
-        return tau if self.friction is None else tau + self.friction.torque(v_ref)
+        tau = tau if self.friction is None else tau + self.friction.torque(v_ref)
+        return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
 
     def _packed(self, numpy: bool) -> Packed:
         kp, kd = self.gains.value(numpy=numpy)

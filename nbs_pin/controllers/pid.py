@@ -5,17 +5,29 @@ from typing import NamedTuple
 import numpy as np
 from torch import nn
 
-from nbs_pin.base.arrays import Array, JointArray, Vectors, array_namespace, as_vectors, constant_like, is_torch_array
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, checked, flag, joints, maybe, number
+from nbs_pin.base.arrays import (
+    Array,
+    JointArray,
+    Vectors,
+    array_namespace,
+    as_vectors,
+    constant_like,
+    finite_result,
+    is_torch_array,
+)
+from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.records import Reference
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, positive_gains, stored_gains
+from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, stored_gains
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.kernels.laws import compile_laws, pid
 from nbs_pin.kernels.layout import Packed, pack_pid
-from nbs_pin.robots.robot import Robot, configuration_difference
+from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 
 
 class PIDMemory(NamedTuple):
@@ -52,6 +64,7 @@ class PID(Controller, nn.Module):
         array([666.7, 666.7])
     """
 
+    @checked(filter_time=number(least=0.0, unit="s"), robot=maybe(ARM))
     def __init__(
         self,
         *,
@@ -64,13 +77,15 @@ class PID(Controller, nn.Module):
         robot: Robot | None = None,
     ) -> None:
         super().__init__()
-        nv = np.size(kp)
+        nv = floats("kp", kp).size
         self.gains = PositiveGains(nv, kp=kp, ki=ki, kd=kd)
-        (self.effort_limit,) = positive_gains(nv, effort_limit=effort_limit)
-        if not 0.0 <= filter_time < np.inf:
-            raise ArgumentError(f"filter_time is {filter_time} s; give a finite time ≥ 0.")
+        limit = joints(above=0.0, unit="N·m", infinite=True)("PID: effort_limit", effort_limit)
+        if limit.shape not in ((), (nv,)):
+            raise ArgumentError(f"effort_limit has {limit.size} numbers, expected {nv}; give one per joint.")
+        self.effort_limit = np.full(nv, limit)
         self.filter_time = filter_time
-        self.continuous = np.zeros(nv, dtype=bool) if continuous is None else np.asarray(continuous, dtype=bool)
+        wraps = np.zeros(nv) if continuous is None else floats("continuous", continuous, truths=True)
+        self.continuous = wraps.astype(bool)
         if self.continuous.shape != (nv,):
             raise ArgumentError(f"continuous has {self.continuous.size} entries, expected {nv}: one per joint.")
         if robot is not None and robot.nv != nv:
@@ -78,6 +93,7 @@ class PID(Controller, nn.Module):
         self.robot = robot
 
     @classmethod
+    @checked(robot=ARM, bandwidth=BANDWIDTH, period=PERIOD)
     def for_robot(cls, robot: Robot, *, bandwidth: float = 8.0, period: float = 0.001) -> "PID":
         """Gains of `pd_gains`, integral time 4/ω, and a derivative filter of two periods."""
         kp, kd = pd_gains(robot, PinocchioDynamics(robot), bandwidth=bandwidth, period=period)
@@ -106,6 +122,7 @@ class PID(Controller, nn.Module):
 
     def initial_memory(self, q: Vectors) -> PIDMemory:
         """Zero integral and derivative with the array type of q."""
+        (q,) = as_vectors(self.nv, q=q)
         xp = array_namespace(q)
         return PIDMemory(xp.zeros_like(q), xp.zeros_like(q))
 
@@ -113,13 +130,15 @@ class PID(Controller, nn.Module):
         self, memory: PIDMemory, q: Vectors, v: Vectors, reference: Reference, period: float
     ) -> tuple[Vectors, PIDMemory]:
         """τ [N·m] for the next period [s], and the memory after it; differentiable for tensors."""
+        period, given = PERIOD("period", period), _signals(self.nv, memory, q, v, reference)
+        integral, derivative, q, v, q_ref, v_ref = given
         xp, (kp, ki, kd) = array_namespace(q), self.gains.like(q)
-        z1 = configuration_difference(q, reference.q, self.continuous)
+        z1 = configuration_difference(q, q_ref, self.continuous)
         blend = period / (self.filter_time + period)  # backward Euler for the filter
-        derivative = memory.derivative + blend * (v - reference.v - memory.derivative)
-        tau = -kp * z1 - memory.integral - kd * derivative
+        derivative = derivative + blend * (v - v_ref - derivative)
+        tau = finite_result("the torque", -kp * z1 - integral - kd * derivative, *given)
         winding = (abs(tau) > constant_like(q, self.effort_limit)) & (tau * z1 < 0.0)
-        integral = memory.integral + xp.where(winding, 0.0 * z1, ki * period * z1)
+        integral = integral + xp.where(winding, 0.0 * z1, ki * period * z1)
         return tau, PIDMemory(integral, derivative)
 
     @property
@@ -127,6 +146,7 @@ class PID(Controller, nn.Module):
         """Whether the kernel implements this law: True unless it is a subclass."""
         return defines(self, "packed_law")
 
+    @checked(numpy=flag)
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """Gains, limits, T_f and wrapped joints for the kernel (`Controller.packed_law`)."""
         if not self.packable:
@@ -137,6 +157,17 @@ class PID(Controller, nn.Module):
     def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
         """The law as machine code (`Controller.compile`)."""
         return CompiledPID(self.packed_law()) if self.packable else self
+
+
+def _signals(nv: int, memory: PIDMemory, q: Array, v: Array, reference: Reference) -> tuple[Array, ...]:
+    """Integral, derivative, q, v and the reference's q and v as arrays of one type and shape (..., nv)."""
+    if not isinstance(memory, PIDMemory):
+        raise ArgumentError(f"memory is {told(memory)}, expected what initial_memory or step returned; give that.")
+    try:
+        aim = {"q_ref": reference.q, "v_ref": reference.v}
+    except AttributeError as error:
+        raise ArgumentError(f"reference is {told(reference)}, expected a Reference of q, v and a.") from error
+    return as_vectors(nv, **memory._asdict(), q=q, v=v, **aim)
 
 
 class CompiledPID(Controller):
@@ -157,17 +188,22 @@ class CompiledPID(Controller):
 
     def initial_memory(self, q: Vectors) -> PIDMemory:
         """Zero integral and derivative."""
+        (q,) = as_vectors(self.nv, q=q)
+        if is_torch_array(q):
+            raise ArgumentError("a compiled PID was given torch tensors, expected numpy arrays; call `PID`'s method.")
         return PIDMemory(np.zeros_like(q), np.zeros_like(q))
 
     def step(
         self, memory: PIDMemory, q: Array, v: Array, reference: Reference, period: float
     ) -> tuple[Vectors, PIDMemory]:
         """τ [N·m] for the next period [s], and the memory after it; ArgumentError for tensors or wrong shapes."""
+        if type(period) is not float or not 0.0 < period <= 1000.0:
+            period = PERIOD("period", period)
         if isinstance(q, np.ndarray) and q.ndim == 1:
             out = np.empty((3, self.nv))
             try:
-                fits = pid(*memory, q, v, reference.q, reference.v, float(period), self.weights, out)
-            except TypeError:  # not all contiguous float64 vectors: converted and checked below
+                fits = pid(*memory, q, v, reference.q, reference.v, period, self.weights, out)
+            except (AttributeError, *NOT_TAKEN):  # not all contiguous float64 vectors: converted and checked below
                 fits = False
             if fits:
                 return out[0], PIDMemory(out[1], out[2])
@@ -176,10 +212,10 @@ class CompiledPID(Controller):
     def _steps(
         self, memory: PIDMemory, q: Array, v: Array, reference: Reference, period: float
     ) -> tuple[Vectors, PIDMemory]:
-        given = as_vectors(self.nv, **memory._asdict(), q=q, v=v, q_ref=reference.q, v_ref=reference.v)
+        given = _signals(self.nv, memory, q, v, reference)
         if is_torch_array(given[0]):
             raise ArgumentError("a compiled PID was given torch tensors, expected numpy arrays; call `PID.step`.")
         out = np.empty((3, given[0].size))
-        pid(*(np.array(x, dtype=float).ravel() for x in given), float(period), self.weights, out)
-        tau, integral, derivative = out.reshape(3, *given[0].shape)
+        pid(*(np.array(x, dtype=float).ravel() for x in given), period, self.weights, out)
+        tau, integral, derivative = finite_result("the torque", out, *given).reshape(3, *given[0].shape)
         return tau, PIDMemory(integral, derivative)

@@ -9,7 +9,18 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
-from nbs_pin.base.arrays import Array, JointArray, Scalars, Vectors, array_namespace, is_torch_array, matvec
+from nbs_pin.base.arguments import SEED, SHARE, WIDTHS, a, checked, choice, flag, maybe, number, numbers
+from nbs_pin.base.arrays import (
+    Array,
+    JointArray,
+    Scalars,
+    Vectors,
+    array_namespace,
+    as_vectors,
+    finite_result,
+    is_torch_array,
+    matvec,
+)
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import OUTWARD, Interval
 from nbs_pin.base.known_code import defines, known_code
@@ -64,6 +75,13 @@ class Potential(nn.Module):
 
     scale: torch.Tensor
 
+    @checked(
+        form=choice(*POTENTIALS),
+        widths=WIDTHS,
+        activation=maybe(a(Activation, "an Activation, such as Squareplus()")),
+        least_share=SHARE,
+        seed=SEED,
+    )
     def __init__(
         self,
         stiffness: Float[Array, "n n"],
@@ -76,9 +94,8 @@ class Potential(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if form not in POTENTIALS:
-            raise ArgumentError(f"potential '{form}' is unknown; choose one of {', '.join(POTENTIALS)}.")
-        s, nv = positive_definite("the stiffness S", stiffness), len(stiffness)
+        s = positive_definite("the stiffness S", stiffness)
+        nv = len(s)
         self.form = form
         self.stiffness = Gain(s, least_share=least_share, name="the stiffness S")
         self.register_buffer("scale", positive_scale("the input scale R", scale, nv))
@@ -104,11 +121,13 @@ class Potential(nn.Module):
 
     def terms(self, z: Vectors, dz: Vectors) -> tuple[Scalars, Vectors, Vectors]:
         """Φ(z) [J], ∇Φ(z) [N·m] and ∇²Φ(z) dz with the array type of z."""
+        z, dz = as_vectors(self.nv, z=z, dz=dz)
         xp = array_namespace(z)
         s, r = self.stiffness.like(z), self.scale if is_torch_array(z) else self.scale.numpy(force=True)
         value, gradient, product = self._psi(r * z, r * dz)
         force, force_rate = 2.0 * matvec(s, z), 2.0 * matvec(s, dz)
-        return value + 0.5 * xp.sum(z * force, axis=-1), r * gradient + force, r * product + force_rate
+        energy = finite_result("Φ", value + 0.5 * xp.sum(z * force, axis=-1), z, dz)
+        return energy, r * gradient + force, finite_result("∇²Φ dz", r * product + force_rate, z, dz)
 
     @property
     def is_packable(self) -> bool:
@@ -116,6 +135,7 @@ class Potential(nn.Module):
         activation = self.network.activation
         return defines(self, "packed") and defines(self.network, "layers") and defines(activation, "kernel")
 
+    @checked(numpy=flag)
     def packed(self, *, numpy: bool = True) -> Packed:
         """Weights for the kernel of `terms`, as array or tensor; ArgumentError if the activation has no kernel."""
         activation = self.network.activation
@@ -128,11 +148,14 @@ class Potential(nn.Module):
         packed = pack_potential(layers, activation.kernel, r, self.stiffness.like(r), tangent)
         return subtract_tangent(packed) if self.form == "smooth" and numpy else packed
 
+    @checked(radius=number(least=0.0))
     def curvature(self, radius: float) -> Interval:
         """Bounds of ψ'' for |z| ≤ radius [rad], for one joint [N·m/rad], by interval arithmetic.
 
         For each layer y = σ(a), y' = σ'(a) a', y'' = σ''(a) a'² + σ'(a) a'', with σ and σ' monotone.
         """
+        if self.nv != 1:
+            raise ArgumentError(f"Potential.curvature is for one joint, and this has {self.nv}; take curvature_range.")
         scale, activation = float(self.scale[0]), self.network.activation
         x = Interval.cells(scale * radius, _CELLS)
         one = Interval.of(np.ones_like(x.low))
@@ -146,6 +169,7 @@ class Potential(nn.Module):
             dy, ddy = slope * da, activation.curvature_range(a) * da.squared() + slope * dda
         return ddy.hull().times(scale * scale).widened(OUTWARD)
 
+    @checked(radii=numbers(None, above=0.0))
     def curvature_range(self, radii: JointArray) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:
         """A and B with A ⪯ ∇²ψ(z) ⪯ B while Σ (z_i/radii_i)² ≤ 1 [N·m/rad], by interval arithmetic.
 
@@ -154,6 +178,7 @@ class Potential(nn.Module):
         from those at 0 by at most the largest |g_u| of the ellipsoid, in its norm.
         """
         scale = np.abs(self.scale.numpy(force=True))
+        _of_joints(self.nv, radii=radii)
         tape = self._tape(scale * radii)
         shape = (len(scale), len(scale))
         known, unknown, lam = [np.zeros(shape), np.zeros(shape)], np.zeros(shape), Interval.of(np.ones(1))
@@ -165,6 +190,7 @@ class Potential(nn.Module):
             lam = (lam * unit.slope).through(unit.wy.T)
         return self._widened(scale, known, unknown.sum(axis=1))  # |x|ᵀU|x| ≤ Σ (U1)_i x_i² for U ≥ 0
 
+    @checked(radii=numbers(None, above=0.0), weights=numbers(None, above=0.0))
     def curvature_rate(self, radii: JointArray, weights: JointArray) -> float:
         """L with |xᵀ(∇²ψ(z) − ∇²ψ(z'))y| ≤ L‖x‖‖y‖‖z − z'‖ where `curvature_range` holds, ‖x‖² = Σ weights_i x_i².
 
@@ -172,6 +198,7 @@ class Potential(nn.Module):
         D³y = σ'''(Da)³ + 3σ''Da D²a + σ'D³a, where weights ≥ 0 pass norms on.
         """
         scale, activation = np.abs(self.scale.numpy(force=True)), self.network.activation
+        _of_joints(self.nv, radii=radii, weights=weights)
         second, third = np.zeros((2, 0))
         for unit in self._tape(scale * radii):
             first = np.linalg.norm(np.maximum(-unit.da.low, unit.da.high) * scale / np.sqrt(weights), axis=1)
@@ -218,3 +245,10 @@ class Potential(nn.Module):
         gradient_0 = gradients[1]
         psi = values[0] - values[1] - xp.sum(gradient_0 * x, axis=-1)
         return psi, gradients[0] - gradient_0, products[0]
+
+
+def _of_joints(nv: int, **vectors: JointArray) -> None:
+    """Raise ArgumentError unless each vector has a number per joint."""
+    for name, x in vectors.items():
+        if x.shape != (nv,):
+            raise ArgumentError(f"{name} has {x.size} numbers, expected {nv}; give one per joint.")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, checked, joints, maybe
 from nbs_pin.base.arrays import Array, Matrices, Vectors, array_namespace, as_vectors, constant_like
 from nbs_pin.base.claims import Claim, known, refuse
 from nbs_pin.base.intervals import Interval
@@ -15,10 +16,10 @@ from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, effective_inertia, positive_gains, stored_gains
 from nbs_pin.controllers.lyapunov_law import Lyapunov
 from nbs_pin.controllers.slotine_li import SlotineLi
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.robots.robot import Robot
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
+from nbs_pin.robots.robot import ARM, Robot
 
 
 def _stored(t: Tensors) -> Mapping[str, Any]:
@@ -64,6 +65,14 @@ class SlidingMode(SlotineLi):
         (self.boundary,) = positive_gains(dynamics.nv, boundary=boundary)
 
     @classmethod
+    @checked(
+        robot=ARM,
+        dynamics=maybe(MODEL),
+        bandwidth=BANDWIDTH,
+        period=PERIOD,
+        friction=maybe(FRICTION),
+        switching=joints(above=0.0, unit="N·m"),
+    )
     def for_robot(
         cls,
         robot: Robot,
@@ -77,7 +86,7 @@ class SlidingMode(SlotineLi):
         """λ and K of `SlotineLi.for_robot`, and a boundary layer with η/ε = ¼M_e/h, wide enough to avoid chatter."""
         model = PinocchioDynamics(robot) if dynamics is None else dynamics
         law = SlotineLi.for_robot(robot, model, bandwidth=bandwidth, period=period)
-        boundary = 4.0 * period * np.asarray(switching) / effective_inertia(robot, model)
+        boundary = 4.0 * period * switching / effective_inertia(robot, model)
         gains = {"rate": law.rate, "gain": law.gain, "switching": switching, "boundary": boundary}
         return cls(model, **gains, friction=friction)
 
@@ -90,10 +99,12 @@ class SlidingMode(SlotineLi):
 
     def damping_force(self, z2: Array) -> Vectors:
         """K z2 + η tanh(z2/ε) [N·m]."""
+        (z2,) = as_vectors(self.nv, z2=z2)
         return super().damping_force(z2) + self._switched(z2)
 
     def damping_matrix(self, z2: Array) -> Matrices:
         """K + diag(η tanh(z2/ε)/z2) [N·m·s/rad]."""
+        (z2,) = as_vectors(self.nv, z2=z2)
         xp, (steepest,) = array_namespace(z2), self.switching.like(z2)
         x = z2 / constant_like(z2, self.boundary)
         small = abs(x) < 1e-6

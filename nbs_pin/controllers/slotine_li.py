@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, array_namespace, as_vectors
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, checked, maybe
+from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, array_namespace, as_vectors, finite_result
 from nbs_pin.base.claims import Claim, known
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import foreign_code, known_code
@@ -18,11 +19,11 @@ from nbs_pin.controllers.gains import (
 )
 from nbs_pin.controllers.lyapunov_law import Lyapunov, LyapunovLaw
 from nbs_pin.controllers.part_claims import check_parts, friction_claims, positive_gain
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.kernels.layout import LawCode, Packed
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 
 @known_code
@@ -56,6 +57,7 @@ class SlotineLi(LyapunovLaw):
         self.gains = PositiveGains(dynamics.nv, rate=rate, gain=gain)
 
     @classmethod
+    @checked(robot=ARM, dynamics=maybe(MODEL), bandwidth=BANDWIDTH, period=PERIOD, friction=maybe(FRICTION))
     def for_robot(
         cls,
         robot: Robot,
@@ -89,20 +91,25 @@ class SlotineLi(LyapunovLaw):
         v_r = v_ref - rate * self.dynamics.difference(q, q_ref)
         a_r = a_ref - rate * (v - v_ref)
         tau = self.dynamics.reference_torque(q, v, v_r, a_r) - gain * (v - v_r)
-        return tau if self.friction is None else tau + self.friction.torque(v_r)
+        tau = tau if self.friction is None else tau + self.friction.torque(v_r)
+        return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
 
     def potential_terms(self, z1: Array, dz: Array) -> tuple[Array, Array, Array]:
         """z1ᵀλKz1 [J], 2λKz1 [N·m] and 2λK dz."""
+        z1, dz = as_vectors(self.nv, z1=z1, dz=dz)
         rate, gain = self.gains.like(z1)
         gradient = 2.0 * rate * gain * z1
-        return 0.5 * array_namespace(z1).sum(gradient * z1, axis=-1), gradient, 2.0 * rate * gain * dz
+        value = finite_result("Φ", 0.5 * array_namespace(z1).sum(gradient * z1, axis=-1), z1)
+        return value, gradient, finite_result("∇²Φ dz", 2.0 * rate * gain * dz, dz)
 
     def damping_force(self, z2: Array) -> Vectors:
         """K z2 [N·m]."""
-        return self.gains.like(z2)[1] * z2
+        (z2,) = as_vectors(self.nv, z2=z2)
+        return finite_result("K z2", self.gains.like(z2)[1] * z2, z2)
 
     def damping_matrix(self, z2: Array) -> Matrices:
         """K [N·m·s/rad]."""
+        (z2,) = as_vectors(self.nv, z2=z2)
         xp, gain = array_namespace(z2), self.gains.like(z2)[1]
         return xp.eye(self.nv, dtype=z2.dtype) * gain + 0.0 * z2[..., None]
 

@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import Array, Scalars, array_namespace
+from nbs_pin.base.arguments import checked, many, maybe, number
+from nbs_pin.base.arrays import Array, Scalars, array_namespace, as_vectors, finite_result
 from nbs_pin.base.claims import Claim, Label, refuse
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.known_code import known_code
@@ -12,7 +13,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.structure import POSITIVE, ROUNDING, ModelClaims, quadratic
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import Link, pack_tree
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 
 @known_code
@@ -32,6 +33,12 @@ class AnalyticDynamics(DynamicsProvider):
         array([29.4,  9.8])
     """
 
+    @checked(
+        masses=many(number(above=0.0, least=1e-30, most=1e30, unit="kg"), 2, 2, "masses"),
+        lengths=many(number(above=0.0, least=1e-30, most=1e30, unit="m"), 2, 2, "lengths"),
+        gravity=number(least=-1e30, most=1e30, unit="m/s²"),
+        robot=maybe(ARM),
+    )
     def __init__(
         self,
         masses: tuple[float, float] = (1.0, 1.0),
@@ -39,12 +46,6 @@ class AnalyticDynamics(DynamicsProvider):
         gravity: float = 9.8,
         robot: Robot | None = None,
     ) -> None:
-        numbers = np.array([*masses, *lengths])
-        if not (np.isfinite([*numbers, gravity]).all() and (numbers > 0.0).all()):
-            raise ArgumentError(
-                f"masses {masses} kg, lengths {lengths} m, gravity {gravity} m/s² were given, expected finite numbers;"
-                " masses and lengths must be positive."
-            )
         (m1, m2), (l1, l2) = masses, lengths
         self._robot, self.masses, self.lengths, self.gravity_constant = robot, masses, lengths, gravity
         self._shoulder = (m1 + m2) * l1 * l1  # inertia of both masses at the elbow about the shoulder
@@ -64,6 +65,7 @@ class AnalyticDynamics(DynamicsProvider):
 
     def mass_matrix(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2 2"]:
         """M(q) [kg·m²]."""
+        (q,) = as_vectors(2, q=q)
         xp = array_namespace(q)
         coupling = self._coupling * xp.cos(q[..., 1])
         forearm = self._forearm + xp.zeros_like(coupling)
@@ -73,15 +75,17 @@ class AnalyticDynamics(DynamicsProvider):
 
     def coriolis_matrix(self, q: Float[Array, "*batch 2"], v: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2 2"]:
         """C(q, v) [N·m·s], the Christoffel matrix of M."""
+        q, v = as_vectors(2, q=q, v=v)
         xp = array_namespace(q)
         h = self._coupling * xp.sin(q[..., 1])
         v1, v2 = v[..., 0], v[..., 1]
         upper = xp.stack([-h * v2, -h * (v1 + v2)], axis=-1)
         lower = xp.stack([h * v1, 0.0 * h * v1], axis=-1)
-        return xp.stack([upper, lower], axis=-2)
+        return finite_result("C(q, v)", xp.stack([upper, lower], axis=-2), q, v)
 
     def gravity(self, q: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
         """G(q) [N·m]."""
+        (q,) = as_vectors(2, q=q)
         xp = array_namespace(q)
         elbow = self._weights[1] * xp.cos(q[..., 0] + q[..., 1])
         return xp.stack([self._weights[0] * xp.cos(q[..., 0]) + elbow, elbow], axis=-1)
@@ -114,5 +118,6 @@ class AnalyticDynamics(DynamicsProvider):
 
     def potential_energy(self, q: Float[Array, "*batch 2"]) -> Scalars:
         """V(q) [J], zero with the arm horizontal."""
+        (q,) = as_vectors(2, q=q)
         xp = array_namespace(q)
         return self._weights[0] * xp.sin(q[..., 0]) + self._weights[1] * xp.sin(q[..., 0] + q[..., 1])

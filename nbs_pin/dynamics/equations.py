@@ -1,9 +1,11 @@
 """The equations of motion of any `DynamicsProvider`, with checks of the shapes (docs/theory.md §1)."""
 
-from nbs_pin.base.arrays import Array, Scalars, Vectors, array_namespace, as_vectors, matvec
-from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.base.arguments import checked
+from nbs_pin.base.arrays import Array, Scalars, Vectors, array_namespace, as_vectors, finite_result, matvec
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 
 
+@checked(dynamics=MODEL)
 def reference_torque(dynamics: DynamicsProvider, q: Array, v: Array, v_r: Array, a_r: Array) -> Vectors:
     """M(q) a_r + C(q, v) v_r + G(q) [N·m], for a reference velocity v_r [rad/s] and acceleration a_r [rad/s²].
 
@@ -18,6 +20,7 @@ def reference_torque(dynamics: DynamicsProvider, q: Array, v: Array, v_r: Array,
     return dynamics.reference_torque(*as_vectors(dynamics.nv, q=q, v=v, v_r=v_r, a_r=a_r))
 
 
+@checked(dynamics=MODEL)
 def inverse_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, a: Array) -> Vectors:
     """τ = M(q) a + C(q, v) v + G(q) [N·m], the torque that produces the acceleration a [rad/s²].
 
@@ -30,6 +33,7 @@ def inverse_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, a: Array) -
     return dynamics.reference_torque(q, v, v, a)
 
 
+@checked(dynamics=MODEL)
 def forward_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, tau: Array) -> Vectors:
     """v̇ = M(q)⁻¹(τ − C(q, v) v − G(q)) [rad/s²], the acceleration produced by the torque τ [N·m].
 
@@ -41,18 +45,22 @@ def forward_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, tau: Array)
     return dynamics.forward_dynamics(*as_vectors(dynamics.nv, q=q, v=v, tau=tau))
 
 
+@checked(dynamics=MODEL)
 def bias(dynamics: DynamicsProvider, q: Array, v: Array) -> Vectors:
     """C(q, v) v + G(q) [N·m]: the torque that keeps the velocity constant."""
     q, v = as_vectors(dynamics.nv, q=q, v=v)
     return dynamics.reference_torque(q, v, v, 0.0 * v)
 
 
+@checked(dynamics=MODEL)
 def kinetic_energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
     """½ vᵀM(q)v [J]."""
     q, v = as_vectors(dynamics.nv, q=q, v=v)
-    return 0.5 * array_namespace(v).sum(v * matvec(dynamics.mass_matrix(q), v), axis=-1)
+    value = 0.5 * array_namespace(v).sum(v * matvec(dynamics.mass_matrix(q), v), axis=-1)
+    return finite_result("the kinetic energy", value, q, v)
 
 
+@checked(dynamics=MODEL)
 def energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
     """E = ½ vᵀM(q)v + V(q) [J]; dE/dt = vᵀτ along every motion."""
     q, v = as_vectors(dynamics.nv, q=q, v=v)

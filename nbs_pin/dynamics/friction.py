@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, constant_like
+from nbs_pin.base.arguments import a, check_fields, checked, maybe, number
+from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors, constant_like
+from nbs_pin.base.checks import floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.base.storable import storable
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 
 @known_code
@@ -36,30 +38,36 @@ class JointFriction:
 
     def __post_init__(self) -> None:
         for name in ("viscous", "coulomb"):
-            object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=float)))
-            value = getattr(self, name)
-            if value.ndim != 1 or not (np.isfinite(value).all() and (value >= 0.0).all()):
-                raise ArgumentError(f"{name} friction is {value.tolist()}; give finite numbers ≥ 0, one per joint.")
+            value = np.atleast_1d(floats(f"JointFriction: {name}", getattr(self, name)))
+            if value.ndim != 1 or value.size == 0 or not (is_usual(value) and (value >= 0.0).all()):
+                raise ArgumentError(f"{name} friction is {told(value)}; give finite numbers ≥ 0, one per joint.")
+            object.__setattr__(self, name, value)
         if self.viscous.shape != self.coulomb.shape:
             raise ArgumentError(
                 f"viscous has {self.viscous.size} joints and coulomb {self.coulomb.size}; give one number per joint."
             )
-        if not 0.0 < self.transition < np.inf:
-            raise ArgumentError(f"transition is {self.transition} rad/s, expected a finite speed > 0; 0.01 is usual.")
+        check_fields(self, transition=number(above=0.0, unit="rad/s"))
 
     @classmethod
+    @checked(robot=ARM)
     def of(cls, robot: Robot, transition: float = 0.01) -> "JointFriction":
         """Friction from the URDF of the robot (`<dynamics damping friction>`), zero where it has none."""
         return cls(robot.damping, robot.friction, transition)
 
     def torque(self, v: Vectors) -> Vectors:
         """Friction torque [N·m] at the velocity v [rad/s], with the array type of v (numpy or torch)."""
+        (v,) = as_vectors(self.viscous.size, v=v)
         viscous, coulomb = constant_like(v, self.viscous), constant_like(v, self.coulomb)
         return viscous * v + coulomb * array_namespace(v).tanh(v / self.transition)
 
 
+FRICTION = a(JointFriction, "a JointFriction, such as JointFriction.of(robot)")
+"""The check of an argument that is joint friction."""
+
+
 def friction_of_size(friction: JointFriction | None, nv: int) -> JointFriction | None:
-    """Return the friction; raise ArgumentError unless it is None or has nv joints."""
+    """Return the friction; raise ArgumentError unless it is None or a JointFriction of nv joints."""
+    maybe(FRICTION)("friction", friction)
     if friction is not None and friction.viscous.size != nv:
         raise ArgumentError(
             f"the friction is for {friction.viscous.size} joints, the arm has {nv}; give one per joint."

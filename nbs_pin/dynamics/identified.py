@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
+from nbs_pin.base.arguments import checked
 from nbs_pin.base.arrays import Array
 from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError
@@ -18,7 +19,7 @@ from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
 from nbs_pin.dynamics.structure import ModelClaims, rigid_tree_claims
 from nbs_pin.kernels.layout import Packed
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 _ROUNDING = 1e-9
 """Allowance for rounding in the smallest eigenvalue of J, scaled to a unit diagonal."""
@@ -41,6 +42,7 @@ class IdentifiedDynamics(PinocchioDynamics):
         ArgumentError: For a wrong number of joints, a body that is not physically consistent, or rotor inertia < 0.
     """
 
+    @checked(robot=ARM)
     def __init__(
         self,
         robot: Robot,

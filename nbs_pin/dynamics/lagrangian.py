@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, is_torch_array
+from nbs_pin.base.arguments import a, checked, maybe
+from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, finite_result, is_torch_array
 from nbs_pin.base.claims import refuse
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
@@ -21,7 +22,7 @@ from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import tree_workspace
 from nbs_pin.kernels.trees import tree_accelerations
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 
 @known_code
@@ -43,6 +44,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
 
     network: LagrangianNetwork
 
+    @checked(network=a(LagrangianNetwork, "a network, such as fit(data).network"), robot=maybe(ARM))
     def __init__(
         self,
         network: LagrangianNetwork,
@@ -94,7 +96,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         if is_torch_array(vectors[0]) or self._machine_code is None:
             return self._evaluate(self.network.torque, q=q, v=v, v_r=v_r, a_r=a_r)
         rows = (np.ascontiguousarray(x).reshape(-1, self.nv) for x in vectors)
-        return self._machine_code(*rows).reshape(vectors[0].shape)
+        return finite_result("the torque", self._machine_code(*rows), *vectors).reshape(vectors[0].shape)
 
     def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ [rad/s²] under the torque τ [N·m], for numpy arrays by machine code where the network is a rigid tree."""
@@ -105,12 +107,13 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         rows = [np.ascontiguousarray(x).reshape(-1, self.nv) for x in vectors]
         a, factor = np.empty(rows[0].shape), np.empty((self.nv, self.nv))
         tree_accelerations(*rows, *tree, np.empty(tree_workspace(tree)), factor, a)
-        return a.reshape(vectors[0].shape)
+        return finite_result("the acceleration", a, *vectors).reshape(vectors[0].shape)
 
     def packed_tree(self) -> Packed | None:
         """The network as a rigid tree, or None; None for a subclass, which may change equations."""
         return self._tree if type(self) is LagrangianDynamics else None
 
+    @checked(robot=ARM)
     def suits(self, robot: Robot) -> bool:
         """Whether the joints of the network match those of the robot."""
         return self.network.suits(robot.parents, robot.prismatic)
@@ -140,7 +143,14 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         # The same array becomes the same tensor, since `torque` is cheaper when w is v.
         tensors = {id(x): torch.from_numpy(np.array(x)).to(device) for x in vectors}
         with torch.no_grad():
-            return function(*(tensors[id(x)] for x in vectors)).numpy(force=True)
+            try:
+                result = function(*(tensors[id(x)] for x in vectors)).numpy(force=True)
+            except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+                names = ", ".join(arguments)
+                raise ArgumentError(
+                    f"the model has no M ≻ 0 for these {names} ({error!s:.80}); give others."
+                ) from error
+        return finite_result("the result", result, *vectors)
 
 
 def _forget_machine_code(module: nn.Module, keys: Any) -> None:

@@ -7,7 +7,8 @@ from typing import TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, is_torch_array, over_rows
+from nbs_pin.base.arguments import checked
+from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, finite_result, is_torch_array, over_rows
 from nbs_pin.base.claims import refuse
 from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.storable import storable
@@ -15,7 +16,7 @@ from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.structure import ModelClaims, rigid_tree_claims
 from nbs_pin.kernels.layout import Packed
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 Row: TypeAlias = np.ndarray
 
@@ -45,6 +46,7 @@ class PinocchioDynamics(DynamicsProvider):
         array([29.4,  9.8])
     """
 
+    @checked(robot=ARM)
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._model = robot.model
@@ -115,8 +117,8 @@ class PinocchioDynamics(DynamicsProvider):
 
             return differentiable(quantity.value, quantity.vjp, *vectors)
         if vectors[0].ndim == 1:
-            return quantity.value(*vectors)
-        return over_rows(quantity.value, *vectors)
+            return finite_result("the result", quantity.value(*vectors), *vectors)
+        return finite_result("the result", over_rows(quantity.value, *vectors), *vectors)
 
     # Values at one state.
 

@@ -2,10 +2,11 @@
 
 from abc import ABC, abstractmethod
 
-from nbs_pin.base.arrays import Matrices, Scalars, Vectors, array_namespace, matvec
+from nbs_pin.base.arguments import a, checked
+from nbs_pin.base.arrays import Matrices, Scalars, Vectors, array_namespace, as_vectors, finite_result, matvec
 from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
-from nbs_pin.robots.robot import Robot, configuration_difference
+from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 
 
 class DynamicsProvider(ABC):
@@ -44,16 +45,20 @@ class DynamicsProvider(ABC):
 
     def difference(self, q: Vectors, q_ref: Vectors) -> Vectors:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on the continuous joints of `robot`."""
+        q, q_ref = as_vectors(self.nv, q=q, q_ref=q_ref)
         return configuration_difference(q, q_ref, None if self.robot is None else self.robot.continuous)
 
     def reference_torque(self, q: Vectors, v: Vectors, v_r: Vectors, a_r: Vectors) -> Vectors:
         """M(q) a_r + C(q, v) v_r + G(q) [N·m], all that a passivity-based law needs (docs/theory.md §1)."""
-        return matvec(self.mass_matrix(q), a_r) + matvec(self.coriolis_matrix(q, v), v_r) + self.gravity(q)
+        q, v, v_r, a_r = as_vectors(self.nv, q=q, v=v, v_r=v_r, a_r=a_r)
+        tau = matvec(self.mass_matrix(q), a_r) + matvec(self.coriolis_matrix(q, v), v_r) + self.gravity(q)
+        return finite_result("the torque", tau, q, v, v_r, a_r)
 
     def packed_tree(self) -> Packed | None:
         """The model as a rigid tree for the kernels (`kernels/trees.py`), or None if it is not a rigid tree."""
         return None
 
+    @checked(robot=ARM)
     def suits(self, robot: Robot) -> bool:
         """Whether the joints of the model match those of the robot, as far as the model states them."""
         return True
@@ -70,5 +75,11 @@ class DynamicsProvider(ABC):
 
     def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ = M⁻¹(τ − C v − G) [rad/s²]."""
+        q, v, tau = as_vectors(self.nv, q=q, v=v, tau=tau)
         net = tau - matvec(self.coriolis_matrix(q, v), v) - self.gravity(q)
-        return array_namespace(net).linalg.solve(self.mass_matrix(q), net[..., None])[..., 0]
+        a = array_namespace(net).linalg.solve(self.mass_matrix(q), net[..., None])[..., 0]
+        return finite_result("the acceleration", a, q, v, tau)
+
+
+MODEL = a(DynamicsProvider, "a model of the arm, such as PinocchioDynamics(robot)")
+"""The check of an argument that is a model."""

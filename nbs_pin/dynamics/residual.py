@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import nn
 
+from nbs_pin.base.arguments import a
 from nbs_pin.base.arrays import Matrices, Scalars, Vectors, matvec
 from nbs_pin.base.claims import Claim, refuse
 from nbs_pin.base.exceptions import ArgumentError
@@ -138,6 +139,9 @@ class ResidualNetwork(CholeskyNetwork):
         return self.share * mass + (1.0 - self.share) * factor @ factor.mT
 
 
+NETWORK = a(ResidualNetwork, "a ResidualNetwork")
+
+
 @known_code
 @storable(("report",), parts=("network", "friction"))
 class ResidualDynamics(LagrangianDynamics):
@@ -147,6 +151,7 @@ class ResidualDynamics(LagrangianDynamics):
     """
 
     def __init__(self, network: ResidualNetwork, friction: JointFriction | None = None, report: Any = None) -> None:
+        NETWORK("ResidualDynamics: network", network)
         super().__init__(network, network.nominal.robot, friction, report)
 
     @property

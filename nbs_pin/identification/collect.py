@@ -8,20 +8,21 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
+from nbs_pin.base.arguments import SEED, a, checked, choice, count, either, flag, maybe, number
 from nbs_pin.base.arrays import Array, Vectors
-from nbs_pin.base.checks import positive, whole
+from nbs_pin.base.checks import whole
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.controllers.pd import PD
 from nbs_pin.dynamics.equations import inverse_dynamics
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import configuration_box, excitation, soft_pd, torque_limits, work
 from nbs_pin.identification.measurement import CLEAN_WINDOW, QUANTISED_WINDOW, Noise, derivative, quantised
 from nbs_pin.motions.references import DesiredMotion, Hold
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 from nbs_pin.simulation.simulate import simulate
 
@@ -35,6 +36,19 @@ _TIMED = ("excited", "reference")
 _TRAJECTORIES = 20
 
 
+@checked(
+    robot=ARM,
+    recipe=choice(*get_args(Recipe)),
+    samples=count(1, 10_000_000),
+    seed=SEED,
+    noise=maybe(a(Noise, "Noise, such as Noise(encoder=2**-16)")),
+    acceleration=maybe(choice(*get_args(Acceleration))),
+    friction=either(FRICTION, flag),
+    sampling=maybe(number(least=RECORD_STEP, most=10.0, unit="s")),
+    duration=number(above=0.0, most=1000.0, unit="s"),
+    speed=number(above=0.0, most=1000.0, unit="rad/s"),
+    progress=flag,
+)
 def collect(
     robot: Robot,
     recipe: str = "excited",
@@ -82,7 +96,7 @@ def collect(
         Dataset(100 samples of two_link, 100 trajectories, 2 joints)
     """
     noise = noise or Noise()
-    _check(recipe, samples, speed, noise, acceleration)
+    _check(recipe, noise, acceleration)
     acting = JointFriction.of(robot) if friction is True else friction or None
     interval = _interval(recipe, samples, sampling, duration)
     stride = whole(interval, RECORD_STEP, "sampling", "step of the record")
@@ -214,7 +228,6 @@ def _states(bench: _Bench, samples: int, speed: float, generator: np.random.Gene
 
 def _interval(recipe: str, samples: int, sampling: float | None, duration: float) -> float:
     """Time between samples [s]: `sampling`, or the default of the recipe."""
-    positive("duration", duration, "s")
     if sampling is None:
         spread = round(_TRAJECTORIES * duration / samples / RECORD_STEP)
         sampling = RECORD_STEP * (1 if recipe == "passive" else min(max(spread, 10), 50))
@@ -229,14 +242,7 @@ def _shares(samples: int, longest: int) -> list[int]:
     return np.diff(np.linspace(0, samples, count + 1).astype(int)).tolist()
 
 
-def _check(recipe: str, samples: int, speed: float, noise: Noise, acceleration: str | None) -> None:
-    if recipe not in get_args(Recipe):
-        raise ArgumentError(f"recipe '{recipe}' is unknown; give one of {', '.join(get_args(Recipe))}.")
-    if acceleration is not None and acceleration not in get_args(Acceleration):
-        raise ArgumentError(f"acceleration '{acceleration}' is unknown; give 'simulator' or 'differentiated'.")
-    if samples < 1 or samples != int(samples):
-        raise ArgumentError(f"samples is {samples}, expected a whole number ≥ 1; correct it.")
-    positive("speed", speed, "rad/s")
+def _check(recipe: str, noise: Noise, acceleration: str | None) -> None:
     if noise.encoder > 0.0 and acceleration == "simulator":
         raise ArgumentError("acceleration 'simulator' excludes rounded encoders; leave acceleration out.")
     if recipe == "uniform" and (noise.encoder > 0.0 or acceleration == "differentiated"):

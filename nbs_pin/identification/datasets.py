@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nbs_pin.base.archives import parse_json
-from nbs_pin.base.checks import floats
+from nbs_pin.base.arguments import SEED, a, check_fields, checked, mapping, number, readable, text, writable
+from nbs_pin.base.checks import LARGEST, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 
@@ -68,6 +69,7 @@ class Dataset:
     """Origin of the data (recipe, seed, noise, friction, …), JSON-serialisable."""
 
     def __post_init__(self) -> None:
+        check_fields(self, robot=text, about=mapping)
         for names, kind in _KINDS.items():
             for name in names:
                 object.__setattr__(self, name, _array(name, getattr(self, name), kind))
@@ -97,14 +99,13 @@ class Dataset:
         """Number of trajectories."""
         return int(np.unique(self.trajectory).size)
 
+    @checked(share=number(above=0.0, below=1.0), seed=SEED)
     def split(self, share: float = 0.2, seed: int = 0) -> tuple["Dataset", "Dataset"]:
         """Split by whole trajectories into training data and held-out data, about `share` and at least one; at random.
 
         Raises:
             ArgumentError: If share is outside (0, 1) or there is only one trajectory.
         """
-        if not 0.0 < share < 1.0:
-            raise ArgumentError(f"share is {share}, expected a number between 0 and 1; 0.2 is usual.")
         ids = np.unique(self.trajectory)
         if ids.size < 2:
             raise ArgumentError(f"{self!r} cannot be split: it has only one trajectory; collect several.")
@@ -114,9 +115,15 @@ class Dataset:
 
     def take(self, rows: Any) -> "Dataset":
         """The samples selected by the numpy index `rows` (a slice, a mask, or increasing indices)."""
-        index = np.arange(len(self))[rows]
+        try:
+            index = np.arange(len(self))[rows if isinstance(rows, slice) else np.asarray(rows)]
+        except (IndexError, ValueError, TypeError, OverflowError, RuntimeError) as error:
+            raise ArgumentError(
+                f"rows is {told(rows)}, expected a slice, a mask or indices; {error!s:.100}."
+            ) from error
         return replace(self, **{name: getattr(self, name)[index] for name in (*_STATES, "t", "trajectory")})
 
+    @checked(path=writable)
     def save(self, path: str | Path) -> None:
         """Write an npz file atomically; missing folders are created.
 
@@ -131,6 +138,11 @@ class Dataset:
         write_npz(path, {"format": np.array(DATASET_FORMAT), **arrays, "about": np.array(about)})
 
 
+DATA = a(Dataset, "a Dataset, as collect or load_log returns it")
+"""The check of an argument that is data."""
+
+
+@checked(path=readable)
 def load_dataset(path: str | Path) -> Dataset:
     """Load an npz file written by `Dataset.save`; `load_log` reads other logs.
 
@@ -170,12 +182,12 @@ def _fault(data: Dataset) -> str:
 
 def _array(name: str, value: Any, kind: type) -> np.ndarray:
     """The values as an array of that type, uncopied if it is one; nothing is rounded to a whole number or a bool."""
-    numbers = floats(f"the dataset's {name}", value)
+    numbers = floats(f"the dataset's {name}", value, truths=kind is not np.float64)
     with np.errstate(invalid="ignore"):  # NaN cast to an integer is refused below
         array: np.ndarray = np.asarray(value).astype(kind, copy=False)
     if kind is not np.float64 and not np.array_equal(array, numbers):
         expected = "whole numbers" if kind is np.int64 else "true or false for every joint"
-        raise ArgumentError(f"the dataset's {name} is {value!s:.200}, expected {expected}; correct it.")
+        raise ArgumentError(f"the dataset's {name} is {told(value)}, expected {expected}; correct it.")
     return array
 
 
@@ -196,6 +208,8 @@ def _number_fault(arrays: Mapping[str, np.ndarray]) -> str:
             at = np.argwhere(~np.isfinite(arrays[name]))[0]
             joint = f", joint {at[1] + 1}" if at.size > 1 else ""
             return f"{name} of sample {at[0] + 1}{joint} is {arrays[name][tuple(at)]}; leave that sample out"
+        if not is_usual(arrays[name]):
+            return f"{name} reaches {np.abs(arrays[name]).max():.3g}, expected at most {LARGEST:g}; correct its unit"
     return ""
 
 

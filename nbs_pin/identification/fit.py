@@ -6,18 +6,19 @@ from typing import Any
 
 import numpy as np
 
+from nbs_pin.base.arguments import SEED, checked, either, flag, maybe, number, text
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.registry import entry
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.compatibility import arm_fault, other_data_fault
-from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.datasets import DATA, Dataset
 from nbs_pin.identification.doubts import doubts
 from nbs_pin.identification.fit_report import FitReport, torque_nmse, zero_torque_nmse
 from nbs_pin.identification.fitters import FitTask
 from nbs_pin.identification.identify import sign_fault
 from nbs_pin.identification.registry import MODELS
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 _USELESS = 0.9
 """Torque nMSE above which a model is reported as useless."""
@@ -25,6 +26,15 @@ HELD_OUT = 0.2
 """Share of the trajectories that `fit` holds out by default."""
 
 
+@checked(
+    data=DATA,
+    model=text,
+    seed=SEED,
+    robot=maybe(ARM),
+    held_out=maybe(either(DATA, number(least=0.0, below=1.0))),
+    friction=flag,
+    progress=flag,
+)
 def fit(
     data: Dataset,
     model: str = "chain",

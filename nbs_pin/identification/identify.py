@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arguments import checked, flag, number
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.checks import positive
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pseudo_inertia import PARAMETERS_OF_COORDINATES, coordinates, inertial_parameters
 from nbs_pin.identification.compatibility import arm_fault
 from nbs_pin.identification.consistent_fit import ConsistentFit, consistent_fit, in_factors
-from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.datasets import DATA, Dataset
 from nbs_pin.identification.regressor import (
     Expected,
     Geometry,
@@ -30,7 +30,7 @@ from nbs_pin.identification.regressor import (
     torque_size,
     triangle,
 )
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 _EXACT = 1e-11
 """Lower bound of the estimated noise, as a share of the largest torque: above rounding, below any sensor."""
@@ -76,6 +76,14 @@ class IdentificationReport:
     """Whether these ended at the minimum."""
 
 
+@checked(
+    data=DATA,
+    robot=ARM,
+    friction=flag,
+    rotor_inertia=flag,
+    transition=number(above=0.0, unit="rad/s"),
+    regularisation=number(least=1e-30, most=1e30, unit="measurements"),
+)
 def identify(
     data: Dataset,
     robot: Robot,
@@ -113,8 +121,6 @@ def identify(
         >>> report.base_parameters, report.excited, report.unidentifiable
         (6, 6, ())
     """
-    positive("transition", transition, "rad/s")
-    positive("regularisation", regularisation, "measurements")
     _check_arm(data, robot)
     scalars = Scalars(friction, rotor_inertia, transition)
     fault = sign_fault(data, robot)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.arguments import MOST_JOINTS, checked, flag, many, maybe, number, readable, text
 from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz
@@ -17,7 +18,7 @@ from nbs_pin.identification.log_files import Columns, columns_of_arrays, columns
 from nbs_pin.identification.measurement import ORDER, derivative
 from nbs_pin.identification.resampling import resampled
 from nbs_pin.motions.recordings import Joints, degrees_fault, in_radians, seam_fault, seconds_in, time_fault, unwrapped
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 _SPAN = 0.05  # [s]; interval over which derivatives are integrated for comparison, to average sensor noise
 _DISAGREES = 0.3  # largest RMS error of a logged derivative, as a share of the RMS change
@@ -26,6 +27,15 @@ _WINDOW = 0.1  # [s]; usual width of the differentiation window
 _EVEN = 1e-3  # tolerance of even spacing, as a share of the step
 
 
+@checked(
+    path=readable,
+    robot=maybe(ARM),
+    degrees=maybe(flag),
+    time_unit=maybe(text),
+    resample=maybe(number(above=0.0, most=1000.0, unit="s")),
+    window=maybe(number(least=1e-6, most=1000.0, unit="s")),
+    prismatic=maybe(many(flag, 1, MOST_JOINTS, "joints")),
+)
 def load_log(
     path: str | Path,
     *,

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.arguments import check_fields, number
 from nbs_pin.base.exceptions import ArgumentError
 
 CLEAN_WINDOW, QUANTISED_WINDOW = 11, 101
@@ -23,11 +24,7 @@ class Noise:
     """Standard deviation of the torque noise [N·m]."""
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.encoder < 0.5 and 0.0 <= self.torque < np.inf):
-            raise ArgumentError(
-                f"Noise was given encoder = {self.encoder} of a turn and torque = {self.torque} N·m, expected a share "
-                "in [0, 0.5) and a finite number ≥ 0; correct them."
-            )
+        check_fields(self, encoder=number(least=0.0, below=0.5, unit="of a turn"), torque=number(least=0.0, unit="N·m"))
 
 
 def quantised(

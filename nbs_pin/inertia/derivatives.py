@@ -17,6 +17,8 @@ from nbs_pin.base.rounding import up
 from nbs_pin.dynamics.rigid_tree import Arm, RigidTree
 from nbs_pin.inertia.multipliers import Form, Motions, largest_multiple, least_by_multipliers, placed_twist
 
+_PARALLEL = 1.0 - 1e-12
+"""Least cosine between axes that count as parallel; no proof rests on it."""
 _TURNED = (0, 1, 3, 4)
 """Components of a twist or a momentum across the axis."""
 
@@ -30,51 +32,97 @@ def inertia_derivatives(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None
         weight: W, symmetric positive definite; None takes M(q) itself, which gives γ in 1/rad.
     """
     tree = RigidTree.of(arm)
-    return np.array([_derivative(tree, i, weight) for i in range(tree.nv)])
+    return np.array([_derivative(tree, {i: 1.0}, weight) for i in range(tree.nv)])
 
 
-def single_rates(arm: Arm) -> JointArray:
-    """The least C_i found with |q̇_i| ≤ C_i √(q̇ᵀMq̇) for all rates and in every pose; inf where none is found."""
+def link_derivatives(arm: Arm, known: JointArray, weight: Float[np.ndarray, "n n"] | None = None) -> JointArray:
+    """The same for the rates a = Bq̇ of `link_rates`: −γ_jW ⪯ Σ_i (B⁻¹)_ij ∂M/∂q_i ⪯ γ_jW.
+
+    Args:
+        known: `inertia_derivatives` for the same W: a joint without a parallel one behind it keeps its bound.
+        weight: W, symmetric positive definite; None takes M(q) itself.
+    """
     tree = RigidTree.of(arm)
-    return np.array([_largest_rate(tree, unit) for unit in np.eye(tree.nv)])
+    turns = _parallel(tree)
+    found = np.array(known, dtype=float)
+    for j in range(tree.nv):
+        behind = {k: -sign for k, sign in turns.items() if tree.parents[k] == j}
+        if behind:
+            found[j] = _derivative(tree, {j: 1.0, **behind}, weight)
+    return found
 
 
-def rate_bound(arm: Arm, weights: JointArray, single: JointArray | None = None) -> float:
-    """The least C found with Σ w_i|q̇_i| ≤ C √(q̇ᵀMq̇) for all rates and in every pose, w ≥ 0; inf if none is found.
+def link_rates(arm: Arm) -> Float[np.ndarray, "n n"]:
+    """B of the rates a = Bq̇: a_j sums those of joint j and of the joints right before it that turn about parallel axes.
 
-    (Σ w_i|q̇_i|)² ≤ Σ w_i · Σ w_i q̇_i² for any split; here the split takes each joint's own bound into account.
+    So a_j is the rate at which link j turns about such axes in space, up to the motion of what carries all of them.
+    """
+    tree = RigidTree.of(arm)
+    rows, turns = np.eye(tree.nv), _parallel(tree)
+    for k, sign in turns.items():
+        rows[k] += sign * rows[tree.parents[k]]
+    return rows
+
+
+def _parallel(tree: RigidTree) -> dict[int, float]:
+    """Joints that turn about axes parallel to that of their parent joint, with the sign; parents first."""
+    along = {k: float(tree.rotation[k, 2, 2]) for k in range(tree.nv) if tree.parents[k] >= 0}
+    both = {k: z for k, z in along.items() if not tree.prismatic[[k, tree.parents[k]]].any()}
+    return {k: float(np.sign(z)) for k, z in both.items() if abs(z) > _PARALLEL}
+
+
+def single_rates(arm: Arm, rates: Float[np.ndarray, "n n"] | None = None) -> JointArray:
+    """The least C_i found with |a_i| ≤ C_i √(q̇ᵀMq̇) for all rates and in every pose; inf where none is found.
+
+    Args:
+        rates: B of a = Bq̇, None for a = q̇.
+    """
+    tree = RigidTree.of(arm)
+    return np.array([_largest_rate(tree, np.outer(row, row)) for row in (np.eye(tree.nv) if rates is None else rates)])
+
+
+def rate_bound(
+    arm: Arm, weights: JointArray, single: JointArray | None = None, rates: Float[np.ndarray, "n n"] | None = None
+) -> float:
+    """The least C found with Σ w_i|a_i| ≤ C √(q̇ᵀMq̇) for all rates and in every pose, w ≥ 0; inf if none is found.
+
+    (Σ w_i|a_i|)² ≤ Σ w_i · Σ w_i a_i² for any split; here the split takes the bound of each rate into account.
 
     Args:
         single: `single_rates` of the arm, if they are known.
+        rates: B of a = Bq̇, None for a = q̇.
     """
     tree = RigidTree.of(arm)
+    rows = np.eye(tree.nv) if rates is None else rates
     used = np.flatnonzero(weights > 0.0)
     if not len(used):
         return 0.0
     if not np.isfinite(weights).all():
         return np.inf
-    single = np.where(weights > 0.0, single_rates(tree) if single is None else single, 0.0)
+    single = np.where(weights > 0.0, single_rates(tree, rows) if single is None else single, 0.0)
     if not np.isfinite(single).all():
         return np.inf
     share = weights * single
     share = share / share.sum()
     parts = np.divide(weights**2, share, out=np.zeros(tree.nv), where=share > 0.0)
-    return min(up(float(weights @ single)), _largest_rate(tree, parts))
+    return min(up(float(weights @ single)), _largest_rate(tree, (rows.T * parts) @ rows))
 
 
-def _largest_rate(tree: RigidTree, weights: JointArray) -> float:
-    """√ of the least C found with Σ w_i q̇_i² ≤ C q̇ᵀMq̇."""
-    least = least_by_multipliers(tree, np.diag(weights)).value
+def _largest_rate(tree: RigidTree, weight: Float[np.ndarray, "n n"]) -> float:
+    """√ of the least C found with q̇ᵀWq̇ ≤ C q̇ᵀMq̇."""
+    least = least_by_multipliers(tree, weight).value
     return up(1.0 / np.sqrt(least)) if least > 0.0 else np.inf
 
 
-def _derivative(tree: RigidTree, joint: int, weight: Float[np.ndarray, "n n"] | None) -> float:
-    if tree.absent[joint]:
+def _derivative(tree: RigidTree, shares: dict[int, float], weight: Float[np.ndarray, "n n"] | None) -> float:
+    """γ of Σ c_k ∂M/∂q_k, for a joint and its children with their shares c."""
+    joint = min(shares)
+    if tree.absent[joint] and len(shares) == 1:
         return 0.0
     carried = [k for k in range(joint + 1, tree.nv) if joint in tree.path(k)]
     if tree.prismatic[joint] or tree.prismatic[carried].any():
         return np.inf
-    energy, change, conditions = _momenta(tree, joint, carried)
+    energy, change, conditions = _momenta(tree, shares, carried)
     if not change.matrix.any():
         return 0.0
     more = len(_TURNED) * len(carried)
@@ -87,8 +135,9 @@ def _derivative(tree: RigidTree, joint: int, weight: Float[np.ndarray, "n n"] | 
     return up(max(*bounds, 0.0))
 
 
-def _momenta(tree: RigidTree, joint: int, carried: list[int]) -> tuple[Form, Form, list[Form]]:
-    """2T, the change of 2T with q_joint, and the conditions, in the coordinates of `Motions` and those of momenta."""
+def _momenta(tree: RigidTree, shares: dict[int, float], carried: list[int]) -> tuple[Form, Form, list[Form]]:
+    """2T, Σ c_k times its change with q_k, and the conditions, in the coordinates of `Motions` and those of momenta."""
+    joint = min(shares)
     motions = Motions.of(tree)
     few = len(motions.energy.matrix)
     m = few + len(_TURNED) * len(carried)
@@ -113,9 +162,11 @@ def _momenta(tree: RigidTree, joint: int, carried: list[int]) -> tuple[Form, For
         momentum[1, tree.parents[k]] += np.abs(placed).T @ turned[1]
         seen = np.stack([placed @ twist[0, tree.parents[k]], np.abs(placed) @ twist[1, tree.parents[k]]])
         conditions += _rotated(_across(twist[:, k], momentum[:, k]), _across(seen, turned))
-    v, omega, linear, angular = (x for x in _across(twist[:, joint], momentum[:, joint]))
-    change = _cross(v[0], linear[0]) + _cross(omega[0], angular[0])
-    sums = _sums(v[1], linear[1]) + _sums(omega[1], angular[1])
+    change, sums = np.zeros((m, m)), np.zeros((m, m))
+    for k, share in shares.items():
+        v, omega, linear, angular = _across(twist[:, k], momentum[:, k])
+        change += share * (_cross(v[0], linear[0]) + _cross(omega[0], angular[0]))
+        sums += abs(share) * (_sums(v[1], linear[1]) + _sums(omega[1], angular[1]))
     return (
         Form(_wide(motions.energy.matrix, m), _wide(motions.energy.size, m)),
         Form(-2.0 * change, 2.0 * sums),

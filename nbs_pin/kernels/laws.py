@@ -154,6 +154,15 @@ def fit(n: int, size: int, vectors: tuple[Vec, ...]) -> bool:
     return size % n == 0
 
 
+@inlined
+def is_finite(x: Vec) -> bool:
+    """Whether all numbers are finite."""
+    nothing = 0.0
+    for y in x:
+        nothing += 0.0 * y  # NaN if y is not finite
+    return nothing == 0.0
+
+
 # The entry points at control rate take single arrays: numba takes them apart sooner than tuples of them.
 
 
@@ -206,7 +215,7 @@ def tree_law(
         tau: written [N·m].
 
     Returns:
-        Whether all are as long as tau, a multiple of n; nothing is done otherwise.
+        Whether all are as long as tau, a multiple of n, nothing being done otherwise, and tau is finite.
     """
     law, tree, size = Packed(layout[2:], weights), Packed(layout[layout[0] :], weights[layout[1] :]), len(tau)
     n = law.layout[at.JOINTS]
@@ -215,7 +224,7 @@ def tree_law(
     for k in range(size // n):
         target = Target(row(q_ref, k, n), row(v_ref, k, n), row(a_ref, k, n))
         torque_of(State(row(q, k, n), row(v, k, n)), target, law, tree, work, row(tau, k, n))
-    return True
+    return is_finite(tau)
 
 
 @exact_kernel
@@ -261,11 +270,11 @@ def pid(
         out: written, rows τ [N·m], integral [N·m], derivative [rad/s], each as long as q.
 
     Returns:
-        Whether all are as long as the rows of out, a multiple of n; nothing is done otherwise.
+        Whether all are as long as the rows of out, a multiple of n, nothing being done otherwise, and τ is finite.
     """
     gains = pid_of(weights)
     if not fit(len(gains.kp), out.shape[1], (integral, derivative, q, v, q_ref, v_ref)):
         return False
     after = Memory(out[1], out[2])
     pid_step(Memory(integral, derivative), State(q, v), State(q_ref, v_ref), period, gains, out[0], after)
-    return True
+    return is_finite(out[0])

@@ -6,12 +6,14 @@ Each class applies the same torque to all states of a batch, except `TorqueNoise
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from nbs_pin.base.arguments import PERIOD, SEED, check_fields, number
 from nbs_pin.base.arrays import Vectors
-from nbs_pin.base.checks import PerJoint, per_joint, positive
+from nbs_pin.base.checks import PerJoint, floats, per_joint
 from nbs_pin.base.exceptions import ArgumentError
 
 Disturbance: TypeAlias = Callable[[float, np.ndarray, np.ndarray], Any]
@@ -52,7 +54,7 @@ class SinusoidalTorque:
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """τ_d [N·m] at time t [s] and state (q, v)."""
-        return _on_joints(self.amplitude * np.sin(self.frequency * t + self.phase), q)
+        return _on_joints(self.amplitude * np.sin(self.frequency * _instant(t) + self.phase), q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,8 @@ class SquareWave:
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """τ_d [N·m] at time t [s] and state (q, v)."""
-        return _on_joints(self.amplitude * np.where(np.sin(self.frequency * t + self.phase) >= 0.0, 1.0, -1.0), q)
+        sign = np.where(np.sin(self.frequency * _instant(t) + self.phase) >= 0.0, 1.0, -1.0)
+        return _on_joints(self.amplitude * sign, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,23 +89,27 @@ class TorqueNoise:
 
     def __post_init__(self) -> None:
         per_joint(self, "std")
-        positive("period", self.period, "s")
-        if self.seed < 0:
-            raise ArgumentError(f"seed is {self.seed}, expected an integer ≥ 0; give another seed.")
+        check_fields(self, period=PERIOD, seed=SEED)
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """τ_d [N·m] at time t [s] and state (q, v)."""
-        interval = math.floor(t / self.period + 1e-9)  # t = k·period may be rounded into the interval before
-        rng = np.random.default_rng((self.seed, interval))
+        interval = math.floor(_instant(t) / self.period + 1e-9)  # t = k·period may be rounded into the interval before
+        if interval < 0:
+            raise ArgumentError(f"TorqueNoise: t is {t} s; noise begins at t = 0, give a time ≥ 0.")
+        rng, std = np.random.default_rng((self.seed, interval)), _on_joints(self.std, q)
         if self.share is None:
-            return _on_joints(self.std, q) * rng.standard_normal(q.shape)
+            return std * rng.standard_normal(std.shape)
         first, end, count = self.share
-        return _on_joints(self.std, q) * rng.standard_normal((count, *q.shape[1:]))[first:end]
+        return std * rng.standard_normal((count, *std.shape[1:]))[first:end]
 
 
-def _on_joints(torque: Any, q: np.ndarray) -> np.ndarray:
+def _on_joints(torque: Any, q: Any) -> np.ndarray:
     """The torque, broadcast to the shape of q."""
-    count, joints = np.size(torque), q.shape[-1]
-    if count not in (1, joints):
+    shape = floats("the disturbance: q", q).shape
+    count, joints = np.size(torque), shape[-1] if shape else 0
+    if joints == 0 or count not in (1, joints):
         raise ArgumentError(f"the disturbance has {count} torques for {joints} joints; give one, or one per joint.")
-    return np.zeros(q.shape) + torque
+    return np.zeros(shape) + torque
+
+
+_instant = partial(number(unit="s"), "the disturbance: t")

@@ -10,7 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from nbs_pin.base.checks import floats
+from nbs_pin.base.arguments import MOST_JOINTS, checked, either, flag, many, maybe, readable, text
+from nbs_pin.base.checks import LARGEST, floats
 from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require
@@ -24,7 +25,8 @@ from nbs_pin.motions.recordings import (
     time_fault,
     unwrapped,
 )
-from nbs_pin.robots.robot import Robot
+from nbs_pin.motions.references import instants
+from nbs_pin.robots.robot import ARM, Robot
 
 FEWEST_SAMPLES = 4
 """Fewest samples of a not-a-knot cubic spline."""
@@ -82,7 +84,7 @@ class Sampled:
 
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
-        t = np.asarray(t, dtype=float)
+        t = instants(t)
         spline = self._spline
         inside = np.clip(t, self.t[0], self.t[-1])
         moving = (inside == t)[..., None]
@@ -90,6 +92,12 @@ class Sampled:
         return Reference(q, np.where(moving, v, 0.0), np.where(moving, a, 0.0))
 
 
+@checked(
+    path=readable,
+    robot=either(ARM, many(text, 1, MOST_JOINTS, "names of joints")),
+    time_unit=maybe(text),
+    degrees=maybe(flag),
+)
 def load_reference(
     path: str | Path, robot: Robot | Sequence[str], *, time_unit: str | None = None, degrees: bool | None = None
 ) -> Sampled:
@@ -154,18 +162,20 @@ def _fault(t: np.ndarray, q: np.ndarray, columns: list[str]) -> str:
         row, column = np.argwhere(~np.isfinite(table))[0]
         name = ["t", *columns][column]
         return f"row {row + 1}, column {name}: {table[row, column]} is not a finite number; fill the gap"
+    if not np.abs(table).max() <= LARGEST:
+        return f"a number is {np.abs(table).max():.3g}, expected at most {LARGEST:g} in [s] and [rad]; correct it"
     if not (np.diff(t) > 0.0).all():
         row = int(np.argmin(np.diff(t) > 0.0)) + 1
         return f"time must increase, but row {row + 1} ({t[row]:g}) is not after row {row} ({t[row - 1]:g}); sort it"
-    return _overflow(table, ["t", *columns])
+    return _overflow(t, q, columns)
 
 
-def _overflow(table: np.ndarray, names: list[str]) -> str:
+def _overflow(t: np.ndarray, q: np.ndarray, columns: list[str]) -> str:
     """Which number is so large, or so soon after the one before, that the spline overflows; or an empty string."""
-    if np.abs(table).max() > _LARGEST:
-        row, column = np.argwhere(np.abs(table) > _LARGEST)[0]
-        return f"row {row + 1}, column {names[column]}: {table[row, column]:g} is beyond ±{_LARGEST:g}; correct it"
-    steps = np.diff(table[:, 0])
+    if np.abs(q).max() > _LARGEST:
+        row, column = np.argwhere(np.abs(q) > _LARGEST)[0]
+        return f"row {row + 1}, column {columns[column]}: {q[row, column]:g} is beyond ±{_LARGEST:g}; correct it"
+    steps = np.diff(t)
     if steps.min() < 1.0 / _LARGEST:
         row = int(np.argmin(steps)) + 1
         return f"row {row + 1} is {steps.min():g} s after row {row}, expected at least {1.0 / _LARGEST:g} s; correct t"

@@ -10,17 +10,60 @@ from typing import Any, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from nbs_pin.base.checks import PerJoint, floats, per_joint, positive
+from nbs_pin.base.arguments import DURATION, MOST_JOINTS, called, checked, count, function, number
+from nbs_pin.base.checks import LARGEST, SMALLEST, PerJoint, floats, is_usual, per_joint, told
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 DesiredMotion: TypeAlias = Callable[[Any], Reference]
 """ref(t) -> Reference, for a time [s] (shapes (n,)) or an array of times (shapes (..., n)).
 
 Motions may state `duration` [s], how long they last, and `largest_jerk` (n,), a bound of |ȧ_d| while they do [rad/s³].
 """
+
+
+MOTION = function(1, "a motion, a function of times [s] that returns a Reference, such as Sinusoid")
+
+
+def at_times(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
+    """The reference at times t (rows,) [s], which it receives read-only, as float arrays (rows, nv).
+
+    Raises:
+        ArgumentError: If it is not a motion of nv joints for an array of times, fails, or is not finite.
+    """
+    given = called("the reference", reference, t)
+    if not isinstance(given, tuple | list) or len(given) != len(Reference._fields):
+        raise ArgumentError(
+            f"the reference gave {told(given)}, expected a Reference of q, v and a; take Hold, Sinusoid or a file's."
+        )
+    sampled = Reference(*(floats(f"the reference's {name}", x) for name, x in zip("qva", given, strict=True)))
+    for name, rows in sampled._asdict().items():
+        if rows.ndim and rows.shape[-1] != nv:
+            raise ArgumentError(
+                f"the reference has {rows.shape[-1]} joints, the arm has {nv}; give one motion per joint."
+            )
+        if rows.shape != (t.size, nv):
+            raise ArgumentError(
+                f"the reference at {t.size} times gave {name} of shape {rows.shape}, expected ({t.size}, {nv}); let it "
+                f"take arrays of times and return one value for each of the {nv} joints."
+            )
+        if not is_usual(rows):
+            k, joint = np.argwhere(~(np.abs(rows) <= LARGEST))[0]
+            raise ArgumentError(
+                f"the reference's {name} of joint {joint} at t = {t[k]:g} s is {rows[k, joint]:g}, expected a finite"
+                f" number of at most {LARGEST:g}; correct it."
+            )
+    return sampled
+
+
+def instants(t: Any) -> np.ndarray:
+    """Times as a float array of any shape; raises ArgumentError unless they are finite numbers."""
+    array = floats("t", t)
+    if not is_usual(array):
+        raise ArgumentError(f"t is {told(t)}, expected a time or times, finite numbers [s]; correct it.")
+    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +91,13 @@ class Sinusoid:
             object.__setattr__(self, name, value)
 
     @classmethod
+    @checked(robot=ARM, frequency=number(above=0.0, most=1000.0, unit="rad/s"), amplitude=number(above=0.0, unit="rad"))
     def for_robot(cls, robot: Robot, frequency: float = 1.0, amplitude: float = 0.5) -> "Sinusoid":
         """A moderate motion about `resting_posture`, with neighbouring joints a quarter period apart.
 
         Each joint has the angular frequency `frequency` [rad/s] and the least of three amplitudes: `amplitude` [rad], a
         quarter of its range, and half its velocity limit over `frequency`. Raises ArgumentError unless both are > 0.
         """
-        positive("frequency", frequency, "rad/s")
-        positive("amplitude", amplitude, "rad")
         span = np.minimum(robot.upper - robot.lower, 2.0 * np.pi)
         reach = np.minimum.reduce([np.full(robot.nv, amplitude), 0.25 * span, 0.5 * robot.velocity_limit / frequency])
         return cls(reach, frequency, 0.5 * np.pi * (np.arange(robot.nv) % 2), resting_posture(robot))
@@ -68,7 +110,7 @@ class Sinusoid:
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
         A, w = self.amplitude, self.frequency
-        angle = w * np.asarray(t, dtype=float)[..., None] + self.phase
+        angle = w * instants(t)[..., None] + self.phase
         sine, cosine = np.sin(angle), np.cos(angle)
         return Reference(self.offset + A * sine, A * w * cosine, -A * w**2 * sine)
 
@@ -88,10 +130,9 @@ def resting_posture(robot: Robot) -> np.ndarray:
     return postures[np.argmax(load <= max(0.5, load.min()))]
 
 
+@checked(n=count(1, MOST_JOINTS, "joints"))
 def paper_reference(n: int) -> Sinusoid:
     """The paper's q_d = [sin 0.1t, cos 0.1t, sin 0.1t, …] for n joints [rad]."""
-    if n < 1:
-        raise ArgumentError(f"n is {n}, expected at least one joint; give the number of joints.")
     return Sinusoid(amplitude=np.ones(n), frequency=0.1, phase=0.5 * np.pi * (np.arange(n) % 2))
 
 
@@ -118,7 +159,7 @@ class Hold:
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
         q = np.atleast_1d(self.q)
-        zero = np.zeros((*np.shape(t), q.size))
+        zero = np.zeros((*instants(t).shape, q.size))
         return Reference(zero + q, zero, zero.copy())
 
 
@@ -145,10 +186,10 @@ class MinimumJerk:
                 f"MinimumJerk was given waypoints of shape {waypoints.shape} at times of shape {times.shape}, "
                 "expected (k, n) and (k,) with k ≥ 2; give one time per waypoint."
             )
-        if not (np.isfinite(waypoints).all() and np.isfinite(times).all()):
+        if not (is_usual(waypoints) and is_usual(times)):
             raise ArgumentError("MinimumJerk's waypoints and times must be finite; correct the one that is not.")
-        if not (np.diff(times) > 0.0).all():
-            k = int(np.argmin(np.diff(times) > 0.0))
+        if not (np.diff(times) >= SMALLEST).all():
+            k = int(np.argmin(np.diff(times) >= SMALLEST))
             raise ArgumentError(f"times must increase, but times[{k + 1}] = {times[k + 1]} ≤ {times[k]}; correct them.")
         object.__setattr__(self, "waypoints", waypoints)
         object.__setattr__(self, "times", times)
@@ -166,7 +207,7 @@ class MinimumJerk:
 
     def __call__(self, t: Any) -> Reference:
         """Desired motion at t [s]."""
-        t = np.asarray(t, dtype=float)
+        t = instants(t)
         k = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, self.times.size - 2)
         duration = (self.times[k + 1] - self.times[k])[..., None]
         s = np.clip((t - self.times[k])[..., None] / duration, 0.0, 1.0)
@@ -178,6 +219,7 @@ class MinimumJerk:
         )
 
 
+@checked(reference=MOTION, robot=ARM, duration=DURATION, samples=count(2, 1_000_000))
 def check_reference(
     reference: DesiredMotion, robot: Robot, duration: float, *, samples: int = 2001, joint_friction: str = "drop"
 ) -> None:
@@ -189,21 +231,10 @@ def check_reference(
     Raises:
         ArgumentError: If a limit is exceeded; names the joint, the time, the value, the limit and the remedy.
     """
-    positive("duration", duration, "s")
     if joint_friction not in ("drop", "keep"):
-        raise ArgumentError(f"joint_friction is {joint_friction!r:.80}; give 'drop' or 'keep'.")
+        raise ArgumentError(f"joint_friction is {told(joint_friction)}; give 'drop' or 'keep'.")
     t = np.linspace(0.0, duration, samples)
-    desired = Reference(*(floats(f"the reference's {name}", x) for name, x in zip("qva", reference(t), strict=True)))
-    for name, x in desired._asdict().items():
-        if x.ndim and x.shape[-1] != robot.nv:
-            raise ArgumentError(
-                f"the reference has {x.shape[-1]} joints, {robot.name} has {robot.nv}; give one motion per joint."
-            )
-        if x.shape != (samples, robot.nv):
-            raise ArgumentError(
-                f"the reference at {samples} times gave {name} of shape {x.shape}, expected ({samples}, {robot.nv}); "
-                "let it take arrays of times."
-            )
+    desired = at_times(reference, t, robot.nv)
     degrees = " (are these degrees?)" if np.median(np.max(np.abs(desired.q), axis=-1)) > 2.0 * np.pi else ""
     _check_range(robot, t, "position", desired.q, robot.lower, robot.upper, f"stay inside{degrees}")
     _check_range(robot, t, "velocity", desired.v, -robot.velocity_limit, robot.velocity_limit, "slow it down")

@@ -15,9 +15,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from nbs_pin.base.arguments import checked, count, writable
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
-from nbs_pin.base.records import Run
+from nbs_pin.base.records import RUN, Run
 from nbs_pin.robots.robot import configuration_difference
 from nbs_pin.simulation.metrics import saturated_fraction
 
@@ -50,6 +51,7 @@ def picture(path: str | Path, width: float, height: float, dpi: int = 120) -> It
     write_whole(path, buffer.getvalue())
 
 
+@checked(run=RUN, path=writable, start=count(0))
 def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
     """Plot how each joint follows its reference and write the picture (PNG); returns its path.
 

@@ -22,11 +22,12 @@ from meshcat.commands import SetObject, SetTransform
 from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry
 from meshcat.path import Path as ScenePath
 
+from nbs_pin.base.arguments import checked, count, maybe, paths, writable
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
-from nbs_pin.base.records import Run
+from nbs_pin.base.records import RUN, Run
 from nbs_pin.robots.named import load_named
-from nbs_pin.robots.robot import Robot, configuration_difference
+from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 from nbs_pin.robots.visuals import Visual, link_visuals, tip
 
 FRAME_RATE = 50.0
@@ -37,6 +38,7 @@ MAX_FRAMES = 12_000
 """Longer runs get fewer frames per second, so that the page stays small."""
 
 
+@checked(run=RUN, path=writable, robot=maybe(ARM), start=count(0), package_dirs=paths)
 def replay(
     run: Run, path: str | Path, robot: Robot | None = None, *, start: int = 0, package_dirs: Iterable[str | Path] = ()
 ) -> Path:

@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import pinocchio as pin
 from array_api_compat import device
 from jaxtyping import Bool, Float, Int
 
-from nbs_pin.base.arrays import JointArray, Vectors, array_namespace
-from nbs_pin.base.checks import PerJoint, floats
+from nbs_pin.base.arguments import a, checked, path
+from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors
+from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError, RobotError
 from nbs_pin.base.storable import storable
@@ -140,6 +142,7 @@ class Robot:
 
     def difference(self, q: Vectors, q_ref: Vectors) -> Vectors:
         """z1 = q ⊖ q_ref [rad], wrapped to (−π, π] on continuous joints."""
+        q, q_ref = as_vectors(self.nv, q=q, q_ref=q_ref)
         return configuration_difference(q, q_ref, self.continuous)
 
     def with_effort_limit(self, limit: PerJoint) -> "Robot":
@@ -152,14 +155,18 @@ class Robot:
             ArgumentError: If a limit is not > 0 or the number of limits is wrong.
         """
         effort = floats("effort limit", limit)
-        if effort.shape not in ((), (self.nv,)) or not (effort > 0.0).all():
+        if effort.shape not in ((), (self.nv,)) or not (effort >= SMALLEST).all():
             raise ArgumentError(
-                f"effort limit is {limit}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means no limit."
+                f"effort limit is {told(limit)}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means none."
             )
         by_name = dict(zip(self.joint_names, np.full(self.nv, effort).tolist(), strict=True))
         joints = tuple(replace(joint, effort=by_name[joint.name]) for joint in self.urdf.joints)
         urdf = replace(self.urdf, joints=joints)
         return replace(self, urdf=urdf, model=_with_limits(self.model.copy(), urdf))
+
+
+ARM = a(Robot, "an arm, as load_robot returns it")
+"""The check of an argument that is an arm."""
 
 
 def configuration_difference(q: Vectors, q_ref: Vectors, continuous: Bool[np.ndarray, " n"] | None) -> Vectors:
@@ -175,6 +182,7 @@ def configuration_difference(q: Vectors, q_ref: Vectors, continuous: Bool[np.nda
     return z1 - 2.0 * np.pi * turns * xp.asarray(continuous.astype(float), dtype=z1.dtype, device=device(z1))
 
 
+@checked(name_or_path=path)
 def load_robot(
     name_or_path: str | Path,
     *,
@@ -241,13 +249,13 @@ def load_robot(
 
 def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
     """The gravity vector in the base frame [m/s²]; raises ArgumentError unless it is one or three finite numbers."""
-    message = f"gravity is {gravity!r}, expected one finite number (downward) or three; give e.g. 9.81."
-    try:
-        vector = np.array(list(gravity) if isinstance(gravity, Iterable) else gravity, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(message) from error
-    if vector.shape not in ((), (3,)) or not np.isfinite(vector).all():
-        raise ArgumentError(message)
+    if isinstance(gravity, Iterable) and not isinstance(gravity, np.ndarray | str):
+        gravity = list(islice(gravity, 4))
+    vector = floats("gravity", gravity)
+    if vector.shape not in ((), (3,)) or not is_usual(vector):
+        raise ArgumentError(
+            f"gravity is {told(gravity)}, expected one finite number (downward) or three; give e.g. 9.81."
+        )
     return np.array([0.0, 0.0, -float(vector)]) if vector.ndim == 0 else vector
 
 

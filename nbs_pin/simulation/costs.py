@@ -4,13 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float
 
+from nbs_pin.base.arguments import check_fields, checked, joints, number
 from nbs_pin.base.arrays import Scalars, Vectors
-from nbs_pin.base.checks import positive
+from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 
 StageCost: TypeAlias = Callable[[Vectors, Vectors, Vectors], Scalars]
 """l(z1, v − v_d, τ) [1/s]: error [rad] and its rate [rad/s] at the end of a control period, and the torque commanded
@@ -19,6 +21,9 @@ during it [N·m], before the effort limits. Any differentiable callable is accep
 
 def squared_error(z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
     """z1ᵀz1, the paper's cost: torque is free, so training uses much of it (docs/theory.md §7)."""
+    z1 = z1 if isinstance(z1, torch.Tensor) else floats("z1", z1)
+    if z1.ndim == 0:
+        raise ArgumentError(f"z1 is {told(z1)}, expected errors (..., n) [rad]; give one number per joint.")
     return (z1 * z1).sum(-1)
 
 
@@ -42,21 +47,19 @@ class TorqueAware:
     effort: float = 1e-4
 
     def __post_init__(self) -> None:
-        for name in ("rate", "excess", "effort"):
-            if getattr(self, name) != 0.0:
-                positive(f"TorqueAware's {name}", getattr(self, name), "")
-        limit = torch.as_tensor(self.limit, dtype=torch.float64)
-        if not bool((limit > 0.0).all()):
-            raise ArgumentError(f"TorqueAware's limit is {limit.tolist()}, expected torques > 0 [N·m]; inf means none.")
-        object.__setattr__(self, "limit", limit)
+        share = number(least=0.0)
+        check_fields(self, rate=share, excess=share, effort=share, limit=joints(above=0.0, unit="N·m", infinite=True))
+        object.__setattr__(self, "limit", torch.from_numpy(np.array(self.limit)))
 
     @classmethod
+    @checked(robot=ARM)
     def for_robot(cls, robot: Robot) -> "TorqueAware":
         """The cost with the effort limits of the arm."""
         return cls(torch.as_tensor(robot.effort_limit))
 
     def __call__(self, z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
         """The cost per second."""
+        _check_tensors(z1=z1, dz1=dz1, tau=tau)
         share = tau / self.limit.to(tau.device)
         beyond = torch.clamp(share.abs() - 1.0, min=0.0)
         price = z1 * z1 + self.rate**2 * dz1 * dz1 + self.excess * beyond * beyond + self.effort * share * share
@@ -79,14 +82,29 @@ class TimeOutside:
     pull: float = 0.1
 
     def __post_init__(self) -> None:
-        positive("TimeOutside's threshold", self.threshold, "rad²")
-        if self.pull != 0.0:
-            positive("TimeOutside's pull", self.pull, "1/rad²")
+        check_fields(self, threshold=number(above=0.0, unit="rad²"), pull=number(least=0.0, unit="1/rad²"))
 
     def __call__(self, z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
         """The cost per second."""
+        _check_tensors(z1=z1)
         squared = (z1 * z1).sum(-1)
         return squared / (squared + self.threshold) + self.pull * squared
+
+
+def _check_tensors(**vectors: Vectors) -> None:
+    """Raise ArgumentError unless all are tensors of real numbers (..., n) of one shape."""
+    shapes = {getattr(x, "shape", None) for x in vectors.values()}
+    for name, x in vectors.items():
+        if (
+            not isinstance(x, torch.Tensor)
+            or not x.is_floating_point()
+            or x.ndim == 0
+            or len(shapes) > 1
+            or x.is_sparse
+        ):
+            raise ArgumentError(
+                f"{name} is {told(x)}, expected tensors (..., n) of one shape for {', '.join(vectors)}; give such."
+            )
 
 
 CostName: TypeAlias = Literal["torque-aware", "squared-error", "time-outside"]

@@ -1,14 +1,17 @@
 """A plant from a dynamics model, integrated in time."""
 
+from functools import partial
+
 import numpy as np
 
-from nbs_pin.base.arrays import Array, Vectors, is_torch_array
+from nbs_pin.base.arguments import DURATION, checked, choice, maybe
+from nbs_pin.base.arrays import Array, Vectors, as_vectors, is_torch_array
 from nbs_pin.base.checks import all_finite
-from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.base.exceptions import SimulationDiverged, TooLarge
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.robots.robot import Robot
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
+from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.simulation.integrators import INTEGRATORS, IntegratorName
 from nbs_pin.simulation.plant import Plant
 
@@ -32,17 +35,17 @@ class DynamicsPlant(Plant):
         array([-0.0108,  0.0128])
     """
 
+    @checked(dynamics=MODEL, integrator=choice(*INTEGRATORS))
     def __init__(
         self, dynamics: DynamicsProvider, integrator: IntegratorName = "rk4", friction: JointFriction | None = None
     ) -> None:
-        if integrator not in INTEGRATORS:
-            raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(INTEGRATORS)}.")
         self.dynamics = dynamics
         self.integrator = integrator
         self.friction = friction_of_size(friction, dynamics.nv)
         self._step = INTEGRATORS[integrator]
 
     @classmethod
+    @checked(robot=ARM, integrator=maybe(choice(*INTEGRATORS)), joint_friction=choice("drop", "keep"))
     def for_robot(
         cls, robot: Robot, integrator: IntegratorName | None = None, joint_friction: str = "drop"
     ) -> "DynamicsPlant":
@@ -51,8 +54,6 @@ class DynamicsPlant(Plant):
         Raises:
             ArgumentError: If integrator is unknown, or joint_friction is not "drop" or "keep".
         """
-        if joint_friction not in ("drop", "keep"):
-            raise ArgumentError(f"joint_friction '{joint_friction}' is unknown; give 'drop' or 'keep'.")
         friction = JointFriction.of(robot) if joint_friction == "keep" else None
         return cls(PinocchioDynamics(robot), integrator or "rk4", friction)
 
@@ -76,19 +77,28 @@ class DynamicsPlant(Plant):
             SimulationDiverged: If the result is not finite.
         """
         dynamics, friction = self.dynamics, self.friction
+        q, v, tau = as_vectors(self.nv, q=q, v=v, tau=tau)
+        duration = _DURATION(duration)
 
         def acceleration(q: Array, v: Array) -> Array:
             net = tau if friction is None else tau - friction.torque(v)
             return dynamics.forward_dynamics(q, v, net)
 
-        with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below
-            q, v = self._step(acceleration, q, v, duration)
+        far = (
+            f"{self!r} diverged to a state that is not finite in a step of {duration:g} s; "
+            "take a shorter plant step, or check the controller."
+        )
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # overflow is reported below
+                q, v = self._step(acceleration, q, v, duration)
+        except TooLarge as error:
+            raise SimulationDiverged(far) from error
         if not (_finite(q) and _finite(v)):
-            raise SimulationDiverged(
-                f"{self!r} diverged to a state that is not finite in a step of {duration:g} s; "
-                "take a shorter plant step, or check the controller."
-            )
+            raise SimulationDiverged(far)
         return q, v
+
+
+_DURATION = partial(DURATION, "duration")
 
 
 def _finite(x: Array) -> bool:

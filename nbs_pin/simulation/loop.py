@@ -6,14 +6,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nbs_pin.base.checks import positive, whole
+from nbs_pin.base.arguments import MOST_PERIODS, MOST_STEPS
+from nbs_pin.base.checks import LARGEST, SMALLEST, floats, is_usual, told, whole
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.records import Reference, Run
-from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.base.records import ROW_ARRAYS, Reference, Run
+from nbs_pin.motions.references import DesiredMotion, at_times
 from nbs_pin.simulation.plant import Plant
 
 LONGEST_PLANT_STEP = 1e-3
 """Default plant step [s], or the nearest shorter one that divides the period."""
+
+MOST_RECORDED = 2**30
+"""Most numbers of a run (8 GiB)."""
 
 
 class Schedule(NamedTuple):
@@ -56,16 +60,20 @@ class Loop:
         plant_step: float | None,
         effort_limit: Any,
         lookahead: float | None,
+        most: float | None = None,
     ) -> "Loop":
-        """The loop of a law for nv joints with `simulate`'s arguments; raises ArgumentError if they do not match."""
+        """The loop of a law for nv joints with `simulate`'s arguments; raises ArgumentError if they do not match.
+
+        It has at most `most` periods (None: `MOST_PERIODS`), each of at most `MOST_STEPS` plant steps.
+        """
         if nv != plant.nv:
             raise ArgumentError(f"the controller has {nv} joints and the plant {plant.nv}; build both for one arm.")
         return cls(
             plant=plant,
             period=period,
-            steps=whole(duration, period, "duration", "period"),
+            steps=whole(duration, period, "duration", "period", float(MOST_PERIODS if most is None else most)),
             substeps=_substeps(period, plant_step),
-            lead=_lead(lookahead, period),
+            lead=0.5 * period if lookahead is None else lookahead,
             limit=_effort_limit(plant, effort_limit),
         )
 
@@ -76,7 +84,7 @@ class Loop:
 
     def start(self, reference: DesiredMotion, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
         """Start (q, v): the reference's, or q0 at rest unless v0 is given; ArgumentError if they do not match."""
-        return _start(_sampled(reference, np.zeros(1), self.plant.nv), q0, v0)
+        return _start(at_times(reference, np.zeros(1), self.plant.nv), q0, v0)
 
     def schedule(self, reference: DesiredMotion, first: int = 0, steps: int | None = None) -> Schedule:
         """Control instants first, …, first + steps, or to the end; ArgumentError if the reference is invalid there."""
@@ -84,8 +92,16 @@ class Loop:
         times = self.period * np.arange(first, first + steps + 1.0)
         # The reference need not exist beyond the end, so the law does not look ahead at the last instant.
         seen = np.minimum(times + self.lead, self.period * self.steps)
-        desired, target = (_sampled(reference, t, self.plant.nv) for t in (times, seen))
+        desired, target = (at_times(reference, t, self.plant.nv) for t in (times, seen))
         return Schedule(times, seen - times, desired, target)
+
+    def check_size(self, starts: int) -> None:
+        """Raise ArgumentError if the run from so many starts has more than `MOST_RECORDED` numbers."""
+        if len(ROW_ARRAYS) * (self.steps + 1) * starts * self.plant.nv > MOST_RECORDED:
+            raise ArgumentError(
+                f"{starts} motions of {self.steps} periods have more than {MOST_RECORDED} numbers; give a shorter"
+                " duration or fewer starts, or record one motion in blocks (stream)."
+            )
 
     def blank_run(self, times: np.ndarray, desired: Reference, q0: np.ndarray, v0: np.ndarray, controller: str) -> Run:
         """A run with the times, references (rows, n) or (rows, *batch, n) and start (*batch, n), else zeros."""
@@ -119,43 +135,23 @@ class Loop:
 
 def _substeps(period: float, plant_step: float | None) -> int:
     if plant_step is not None:
-        return whole(period, plant_step, "period", "plant_step")
-    positive("period", period, "s")
+        return whole(period, plant_step, "period", "plant_step", float(MOST_STEPS))
     return max(1, math.ceil(period / LONGEST_PLANT_STEP - 1e-9))
-
-
-def _lead(lookahead: float | None, period: float) -> float:
-    lead = 0.5 * period if lookahead is None else lookahead
-    if not 0.0 <= lead < math.inf:
-        raise ArgumentError(f"lookahead is {lookahead} s, expected a finite time ≥ 0; half a period is usual.")
-    return lead
-
-
-def _sampled(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
-    sampled = Reference(*(np.asarray(x, dtype=float) for x in reference(t)))
-    for name, rows in sampled._asdict().items():
-        if rows.shape != (t.size, nv):
-            raise ArgumentError(
-                f"the reference at {t.size} times gave {name} of shape {rows.shape}, expected ({t.size}, {nv}); "
-                f"make it accept arrays of times and return one value for each of the {nv} joints."
-            )
-        if not np.isfinite(rows).all():
-            k, joint = np.argwhere(~np.isfinite(rows))[0]
-            raise ArgumentError(f"the reference's {name} of joint {joint} at t = {t[k]:g} s is not finite; correct it.")
-    return sampled
 
 
 def _start(desired: Reference, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray]:
     """Start (q, v) of one batch shape."""
     rest = desired.v[0] if q0 is None else np.zeros_like(desired.v[0])
     given = {"q0": desired.q[0] if q0 is None else q0, "v0": rest if v0 is None else v0}
-    start = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+    start = {name: floats(name, value) for name, value in given.items()}
     nv = rest.size
     for name, x in start.items():
         if x.ndim == 0 or x.shape[-1] != nv or 0 in x.shape:
             raise ArgumentError(f"{name} has shape {x.shape}, expected (..., {nv}): one number per joint.")
-        if not np.isfinite(x).all():
-            raise ArgumentError(f"{name} is {x}, expected finite numbers; correct the start.")
+        if not is_usual(x):
+            raise ArgumentError(
+                f"{name} is {told(x)}, expected finite numbers of at most {LARGEST:g}; correct the start."
+            )
     try:
         q, v = np.broadcast_arrays(start["q0"], start["v0"])
         return q, v
@@ -167,10 +163,10 @@ def _start(desired: Reference, q0: Any, v0: Any) -> tuple[np.ndarray, np.ndarray
 def _effort_limit(plant: Plant, given: Any) -> np.ndarray:
     if given is None:
         given = np.inf if plant.robot is None else plant.robot.effort_limit
-    limit = np.asarray(given, dtype=float)
-    if limit.shape not in ((), (plant.nv,)) or not (limit > 0.0).all():
+    limit = floats("effort_limit", given)
+    if limit.shape not in ((), (plant.nv,)) or not (limit >= SMALLEST).all():
         raise ArgumentError(
-            f"effort_limit is {given}, expected one number > 0 or {plant.nv} of them [N·m, N where it "
-            "slides]; np.inf means no limit."
+            f"effort_limit is {told(given)}, expected one number > 0 or {plant.nv} of them [N·m, N where it slides]; "
+            "np.inf means none."
         )
     return np.full(plant.nv, limit)

@@ -9,10 +9,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from nbs_pin.base.arguments import checked, count, number
 from nbs_pin.base.arrays import Scalars, Vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
-from nbs_pin.base.records import Run
+from nbs_pin.base.records import RUN, Run
 from nbs_pin.robots.robot import configuration_difference
 
 Numbers: TypeAlias = Scalars | np.float64
@@ -21,11 +22,13 @@ PAPER_THRESHOLD = 0.01
 """‖z1‖² below which the paper considers an arm converged [rad²]."""
 
 
+@checked(run=RUN)
 def error(run: Run) -> Float[np.ndarray, "rows *batch n"]:
     """z1 = q ⊖ q_ref at every control instant [rad], wrapped on continuous joints."""
     return configuration_difference(run.q, run.q_ref, run.continuous)
 
 
+@checked(run=RUN, shift=count(0))
 def squared_error(run: Run, shift: int = 0) -> Float[np.ndarray, "rows *batch"]:
     """‖z1‖² at every control instant [rad²], comparing q in row k + `shift` with q_ref in row k.
 
@@ -38,6 +41,7 @@ def squared_error(run: Run, shift: int = 0) -> Float[np.ndarray, "rows *batch"]:
     return np.sum(z1 * z1, axis=-1)
 
 
+@checked(run=RUN, shift=count(0), last=number(above=0.0, most=1.0))
 def steady_error(run: Run, last: float = 0.3, shift: int = 0) -> Numbers:
     """Largest ‖z1‖² over the last fraction `last` of the time [rad²]; the paper takes the last 30 s of 100 s.
 
@@ -49,14 +53,13 @@ def steady_error(run: Run, last: float = 0.3, shift: int = 0) -> Numbers:
         >>> bool(nbs.metrics.steady_error(run) < 1e-12)
         True
     """
-    if not 0.0 < last <= 1.0:
-        raise ArgumentError(f"last is {last}, expected a fraction in (0, 1]; the paper's is 0.3.")
     values = squared_error(run, shift)
     start = run.t[-1] - last * (run.t[-1] - run.t[0])
     late = run.t[shift:] >= start - 1e-9 * run.period
     return np.max(values[late], axis=0)
 
 
+@checked(run=RUN, shift=count(0), threshold=number(above=0.0, unit="rad²"))
 def convergence_time(run: Run, threshold: float = PAPER_THRESHOLD, shift: int = 0) -> Numbers:
     """First control instant [s] from which ‖z1‖² stays below the threshold [rad²] to the end; inf if there is none.
 
@@ -68,26 +71,31 @@ def convergence_time(run: Run, threshold: float = PAPER_THRESHOLD, shift: int = 
     return np.append(run.t[:rows], np.inf)[last_outside + 1]
 
 
+@checked(run=RUN, after=number(least=0.0, unit="s"))
 def rms_error(run: Run, after: float = 0.0) -> Vectors:
     """Root mean square of z1 per joint from the time `after` [s] on [rad]."""
     return np.sqrt(np.mean(error(run)[_from(run, after)] ** 2, axis=0))
 
 
+@checked(run=RUN)
 def peak_torque(run: Run) -> Numbers:
     """Largest |τ_i| applied, over time and joints [N·m]."""
     return np.max(joint_peak_torque(run), axis=-1)
 
 
+@checked(run=RUN)
 def joint_peak_torque(run: Run) -> Vectors:
     """Largest |τ_i| applied, over time, per joint [N·m]."""
     return np.max(np.abs(run.tau[:-1]), axis=0)
 
 
+@checked(run=RUN)
 def rms_torque(run: Run) -> Numbers:
     """Root mean square over time of the applied ‖τ‖ [N·m]."""
     return np.sqrt(np.mean(np.sum(run.tau[:-1] ** 2, axis=-1), axis=0))
 
 
+@checked(run=RUN, after=number(least=0.0, unit="s"))
 def saturated_fraction(run: Run, after: float = 0.0) -> Numbers:
     """Fraction of the control periods ending after `after` [s] in which the command of some joint exceeded its limit.
 
@@ -98,12 +106,14 @@ def saturated_fraction(run: Run, after: float = 0.0) -> Numbers:
     return np.mean(exceeded[run.t[1:] > after + 1e-9 * run.period], axis=0)
 
 
+@checked(run=RUN)
 def peak_torque_rate(run: Run) -> Numbers:
     """Largest |Δτ_i|/period between control instants, over time and joints [N·m/s]; 0 for a run of one period."""
     steps = np.abs(np.diff(run.tau[:-1], axis=0)) / run.period
     return np.max(steps, axis=(0, -1), initial=0.0)
 
 
+@checked(run=RUN, after=number(least=0.0, unit="s"))
 def summary(run: Run, after: float = 1.0) -> dict[str, Any]:
     """All metrics above as JSON values, with units in the keys, None for inf and a list over a batch of starts.
 

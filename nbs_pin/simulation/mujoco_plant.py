@@ -1,20 +1,23 @@
 """MuJoCo as a plant, built from the same URDF bytes as the Pinocchio model; the only module that imports mujoco."""
 
 import logging
+import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import mujoco
 import numpy as np
 
-from nbs_pin.base.arrays import Matrices, Vectors
+from nbs_pin.base.arguments import DURATION, checked, choice, either, maybe
+from nbs_pin.base.arrays import Matrices, Vectors, as_vectors, finite_result
 from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
-from nbs_pin.dynamics.friction import JointFriction, friction_of_size
-from nbs_pin.robots.robot import Robot
+from nbs_pin.dynamics.friction import FRICTION, JointFriction, friction_of_size
+from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.simulation.plant import Plant
 
-_SCRATCH = ("_data", "_qpos", "_qvel", "_torque", "_warnings")
+_SCRATCH = ("_lock", "_data", "_qpos", "_qvel", "_torque", "_warnings")
 _LOGGER = logging.getLogger("nbs_pin.mujoco")
 MujocoIntegrator: TypeAlias = Literal["rk4", "euler", "implicitfast"]
 JointFrictionChoice: TypeAlias = Literal["drop", "keep"] | JointFriction
@@ -38,7 +41,8 @@ class MujocoPlant(Plant):
     """The arm in MuJoCo, without contacts, position limits or effort limits, which `simulate` applies.
 
     MuJoCo's warnings raise SimulationDiverged; for the whole process they go to the logger "nbs_pin.mujoco" instead of
-    a file in the working directory. Each plant owns a scratch `mujoco.MjData`: use one plant per thread.
+    a file in the working directory. Each plant owns a scratch `mujoco.MjData`, which one thread uses at a time: several
+    threads may share a plant, but with a plant for each they need not wait for each other.
 
     Args:
         robot: The arm.
@@ -57,18 +61,18 @@ class MujocoPlant(Plant):
         MujocoPlant(panda, implicitfast, joint_friction=keep)
     """
 
+    @checked(
+        robot=ARM, integrator=maybe(choice(*_INTEGRATORS)), joint_friction=either(FRICTION, choice("drop", "keep"))
+    )
     def __init__(
         self, robot: Robot, integrator: MujocoIntegrator | None = None, joint_friction: JointFrictionChoice = "drop"
     ) -> None:
-        integrator = integrator or ("rk4" if joint_friction == "drop" else "implicitfast")
-        if integrator not in _INTEGRATORS:
-            raise ArgumentError(f"integrator '{integrator}' is unknown; give one of {', '.join(_INTEGRATORS)}.")
+        is_dropped = isinstance(joint_friction, str) and joint_friction == "drop"
+        integrator = integrator or ("rk4" if is_dropped else "implicitfast")
         if isinstance(joint_friction, JointFriction):
             friction_of_size(joint_friction, robot.nv)
-        elif joint_friction not in ("drop", "keep"):
-            raise ArgumentError(f"joint_friction '{joint_friction}' is unknown; give 'drop' or 'keep'.")
         mujoco.set_mju_user_warning(_LOGGER.info)
-        self._robot = robot
+        self._robot, self._nv = robot, robot.nv
         self.integrator = integrator
         self.joint_friction = joint_friction
         self.model = build_model(robot, integrator, joint_friction)
@@ -78,7 +82,7 @@ class MujocoPlant(Plant):
         self._bind()
 
     def _bind(self) -> None:
-        self._data = mujoco.MjData(self.model)
+        self._data, self._lock = mujoco.MjData(self.model), threading.Lock()
         # Views, fetched once: every access through MjData would create new ones.
         self._qpos, self._qvel, self._torque = self._data.qpos, self._data.qvel, self._data.qfrc_applied
         self._warnings = self._data.warning.number
@@ -112,23 +116,43 @@ class MujocoPlant(Plant):
         Raises:
             SimulationDiverged: If an input or the result is not finite, or MuJoCo issues a warning.
         """
-        self.model.opt.timestep = duration
-        if q.ndim == 1:
-            return self._step_row(q, v, tau)
-        result = _stack(lambda *row: np.array(self._step_row(*row)), q, v, tau)
+        duration = _DURATION(duration)
+        q, v, tau = self._vectors(q=q, v=v, tau=tau)
+        with self._lock:
+            self.model.opt.timestep = duration
+            if q.ndim == 1:
+                return self._step_row(q, v, tau)
+            result = _stack(lambda *row: np.array(self._step_row(*row)), q, v, tau)
         return result[..., 0, :], result[..., 1, :]
 
     def acceleration(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
         """v̇ [rad/s²] for the torque τ [N·m], by MuJoCo's forward dynamics."""
-        return _stack(lambda *row: self._forward(*row).qacc[self._at_v].copy(), q, v, tau)
+        q, v, tau = self._vectors(q=q, v=v, tau=tau)
+        with self._lock:
+            a = _stack(lambda *row: self._forward(*row).qacc[self._at_v].copy(), q, v, tau)
+        return finite_result("v̇", a, q, v, tau)
 
     def bias(self, q: Vectors, v: Vectors) -> Vectors:
         """C(q, v) v + G(q) [N·m], without joint friction."""
-        return _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v].copy(), q, v, np.zeros_like(v))
+        q, v = self._vectors(q=q, v=v)
+        with self._lock:
+            torque = _stack(lambda *row: self._forward(*row).qfrc_bias[self._at_v].copy(), q, v, np.zeros_like(v))
+        return finite_result("the bias", torque, q, v)
 
     def mass_matrix(self, q: Vectors) -> Matrices:
         """M(q) [kg·m²]."""
-        return _stack(self._mass_matrix_row, q, np.zeros_like(q), np.zeros_like(q))
+        (q,) = self._vectors(q=q)
+        with self._lock:
+            return _stack(self._mass_matrix_row, q, np.zeros_like(q), np.zeros_like(q))
+
+    def _vectors(self, **vectors: Vectors) -> tuple[np.ndarray, ...]:
+        """The vectors as float arrays of one shape (..., nv)."""
+        arrays = as_vectors(self._nv, **vectors)
+        if arrays[0].shape[0] == 0:
+            raise ArgumentError(f"{self!r} was given no states, arrays of shape {arrays[0].shape}; give at least one.")
+        if type(arrays[0]) is not np.ndarray:
+            raise ArgumentError(f"{self!r} was given torch tensors, expected numpy arrays; give x.numpy().")
+        return arrays
 
     def _mass_matrix_row(self, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
         full = np.zeros((self.model.nv, self.model.nv))
@@ -168,6 +192,9 @@ class MujocoPlant(Plant):
             cause = mujoco.mju_warningText(kind, int(self._data.warning.lastinfo[kind]))
             mujoco.mj_resetData(self.model, self._data)
             raise SimulationDiverged(f"{self!r}: {cause} Take a shorter plant step, or check the controller.")
+
+
+_DURATION = partial(DURATION, "duration")
 
 
 def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: JointFrictionChoice) -> mujoco.MjModel:

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 
+from nbs_pin.base.arguments import a
 from nbs_pin.base.arrays import Vectors
 from nbs_pin.robots.robot import Robot
 
@@ -26,3 +27,7 @@ class Plant(ABC):
         Raises:
             SimulationDiverged: If the result is not finite, or the engine reports a warning.
         """
+
+
+PLANT = a(Plant, "a plant, such as MujocoPlant(robot)")
+"""The check of an argument that is a plant."""

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from nbs_pin.base.checks import floats
+from nbs_pin.base.arguments import called
+from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import Controller
@@ -66,8 +67,9 @@ class Batch:
 
         tau_d is a constant torque, a number or (n,). Raises ArgumentError if starts or torque do not match the loop.
         """
-        _, leads, desired, target = loop.schedule(reference)
         q, v = (np.array(x).reshape(-1, loop.plant.nv) for x in loop.start(reference, q0, v0))
+        loop.check_size(len(q))
+        _, leads, desired, target = loop.schedule(reference)
         aim = np.stack([desired.a, target.q, target.v, target.a], axis=1)[:-1]
         aims, wanted = (np.tile(x, (len(q), 1, 1, 1)) for x in (aim, np.stack(desired, axis=1)))
         torque = np.zeros((len(q), loop.steps, loop.plant.nv)) + _constant_torque(tau_d, loop.plant.nv)
@@ -137,7 +139,13 @@ def running_cost(motion: Motions, batch: Batch, cost: StageCost) -> Float[torch.
     robot = batch.loop.plant.robot
     q_ref, v_ref = (torch.as_tensor(batch.desired[:, 1:, k]).to(motion.q) for k in (0, 1))
     z1 = configuration_difference(motion.q[:, 1:], q_ref, None if robot is None else robot.continuous)
-    return batch.loop.period * cost(z1, motion.v[:, 1:] - v_ref, motion.command).sum(-1)
+    price = called("the cost", cost, z1, motion.v[:, 1:] - v_ref, motion.command)
+    if not isinstance(price, torch.Tensor) or price.shape != z1.shape[:-1]:
+        raise ArgumentError(
+            f"the cost of errors of shape {tuple(z1.shape)} is {told(price)}, expected a tensor of one number per"
+            f" instant, shape {tuple(z1.shape[:-1])}; sum over the joints alone."
+        )
+    return batch.loop.period * price.sum(-1)
 
 
 def recorded(motion: Motions, batch: Batch, controller: str) -> Run:
@@ -171,7 +179,7 @@ def _constant_torque(tau_d: Any, nv: int) -> np.ndarray:
     torque = floats("disturbance", 0.0 if tau_d is None else tau_d)
     if torque.shape not in ((), (nv,)) or not np.isfinite(torque).all():
         raise ArgumentError(
-            f"disturbance is {tau_d}, expected one finite torque or {nv}, one per joint [N·m, N where it slides]."
+            f"disturbance is {told(tau_d)}, expected one finite torque or {nv}, one per joint [N·m, N where it slides]."
         )
     return torque
 

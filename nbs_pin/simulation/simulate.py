@@ -13,20 +13,37 @@ from typing import Any
 import joblib
 import numpy as np
 
-from nbs_pin.base.checks import all_finite
-from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
+from nbs_pin.base.arguments import DURATION, MOST_PERIODS, PERIOD, called, checked, count, flag, function, maybe, number
+from nbs_pin.base.checks import all_finite, floats
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged, TooLarge
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Reference, Run
-from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.motions.disturbances import Disturbance, TorqueNoise
-from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.motions.references import MOTION, DesiredMotion
 from nbs_pin.simulation.loop import Loop
-from nbs_pin.simulation.plant import Plant
+from nbs_pin.simulation.plant import PLANT, Plant
 
 _MEMORY = "/dev/shm"
+MOST_STREAMED = 10**12
+"""Most control periods of a motion that is recorded in blocks."""
 _RECORDED = ("q", "v", "tau", "tau_command", "disturbance")
 
 
+_LOOP = {
+    "plant": PLANT,
+    "controller": CONTROLLER,
+    "reference": MOTION,
+    "duration": DURATION,
+    "period": PERIOD,
+    "plant_step": maybe(PERIOD),
+    "disturbance": maybe(function(3, "a disturbance, a function of t, q and v that returns torques, or None")),
+    "lookahead": maybe(number(least=0.0, most=1000.0, unit="s")),
+    "progress": flag,
+}
+
+
+@checked(**_LOOP, workers=count(1, 1024, "processes"))
 def simulate(
     plant: Plant,
     controller: Controller,
@@ -77,12 +94,11 @@ def simulate(
         >>> nbs.simulate(plant, law, nbs.Hold([0.3, 0.2]), duration=0.1, period=0.001).q.shape
         (101, 2)
     """
-    if workers < 1 or workers != int(workers):
-        raise ArgumentError(f"workers is {workers}, expected a whole number of processes ≥ 1; correct it.")
     loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
     start = loop.start(reference, q0, v0)
+    loop.check_size(math.prod(start[0].shape[:-1]))
     if workers > 1:
-        return _shared(loop, reference, start, int(workers))
+        return _shared(loop, reference, start, workers)
     return _block(loop, reference, 0, loop.steps, start, None, progress)[0]
 
 
@@ -132,6 +148,7 @@ def _share(
     return replace(run, **{name: getattr(run, name)[:, :1] for name in (*_RECORDED, "q_ref", "v_ref", "a_ref")})
 
 
+@checked(**_LOOP, block=count(1, MOST_PERIODS, "periods"))
 def stream(
     plant: Plant,
     controller: Controller,
@@ -161,9 +178,7 @@ def stream(
         >>> [len(run.t) for run in nbs.stream(plant, law, nbs.Hold([0.3, 0.2]), 0.2, 0.001, block=100)]
         [101, 101]
     """
-    loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
-    if block < 1:
-        raise ArgumentError(f"block is {block} periods, expected at least one; 1000 is usual.")
+    loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance, MOST_STREAMED)
     return _blocks(loop, reference, loop.start(reference, q0, v0), block, progress)
 
 
@@ -195,9 +210,10 @@ def _closed(
     effort_limit: Any,
     lookahead: float | None,
     disturbance: Disturbance | None,
+    most: float | None = None,
 ) -> _Closed:
     settings = {"plant_step": plant_step, "effort_limit": effort_limit, "lookahead": lookahead}
-    loop = Loop.of(plant, controller.nv, duration, period, **settings)
+    loop = Loop.of(plant, controller.nv, duration, period, **settings, most=most)
     return _Closed(**vars(loop), law=_compiled(controller), name=type(controller).__name__, disturbance=disturbance)
 
 
@@ -234,7 +250,10 @@ def _control(loop: _Closed, run: Run, k: int, lead: float, target: Reference, me
     """The torque of row k, evaluated `lead` [s] ahead and recorded in the run, and the memory after it."""
     q, v, tau, dv = run.q[k], run.v[k], run.tau[k], lead * run.a_ref[k]
     aim = Reference(target.q[k], target.v[k], target.a[k])
-    command, memory = loop.law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, loop.period)
+    try:
+        command, memory = loop.law.step(memory, q + lead * (v + 0.5 * dv), v + dv, aim, loop.period)
+    except TooLarge as error:
+        raise SimulationDiverged(f"the loop has diverged at t = {float(run.t[k]):g} s: {loop.name}: {error}") from error
     # Checked before clipping, which can turn NaN into full effort.
     run.tau_command[k] = command = _checked(command, q.shape, loop.name, float(run.t[k]))
     np.maximum(np.minimum(command, loop.limit, out=tau), -loop.limit, out=tau)
@@ -243,7 +262,8 @@ def _control(loop: _Closed, run: Run, k: int, lead: float, target: Reference, me
 
 def _advance(loop: _Closed, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The state one period after row k; records the disturbance at its start."""
-    q, v, t, step = run.q[k], run.v[k], float(run.t[k]), loop.step
+    # Copies: a plant that writes into its arguments must not change the record.
+    q, v, t, step = run.q[k].copy(), run.v[k].copy(), float(run.t[k]), loop.step
     try:
         for j in range(loop.substeps):
             total = tau
@@ -259,7 +279,7 @@ def _advance(loop: _Closed, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarr
 
 
 def _checked(command: Any, shape: tuple[int, ...], name: str, t: float) -> np.ndarray:
-    command = np.asarray(command, dtype=float)
+    command = floats(f"{name}'s torque", command)
     if command.shape != shape:
         raise ArgumentError(
             f"{name} gave a torque of shape {command.shape} at t = {t:g} s, expected {shape}; "
@@ -274,7 +294,7 @@ def _checked(command: Any, shape: tuple[int, ...], name: str, t: float) -> np.nd
 
 
 def _disturbance(disturbance: Disturbance, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    torque = np.asarray(disturbance(t, q, v), dtype=float)
+    torque = floats("the disturbance", called("the disturbance", disturbance, t, q, v))
     if torque.shape not in (q.shape, q.shape[-1:]):
         raise ArgumentError(
             f"the disturbance at t = {t:g} s has shape {torque.shape}, expected {q.shape}; return one torque per joint."

@@ -18,12 +18,14 @@ import torch
 from safetensors import SafetensorError
 
 from nbs_pin.base.archives import parse_json, read_archive, write_archive
+from nbs_pin.base.arguments import a, checked, mapping, maybe, readable, writable
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError, RobotError, RobotNotFound
 from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
 from nbs_pin.controllers.controller import Controller
+from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robots.named import load_named
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.storage.descriptions import Settings, Stored, describe, described_robot, rebuild
 
 FORMAT = "nbs_pin checkpoint 1"
@@ -41,6 +43,10 @@ class TrainingState:
     """JSON values: epoch, best cost, history, random state as integers."""
 
 
+STORABLE = a((Controller, DynamicsProvider), "a control law or a model of an arm")
+"""The check of an argument that can be stored."""
+
+
 class Checkpoint(NamedTuple):
     """Contents of a checkpoint."""
 
@@ -50,6 +56,7 @@ class Checkpoint(NamedTuple):
     """State of the training during which it was written, or None."""
 
 
+@checked(controller=STORABLE, path=writable, info=maybe(mapping))
 def save(controller: Stored, path: str | Path, *, info: Mapping[str, Any] | None = None) -> None:
     """Write a controller or a model to one file, from which `load` restores the same torques bit for bit.
 
@@ -72,6 +79,7 @@ def save(controller: Stored, path: str | Path, *, info: Mapping[str, Any] | None
     write_checkpoint(path, controller, info=info)
 
 
+@checked(path=readable, robot=maybe(ARM))
 def load(path: str | Path, robot: Robot | None = None) -> Any:
     """The `Controller` or `DynamicsProvider` that `save` wrote to the file; the report of a model becomes a dict.
 
@@ -88,6 +96,7 @@ def load(path: str | Path, robot: Robot | None = None) -> Any:
     return read_checkpoint(path, robot).controller
 
 
+@checked(path=readable)
 def about(path: str | Path) -> dict[str, Any]:
     """`controller` (settings, arm), `versions` and `info` of a file, without building anything; raises as `load`."""
     return _document(path, read_archive(path, FORMAT))

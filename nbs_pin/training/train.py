@@ -10,12 +10,27 @@ import numpy as np
 import torch
 from torch import nn
 
+from nbs_pin.base.arguments import (
+    DURATION,
+    PERIOD,
+    SEED,
+    checked,
+    choice,
+    count,
+    flag,
+    function,
+    many,
+    maybe,
+    number,
+    writable,
+)
+from nbs_pin.base.checks import integral, real
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.controllers.controller import Controller
-from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.controllers.controller import CONTROLLER, Controller
+from nbs_pin.motions.references import MOTION, DesiredMotion
 from nbs_pin.simulation.costs import StageCost, TorqueAware
 from nbs_pin.simulation.loop import Loop
-from nbs_pin.simulation.plant import Plant
+from nbs_pin.simulation.plant import PLANT, Plant
 from nbs_pin.simulation.rollout import Batch, Engine, check_plant, engine_for
 from nbs_pin.training.optimisers import LEARNING_RATES
 from nbs_pin.training.trainer import Regulariser, Task, Trainer, Training
@@ -23,6 +38,28 @@ from nbs_pin.training.trainer import Regulariser, Task, Trainer, Training
 __all__ = ["Regulariser", "Training", "train"]
 
 
+@checked(
+    controller=CONTROLLER,
+    plant=PLANT,
+    references=many(MOTION, 1, 100_000, "motions"),
+    start_error=number(least=0.0, unit="rad"),
+    duration=DURATION,
+    period=PERIOD,
+    plant_step=maybe(PERIOD),
+    lookahead=maybe(number(least=0.0, most=1000.0, unit="s")),
+    cost=maybe(function(3, "a cost, a function of error, its rate and torque, such as TorqueAware.for_robot(robot)")),
+    regulariser=maybe(function(1, "a regulariser, a function of the controller, or None")),
+    gains=flag,
+    epochs=count(1, 1_000_000, "epochs"),
+    optimiser=choice(*LEARNING_RATES),
+    learning_rate=maybe(number(above=0.0)),
+    patience=maybe(count(1, 1_000_000, "epochs")),
+    seed=SEED,
+    checkpoint=maybe(writable),
+    resume=flag,
+    engine=maybe(choice("kernels", "torch")),
+    progress=flag,
+)
 def train(
     controller: Controller,
     plant: Plant,
@@ -85,10 +122,6 @@ def train(
     """
     if not isinstance(controller, nn.Module):
         raise ArgumentError(f"{type(controller).__name__} has no parameters to train; give one of the package's laws.")
-    if epochs < 1 or epochs != int(epochs):
-        raise ArgumentError(f"epochs is {epochs}, expected a whole number ≥ 1; the paper takes 200.")
-    if patience is not None and patience < 1:
-        raise ArgumentError(f"patience is {patience} epochs, expected at least one; None takes all epochs.")
     step = period if plant_step is None else plant_step
     settings = {"plant_step": step, "effort_limit": effort_limit, "lookahead": lookahead}
     loop = Loop.of(plant, controller.nv, duration, period, **settings)
@@ -101,7 +134,7 @@ def train(
         cost=TorqueAware(torch.as_tensor(loop.limit)) if cost is None else cost,
         regulariser=regulariser,
         gains=gains,
-        epochs=int(epochs),
+        epochs=epochs,
         optimiser=optimiser,
         learning_rate=LEARNING_RATES.get(optimiser, 1.0) if learning_rate is None else learning_rate,
         patience=patience,
@@ -116,15 +149,12 @@ def _batches(
     loop: Loop, references: Sequence[DesiredMotion], starts: Any, held_out: Any, error: float, tau_d: Any, seed: int
 ) -> tuple[Batch, Batch | None]:
     """The training and the held-out motions."""
-    if not references:
-        raise ArgumentError("references is empty; give at least one motion to follow.")
-    if not 0.0 <= error < math.inf:
-        raise ArgumentError(f"start_error is {error} rad, expected a finite angle ≥ 0; 0.5 is usual.")
     draw = np.random.default_rng(seed)
     training = _motions(loop, references, starts, error, tau_d, draw)
     if held_out is None:
-        held_out = math.ceil(starts / 4) if isinstance(starts, int | np.integer) else 0
-    kept = None if isinstance(held_out, int | np.integer) and held_out == 0 else held_out
+        number_of_starts = _count_of(starts)
+        held_out = 0 if number_of_starts is None else math.ceil(number_of_starts / 4)
+    kept = None if _count_of(held_out) == 0 else held_out
     return training, None if kept is None else _motions(loop, references, kept, error, tau_d, draw)
 
 
@@ -139,11 +169,19 @@ def _motions(
     """Motions along every reference from every start; random starts differ between references."""
     batches = []
     for reference in references:
-        q0, v0 = starts if isinstance(starts, tuple) else (starts, None)
-        if isinstance(starts, int | np.integer):
-            if starts < 1:
-                raise ArgumentError(f"the number of starts is {starts}, expected at least one; 32 is usual.")
+        q0, v0 = starts if isinstance(starts, tuple) and len(starts) == 2 else (starts, None)
+        number_of_starts = _count_of(starts)
+        if number_of_starts is not None:
+            count(1, 100_000)("the number of starts", number_of_starts)
             begin = loop.schedule(reference, 0, 0).desired.q[0]
-            q0 = begin + draw.uniform(-start_error, start_error, (starts, loop.plant.nv))
+            q0 = begin + draw.uniform(-start_error, start_error, (number_of_starts, loop.plant.nv))
         batches.append(Batch.of(loop, reference, q0, v0, disturbance))
     return Batch.joined(batches)
+
+
+def _count_of(starts: Any) -> int | None:
+    """The number of random starts, if one number was given; raises ArgumentError unless it is whole."""
+    number_given = real(starts)
+    if number_given is None:
+        return None
+    return count(0, 100_000)("the number of starts", integral(starts) if integral(starts) is not None else starts)

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from nbs_pin.base.arguments import called
+from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.progress import tracked, waiting
 from nbs_pin.controllers.gain import Gain
@@ -79,7 +81,12 @@ class Task:
     def loss(self) -> torch.Tensor:
         """Cost to minimise: mean cost of the training motions plus regulariser."""
         value = self.value(self.training)
-        return value if self.regulariser is None else value + self.regulariser(self.controller)
+        if self.regulariser is None:
+            return value
+        price = called("the regulariser", self.regulariser, self.controller)
+        if not isinstance(price, torch.Tensor) or price.numel() != 1:
+            raise ArgumentError(f"the regulariser gave {told(price)}, expected a scalar tensor; correct it.")
+        return value + price.reshape(())
 
     def warm_up(self) -> None:
         """Compile everything: run one period of one motion, and its gradient."""

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from nbs_pin.base.exceptions import FileFormatError, MissingExtra
+from nbs_pin.base.exceptions import FileFormatError, MissingExtra, NoSuchFile
 
 try:
     import jsonschema
@@ -67,7 +67,7 @@ def check_arm(path: Path, stated: dict[str, Any] | None, robot: Arm) -> None:
 def read_document(path: Path) -> dict[str, Any]:
     """The content of the file; raises FileFormatError unless it fits the schema and its own number of joints."""
     schema = json.loads(files("nbs_pin.verification").joinpath("certificate.schema.json").read_text("utf-8"))
-    content = path.read_bytes()
+    content = file_content(path)
     try:
         document: dict[str, Any] = json.loads(
             content, object_pairs_hook=_unique, parse_float=_finite, parse_constant=_finite, parse_int=_whole
@@ -82,6 +82,21 @@ def read_document(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: no certificate of format 1 ({error}); write the file again.") from error
     return document
+
+
+def file_content(path: Path) -> bytes:
+    """The bytes of a file; raises NoSuchFile if there is none, FileFormatError if it cannot be read."""
+    try:
+        if path.is_file():
+            return path.read_bytes()
+        if not path.exists():
+            raise NoSuchFile(f"no file {str(path)!r:.200}; correct the path.")
+        fault = "it is no regular file"
+    except (OSError, ValueError) as error:
+        if isinstance(error, NoSuchFile):
+            raise
+        fault = getattr(error, "strerror", None) or str(error)
+    raise FileFormatError(f"{str(path)!r:.200} cannot be read: {fault}; give the path of a file.")
 
 
 def is_unchanged(document: dict[str, Any]) -> bool:

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from defusedxml import ElementTree
 
-from nbs_pin.base.exceptions import FileFormatError
+from nbs_pin.base.exceptions import FileFormatError, NoSuchFile
 from nbs_pin.verification.balls import Balls, arb, balls, certain, positive_definite, skew
+from nbs_pin.verification.document import file_content
 
 SAME = 1e-10
 """Largest difference between two arms, relative to the sizes of the arm and of its bodies."""
@@ -47,7 +48,9 @@ def urdf_tree(path: Path, joints: list[dict[str, Any]]) -> list[Link]:
     Joints that the file does not name are held at zero. Raises FileFormatError if it is not a URDF with these joints.
     """
     try:
-        return _Description(ElementTree.parse(path).getroot(), joints).links()
+        return _Description(ElementTree.fromstring(file_content(path)), joints).links()
+    except (NoSuchFile, FileFormatError):
+        raise
     except (ValueError, KeyError, AttributeError, TypeError, SyntaxError, RecursionError) as error:
         raise FileFormatError(f"{path}: not the URDF of this certificate ({error}); give its own.") from error
 

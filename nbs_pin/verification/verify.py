@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.verification.balls import Balls, arb, balls, certain, ctx, inverse, positive_definite, skew
 from nbs_pin.verification.document import Arm, check_arm, read_document, unit
 from nbs_pin.verification.stated import FALSE, OPEN, TAKEN, Check, decided, stated
@@ -49,6 +50,9 @@ def verify(path: str | Path, *, urdf: str | Path | None = None, robot: Arm | Non
         FileFormatError: If it is no certificate, or the URDF or the robot is not that of its arm.
         MissingExtra: If the extra `verify` is not installed.
     """
+    for name, given in (("path", path), ("urdf", urdf)):
+        if (given is not None or name == "path") and not isinstance(given, str | Path):
+            raise ArgumentError(f"verify: {name} is a {type(given).__name__}; give the path of a file.")
     document = read_document(Path(path))
     if robot is not None:
         check_arm(Path(path), document["arm"], robot)

@@ -1,0 +1,1 @@
+"""Calls of the public Python interface with hostile arguments (`tools/fuzz_api.py`)."""
