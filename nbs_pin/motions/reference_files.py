@@ -245,6 +245,9 @@ def _read_npz(path: Path) -> _Columns:
     require(data, path, {"t": "f", "q": "f"} | ({"v": "f"} if "v" in data else {}))
     if data["q"].ndim != 2:
         raise FileFormatError(f"{path}: 'q' has shape {data['q'].shape}, expected (rows, joints); choose one motion.")
+    if data["t"].shape != data["q"].shape[:1]:
+        wanted = data["q"].shape[:1]
+        raise FileFormatError(f"{path}: 't' has shape {data['t'].shape}, expected {wanted}: one time per row of q.")
     if "v" in data and data["v"].shape != data["q"].shape:
         raise FileFormatError(f"{path}: 'v' has shape {data['v'].shape}, q {data['q'].shape}; match them.")
     if "joint_names" not in data:
