@@ -12,7 +12,8 @@ from nbs_pin.base.claims import Label
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.coriolis import CoriolisBounds
-from nbs_pin.certificates.hold import Curvature, SampledLaw, hold_of, rows_in_g
+from nbs_pin.certificates.hold import hold_of, rows_in_g
+from nbs_pin.certificates.sampled_law import Curvature, SampledLaw
 from nbs_pin.certificates.sampled_loop import _ENLARGED, _excess, _limit, kept_level
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.controllers.gains import Gains, effective_inertia
@@ -102,7 +103,7 @@ class OneHold:
         force = np.einsum("kij,kj->ki", self.mass, a - e.a_r)
         loss = np.sqrt((e.gradient**2 * k.rate).sum(axis=1)).max()
         found = torque(e.gradient), loss, speed(e.z2), energy(e.z2), speed(rate), energy(rate), torque(force)
-        return np.array(found)
+        return np.array([*found, speed(a - e.a_r), energy(a - e.a_r)])
 
     def g(self):
         k, e = self.loop.constants, self.errors
@@ -272,7 +273,7 @@ def test_a_reference_without_a_bound_of_its_jerk_is_not_covered():
 def test_a_look_ahead_out_of_range_is_refused(lookahead):
     robot = nbs.load_robot("two_link")
     law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
-    with pytest.raises(nbs.ArgumentError, match="half a period is usual"):
+    with pytest.raises(nbs.ArgumentError, match="lookahead is"):
         nbs.certify(law, np.full(2, 5.0), reference=reference, period=0.001, lookahead=lookahead)
 
 

@@ -15,6 +15,7 @@ from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.attack import Attack, attack, random_disturbances
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.certify import certify
+from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.ensemble import motions_of
 from nbs_pin.certificates.loads import MARGIN, gravity_error, payload, total
 from nbs_pin.certificates.model_structure import is_exact
@@ -80,6 +81,10 @@ class Task:
     """Closed-loop trajectories from which the error of an inexact model is bounded."""
     uncertainty: Uncertainty | None = None
     """How far the true arm may differ from the law's model."""
+    delay: float = 0.0
+    """From a reading to the beginning of the hold of its torque [s]."""
+    encoders: Encoders | None = None
+    """What positions are read with; None for exact states."""
     seed: int = 0
 
     def loads(self, robot: Robot) -> tuple[Admissible, ...]:
@@ -124,6 +129,8 @@ def assess(
             q0=start,
             mismatch=error,
             period=task.period,
+            delay=task.delay,
+            encoders=task.encoders,
             robot=robot,
             friction=task.friction,
             uncertainty=task.uncertainty,

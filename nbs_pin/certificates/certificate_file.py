@@ -125,8 +125,10 @@ def certificate_document(certificate: Certificate) -> dict[str, Any]:
 
 def _held(certificate: Certificate, held: HeldTorque) -> dict[str, Any]:
     return {
-        "period": held.period,
-        "lookahead": held.lookahead,
+        "period": held.readings.period,
+        "lookahead": held.readings.lookahead,
+        "delay": held.readings.delay,
+        "encoder_steps": held.readings.steps,
         "level": held.level,
         "error": certificate.error,
         "joint_errors": certificate.joint_errors,

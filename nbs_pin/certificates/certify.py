@@ -20,9 +20,10 @@ from nbs_pin.certificates.certificate import Certificate, Start
 from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.comparison_system import ComparisonSystem, decay, level, reach
 from nbs_pin.certificates.constants import Constants, constants_of
+from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.error_bounds import errors, radians
 from nbs_pin.certificates.friction_error import FrictionError, FrictionGap, friction_error
-from nbs_pin.certificates.held_torque import held_torque
+from nbs_pin.certificates.held_torque import Readings, held_torque
 from nbs_pin.certificates.margins import (
     effort_margin,
     hold_margin,
@@ -59,6 +60,8 @@ _UNKNOWN_ERROR = ModelError(0.0, 0.0, 0.0, (_UNKNOWN,), ())
     mismatch=maybe(a(Mismatch, "compare(…).mismatch")),
     period=maybe(PERIOD),
     lookahead=maybe(number(least=0.0, most=1000.0, unit="s")),
+    delay=number(least=0.0, most=1000.0, unit="s"),
+    encoders=maybe(a(Encoders, "Encoders, such as Encoders.of_bits(16)")),
     robot=maybe(ARM),
     friction=maybe(FRICTION),
     uncertainty=maybe(a(Uncertainty, "an Uncertainty, such as Uncertainty(inertia=0.05)")),
@@ -74,6 +77,8 @@ def certify(
     mismatch: Mismatch | None = None,
     period: float | None = None,
     lookahead: float | None = None,
+    delay: float = 0.0,
+    encoders: Encoders | None = None,
     robot: Robot | None = None,
     friction: JointFriction | None = None,
     uncertainty: Uncertainty | None = None,
@@ -93,7 +98,9 @@ def certify(
         mismatch: Error δ of a learned model along closed loops (`compare(…).mismatch`). Needs the reference.
         period: Control period, over which every torque is held [s]. With the reference, the bounds are those of the
             loop as it runs wherever that can be proved; else the period is compared with the rules of sampled control.
-        lookahead: How far ahead the law is evaluated [s], as in `simulate`; None takes half a period.
+        lookahead: How far ahead of a reading the law is evaluated [s]; None takes the delay and half a period.
+        delay: From the reading of a state to the beginning of the hold of its torque [s], 0 to a period.
+        encoders: Positions are rounded to their steps, and velocities are differences over a period; None is exact.
         robot: The true arm. None takes the model's.
         friction: Joint friction of the arm. None takes the URDF's; without an arm, that which is fed forward.
         uncertainty: How far bodies and friction of the arm may differ from the law's model and from the friction
@@ -113,6 +120,7 @@ def certify(
     arm = law.dynamics.robot if robot is None else robot
     start = _check_arguments(law, arm, reference, duration, q0, v0, mismatch, period)
     bodies = _uncertain_bodies(uncertainty, reference, mismatch)
+    _check_readings(period, bodies, delay, encoders)
     gap = _friction(law, arm, friction, uncertainty)
     constants, admissible = constants_of(law, gap.damping), Admissible.of(disturbance, law.nv)
     motion = _sampled(law.nv, reference, duration)
@@ -121,9 +129,8 @@ def certify(
     comparison = _comparison(constants, admissible, error, rest)
     if bodies is not None and reference is not None and motion is not None:
         found = bounds_for_all(law, bodies, constants, comparison, rest, reference, motion, start)
-        return _with_conditions(
-            _for_all(found, law, admissible, constants, rest, arm, start), reference, motion, period
-        )
+        certificate = _for_all(found, law, admissible, constants, rest, arm, start)
+        return _with_conditions(certificate, reference, motion, period)
     least = level(comparison)
     if not math.isfinite(least.storage):
         raise CertificateRefused(_why_not(comparison, mismatch is not None, bool(rest.lines)))
@@ -131,31 +138,30 @@ def certify(
     size, joints, source = errors(law, constants, comparison, least.storage, potential)
     known = (law, admissible, constants, error, rest, comparison, 0.5 * decay(comparison), least, potential)
     certificate = Certificate(*known, size, joints, source, robot=arm, mismatch=mismatch, start=start)
-    return _with_conditions(_held(certificate, reference, motion, period, lookahead), reference, motion, period)
+    if period is not None:
+        steps = None if encoders is None else encoders.resolution(certificate)
+        certificate = _held(certificate, reference, motion, Readings.of(period, lookahead, delay, steps))
+    return _with_conditions(certificate, reference, motion, period)
 
 
 def _held(
-    certificate: Certificate,
-    reference: DesiredMotion | None,
-    motion: SampledMotion | None,
-    period: float | None,
-    lookahead: float | None,
+    certificate: Certificate, reference: DesiredMotion | None, motion: SampledMotion | None, readings: Readings
 ) -> Certificate:
     """The certificate with the bounds of the held torque in place of those in continuous time, if they are proved."""
-    if period is None:
-        return certificate
     law, constants = certificate.controller, certificate.constants
     inexact = certificate.mismatch is not None or bool(certificate.model_error.lines)
     other = "an inexact model is not part of the proof" if inexact else ""
+    if certificate.start is not None and not readings.is_plain:
+        other = other or "a start away from the reference is not part of the proof with a delay or encoders"
     gap = certificate.friction.gap
     # Of friction known to a share, the least is in D₀, and the most acts.
     loop = law, certificate.robot, constants, certificate.comparison, 2.0 * gap.arm.viscous - gap.damping
     begin = 0.0 if certificate.start is None else certificate.start.storage
-    held = held_torque(*loop, motion, _jerk(reference, motion), certificate.storage, begin, period, lookahead, other)
+    held = held_torque(*loop, motion, _jerk(reference, motion), certificate.storage, begin, readings, other)
     if not held.is_proved:
         return replace(certificate, held=held)
     size, joints = radians(constants.stiffness, held.potential)
-    source = f"Φ ≥ z1ᵀSz1, every torque held for {1e3 * period:g} ms along the reference, docs/certificates.md §13"
+    source = f"Φ ≥ z1ᵀSz1, every {readings} along the reference, docs/certificates.md §13"
     return replace(certificate, held=held, potential=held.potential, error=size, joint_errors=joints, source=source)
 
 
@@ -195,6 +201,11 @@ def _check_arguments(
             raise ArgumentError(f"{name} is {told(x)}, expected {law.nv} finite numbers, one per joint; correct it.")
     begin = Reference(*(x[0] for x in at_times(reference, np.zeros(1), law.nv)))
     return Start(*start, begin, float(law.storage(*start, begin.q, begin.v)))
+
+
+def _check_readings(period: float | None, bodies: Uncertainty | None, delay: float, encoders: Encoders | None) -> None:
+    if (period is None or bodies is not None) and (delay or encoders is not None):
+        raise ArgumentError("delay and encoders need the control period and certain bodies; give period, omit inertia.")
 
 
 def _uncertain_bodies(
@@ -330,7 +341,7 @@ def _with_conditions(
         reached, potential = max(reached, start.storage), max(potential, start.storage)
     margins, found = sampled_control(law, period, reached, potential)
     is_held = certificate.held is not None and certificate.held.is_proved
-    if certificate.held is not None and is_held:
+    if certificate.held is not None and (is_held or not certificate.held.readings.is_plain):
         found = (certificate.held.condition,)
     known = certificate.constants.label
     conditions = [

@@ -19,6 +19,8 @@ class Coriolis(NamedTuple):
     """|C(q, φ)b|_* ≤ slow·|b|_M, with φ in place of v."""
     form: float
     """|aᵀC(q, v)b| ≤ form·|a|_M|b|_M."""
+    slow_form: float
+    """|aᵀC(q, φ)b| ≤ slow_form·|a|_M|b|_M."""
 
 
 class Norms(NamedTuple):
@@ -75,6 +77,7 @@ class Velocity:
             by_energy=0.5 * (isk * self.turn + mixed * motion.speed + error_m + arm.spread * speed_m),
             slow=0.5 * (isk * slow_angle + slow + arm.spread * (reference_m + arm.loss_m * ahead)),
             form=0.5 * (self.turn + 2.0 * arm.turn * speed_m),
+            slow_form=0.5 * (slow_angle + 2.0 * arm.turn * (reference_m + arm.loss_m * ahead)),
         )
 
     def _sum(self, by_m: float, by_d: float, pull: float) -> float:

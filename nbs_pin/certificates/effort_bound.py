@@ -10,7 +10,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.rounding import largest_eigenvalue
 from nbs_pin.certificates.constants import Constants, above_inverse
 from nbs_pin.certificates.coriolis import CoriolisBounds, MotionBounds, Sizes
-from nbs_pin.certificates.hold import UP, Curvature
+from nbs_pin.certificates.sampled_law import UP, Curvature
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 
 

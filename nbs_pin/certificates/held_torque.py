@@ -13,8 +13,8 @@ from nbs_pin.certificates.comparison_system import ComparisonSystem
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.coriolis import MOST_JOINTS, CoriolisBounds
 from nbs_pin.certificates.effort_bound import Asked, torque_bound
-from nbs_pin.certificates.hold import Curvature, SampledLaw
-from nbs_pin.certificates.sampled_loop import Kept, kept_level
+from nbs_pin.certificates.sampled_law import Curvature, SampledLaw
+from nbs_pin.certificates.sampled_loop import kept_level
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.analytic import AnalyticDynamics
@@ -28,13 +28,51 @@ _ROUNDING = 1e-9  # of a V(0) that is computed again
 
 
 @dataclass(frozen=True, eq=False)
-class HeldTorque:
-    """What is proved of a loop whose torque is held for a period."""
+class Readings:
+    """How a sampled loop reads the state, and when its torque acts."""
 
     period: float
     """h [s]."""
     lookahead: float
-    """How far ahead the law is evaluated [s]."""
+    """How far ahead of a reading the law is evaluated [s]."""
+    delay: float = 0.0
+    """From a reading to the beginning of the hold that it acts in [s]."""
+    steps: JointArray | None = None
+    """Encoder steps, with velocities that are differences over a period [rad]; None for exact states."""
+
+    @classmethod
+    def of(cls, period: float, lookahead: float | None, delay: float, steps: JointArray | None) -> "Readings":
+        """Those of the arguments of `certify`; raises ArgumentError for times out of range."""
+        if not 0.0 <= delay <= period:
+            raise ArgumentError(f"delay is {delay} s, expected 0 to the period of {period} s; correct it.")
+        lead = 0.5 * period + delay if lookahead is None else lookahead
+        if not 0.0 <= lead <= period + delay:
+            text = f"0 to {period + delay} s, the period and the delay"
+            raise ArgumentError(f"lookahead is {lead} s, expected {text}; the delay and half a period is usual.")
+        return cls(period, lead, delay, steps)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether states are exact and torques act at once."""
+        return self.delay == 0.0 and self.steps is None
+
+    def at(self, period: float) -> "Readings":
+        """The same with another period, to which the times are proportional."""
+        share = period / self.period
+        return Readings(period, share * self.lookahead, share * self.delay, self.steps)
+
+    def __str__(self) -> str:
+        late = f", {1e3 * self.delay:g} ms after its reading" if self.delay > 0.0 else ""
+        differences = "" if self.steps is None else ", on differences of encoder readings"
+        return f"torque held for {1e3 * self.period:g} ms{late}{differences}"
+
+
+@dataclass(frozen=True, eq=False)
+class HeldTorque:
+    """What is proved of a loop whose torque is held for a period."""
+
+    readings: Readings
+    """Its times and encoders."""
     level: float
     """Level of V' that no hold leaves from a start on the reference [J]; inf if none is proved."""
     level_from_start: float
@@ -57,30 +95,35 @@ class HeldTorque:
 
     def after(self, initial: float) -> tuple[float, float]:
         """The level of V' and the largest Φ from V(0) = `initial` [J], as V' ≤ V; inf beyond what is proved."""
+        # With a history, V(0) alone does not bound V'.
+        if not self.readings.is_plain and initial > 0.0:
+            return math.inf, math.inf
         for level, potential in ((self.level, self.potential), (self.level_from_start, self.potential_from_start)):
             if self.is_proved and initial <= level * (1.0 + _ROUNDING):
                 return level, potential
         return math.inf, math.inf
 
     def storage(self, initial: float, nu: float) -> float:
-        """Bound of V at the control instants from V(0) = `initial` [J], as V' ≥ (1 − ½hν)V; inf if none is proved."""
-        return self.after(initial)[0] / (1.0 - 0.5 * self.period * nu)
+        """Bound of V at the control instants from V(0) = `initial` [J], as V' ≥ (1 − ½hν)V; inf if none is known."""
+        if not self.readings.is_plain:
+            return math.inf
+        return self.after(initial)[0] / (1.0 - 0.5 * self.readings.period * nu)
 
     @property
     def condition(self) -> Condition:
         """The condition that stands for the assumption of continuous time."""
         name = "longest period with a proof for held torques ≥ the period"
-        sides = self.longest * (1.0 + 1e-12), self.period
+        sides = self.longest * (1.0 + 1e-12), self.readings.period
         return Condition(name, *sides, "s", Label.PROVED, _HERE, checks=Assumption.TIME)
 
     @property
     def line(self) -> Claim:
         """What is known of the held torque, for the table."""
         if self.is_proved:
-            because = f"{_HERE}, torque held for {1e3 * self.period:g} ms"
+            because = f"{_HERE}, {self.readings}"
             return Claim("V' that no hold leaves", self.level, "J", Label.PROVED, because, Group.BOUNDS)
         tried = "of the periods tried, the longest that has a proof; " if self.longest > 0.0 else ""
-        because = f"{tried}nothing is proved at {1e3 * self.period:g} ms" + (
+        because = f"{tried}nothing is proved at {1e3 * self.readings.period:g} ms" + (
             f": {self.why_not}" if self.why_not else ""
         )
         return Claim("period with held torques proved", self.longest, "s", Label.PROVED, because, Group.CONSTANTS)
@@ -96,8 +139,7 @@ def held_torque(
     jerk: JointArray | None,
     least: float,
     begin: float,
-    period: float,
-    lookahead: float | None,
+    readings: Readings,
     other: str = "",
 ) -> HeldTorque:
     """The bounds for a period, or the longest period that has them.
@@ -105,42 +147,39 @@ def held_torque(
     viscous: friction of the joints, at most. jerk: bound of |ȧ_d|. least: V∞ in continuous time. begin: V(0) of the
     start, 0 without one. other: what else of the loop the proof does not cover.
     """
-    lead = 0.5 * period if lookahead is None else lookahead
-    if not 0.0 <= lead <= period:
-        raise ArgumentError(f"lookahead is {lead} s, expected 0 to the period of {period} s; half a period is usual.")
     why_not = other or _why_not(law, robot, motion, jerk)
-    unknown = np.full(law.nv, np.inf)
-    nothing = HeldTorque(period, lead, *_NOTHING, unknown, 0.0, why_not)
+    unknown, period = np.full(law.nv, np.inf), readings.period
+    nothing = HeldTorque(readings, *_NOTHING, unknown, 0.0, why_not)
     if why_not or robot is None or motion is None or jerk is None:
         return nothing
     arm = CoriolisBounds.of(robot, constants)
     bounds = arm.motion(motion, constants.floor, jerk)
     numbers = constants, arm, bounds, comparison.t, comparison.alpha, viscous
 
-    def kept(h: float, begin: float) -> Kept:
-        return kept_level(SampledLaw(law, *numbers, h, lead * h / period), begin)
+    def loop(h: float) -> SampledLaw:
+        read = readings.at(h)
+        return SampledLaw(law, *numbers, h, read.lookahead, read.delay, read.steps)
 
     def room(level: float) -> JointArray:
-        loop = SampledLaw(law, *numbers, period, lead)
         if not math.isfinite(level):
             return unknown
-        asked = Asked(law, constants, *Curvature.with_diagonal(loop, level), level)
+        asked = Asked(law, constants, *Curvature.with_diagonal(loop(period), level), level)
         return torque_bound(asked, arm, bounds, motion.half)
 
     begin = max(least, begin)
-    near = kept(period, least)
-    far = near if begin == least else kept(period, begin)
+    near = kept_level(loop(period), least)
+    far = near if begin == least else kept_level(loop(period), begin)
     if math.isfinite(far.potential):
         levels = near.level, max(near.level, far.level)
         found = *levels, near.potential, far.potential, room(max(near.seen, far.seen))
-        return HeldTorque(period, lead, *found, period, "")
+        return HeldTorque(readings, *found, period, "")
     shorter = (period * 0.5**k for k in range(1, _HALVINGS + 1))
-    longest = next((h for h in shorter if math.isfinite(kept(h, begin).potential)), 0.0)
+    longest = next((h for h in shorter if math.isfinite(kept_level(loop(h), begin).potential)), 0.0)
     low, high = longest, 2.0 * longest
     for _ in range(_BISECTIONS if longest > 0.0 else 0):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if math.isfinite(kept(middle, begin).potential) else (low, middle)
-    return HeldTorque(period, lead, *_NOTHING, room(begin), low, "")
+        low, high = (middle, high) if math.isfinite(kept_level(loop(middle), begin).potential) else (low, middle)
+    return HeldTorque(readings, *_NOTHING, room(begin) if readings.is_plain else unknown, low, "")
 
 
 def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None, jerk: JointArray | None) -> str:

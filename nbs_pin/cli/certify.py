@@ -103,6 +103,12 @@ class Certify(FileUnits):
         float | None, number("--period", least=1e-5, most=0.1, unit="s"), default("0.001; the longest for --wanted")
     ] = None
     """Control period, for which every torque is held [s]."""
+    delay: Annotated[float, number("--delay", least=0.0, most=0.1, unit="s")] = 0.0
+    """From the reading of a state to the beginning of the hold of its torque [s], at most a period; the search for the
+    worst motion acts at once."""
+    encoder_bits: Annotated[int | None, integer("--encoder-bits", least=1, most=64), default("exact states")] = None
+    """Bits per turn of the encoders; velocities are then differences of readings over a period. The search for the
+    worst motion reads exactly."""
     bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
     """Rate ω of a law built for an arm [rad/s]."""
     wanted: Annotated[str | None, positive_list("--wanted", most=10.0, unit="rad"), default("no design")] = None

@@ -13,6 +13,7 @@ from nbs_pin.base.records import Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design
 from nbs_pin.certificates.certificate_file import write_certificate
+from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.loads import MARGIN
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.certificates.uncertainty import Uncertainty
@@ -120,6 +121,8 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
         start_error=options.start_error,
         uncertainty=None if options.inertia_within is None else Uncertainty(inertia=options.inertia_within),
         trajectories=options.trajectories or TRAJECTORIES,
+        delay=options.delay,
+        encoders=None if options.encoder_bits is None else Encoders.of_bits(options.encoder_bits),
         seed=options.seed,
     )
 
@@ -129,6 +132,8 @@ def _check_options(options: Certify) -> None:
     loads = {"--payload": options.payload, "--gravity-error": options.gravity_error}
     if options.inertia_within is not None and (options.wanted is not None or options.against is not None):
         raise OptionError("--inertia-within is for the law's own model; omit --wanted and --against.")
+    if (options.delay or options.encoder_bits is not None) and options.wanted is not None:
+        raise OptionError("--delay and --encoder-bits are no part of a design; omit --wanted.")
     if options.norm and options.disturbance is None:
         raise OptionError("--norm needs --disturbance; give both.")
     if options.link is not None and options.payload is None:
