@@ -201,10 +201,10 @@ REFUSED = {
     "track two_link --integrator semi_implicit_euler": "integrator 'semi_implicit_euler' is unknown",
     "track two_link --plant-step 0.0007": "expected a whole number",
     "track two_link --reference sinus": "did you mean sinusoid?",
-    "track two_link --reference none.csv": "'none.csv': no such file",
+    "track two_link --reference none.csv": "no such file 'none.csv'",
     "track two_link --disturbance constant:1,2,3": "3 torques for 2 joints",
     "track two_link --out /proc/nowhere": "'/proc/nowhere': no such file",
-    "replay none.npz": "'none.npz': no such file",
+    "replay none.npz": "no such file 'none.npz'",
     "robots panda": "takes no argument 'panda'",
 }
 WRONG = {

@@ -274,7 +274,7 @@ def test_whole_trajectories_are_held_out():
         ({"model": "identified"}, "needs the arm's URDF; give robot="),
         ({"model": "residual"}, "needs the arm's URDF; give robot="),
         ({"robot": nbs.load_robot("three_link")}, r"2 joints and three_link 3"),
-        ({"held_out": 1.5}, r"share is 1\.5"),
+        ({"held_out": 1.5}, r"held_out is 1\.5"),
         ({"width": 3}, r"no setting width = 3; it takes loss, optimiser"),
         ({"loss": "energy"}, r"loss 'energy' is unknown"),
         ({"optimiser": "newton"}, r"optimiser 'newton' is unknown"),

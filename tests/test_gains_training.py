@@ -109,10 +109,13 @@ def test_a_gain_is_the_equation_and_comes_in_the_kind_asked_for():
     [
         (lambda: Gain(np.array([1.0, 0.0]), name="the rate"), "the rate is .* give 2 positive numbers"),
         (lambda: Gain(np.diag([1.0, -1.0])), "the gain has the eigenvalue -1"),
-        (lambda: Gain(np.ones(2), least_share=1.0), r"least_share of the gain is 1.0; give a number in \[0, 1\)"),
-        (lambda: Gain(np.ones(2), least_share=-0.1), r"give a number in \[0, 1\)"),
-        (lambda: Potential(np.eye(2), least_share=2.0), "least_share of the stiffness S"),
-        (lambda: Damping(2, floor=np.eye(2), least_share=2.0), "least_share of the floor D₀"),
+        (
+            lambda: Gain(np.ones(2), least_share=1.0),
+            r"least_share of the gain is 1.0; give a finite number ≥ 0 and < 1",
+        ),
+        (lambda: Gain(np.ones(2), least_share=-0.1), r"is -0\.1; give a finite number ≥ 0 and < 1"),
+        (lambda: Potential(np.eye(2), least_share=2.0), "Potential: least_share is 2.0"),
+        (lambda: Damping(2, floor=np.eye(2), least_share=2.0), "Damping: least_share is 2.0"),
         (lambda: nbs.PD(nbs.AnalyticDynamics(), feedforward="gravity", kp=np.inf, kd=1.0), "kp is"),
     ],
 )

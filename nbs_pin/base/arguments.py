@@ -19,6 +19,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from nbs_pin.base.checks import LARGEST, SMALLEST, floats, integral, is_usual, real, told
+from nbs_pin.base.doors import argument
 from nbs_pin.base.exceptions import ArgumentError, NbsPinError, NoSuchFile
 
 Check: TypeAlias = Callable[[str, Any], Any]
@@ -47,9 +48,9 @@ def checked(**checks: Check) -> Callable[[_Function], _Function]:
             given = list(args)
             for name, at, check in places:
                 if at < len(given):
-                    given[at] = check(f"{where}: {name}", given[at])
+                    given[at] = check(argument(where, name), given[at])
                 elif name in kwargs:
-                    kwargs[name] = check(f"{where}: {name}", kwargs[name])
+                    kwargs[name] = check(argument(where, name), kwargs[name])
             return function(*given, **kwargs)
 
         return door  # type: ignore[return-value]
@@ -60,7 +61,7 @@ def checked(**checks: Check) -> Callable[[_Function], _Function]:
 def check_fields(record: Any, **checks: Check) -> None:
     """Check the fields of a frozen record in its `__post_init__`, and store what the checks return."""
     for name, check in checks.items():
-        object.__setattr__(record, name, check(f"{type(record).__name__}: {name}", getattr(record, name)))
+        object.__setattr__(record, name, check(argument(type(record).__name__, name), getattr(record, name)))
 
 
 def maybe(check: Check) -> Check:
@@ -90,7 +91,7 @@ def number(
 
     def check(name: str, value: Any) -> float:
         given = real(value)
-        if given is None or not (given > above and lowest <= given <= most and given < below):
+        if given is None or not (given > above and lowest <= given <= most and (given < below or below == math.inf)):
             raise ArgumentError(f"{name} is {told(value)}; give {_range(above, least, most, below, unit)}.")
         return given
 

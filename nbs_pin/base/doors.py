@@ -48,6 +48,11 @@ def option(name: str, value: Any) -> str:
     return f"{flag}={typed}" if typed.startswith("-") else f"{flag} {typed}"
 
 
+def argument(function: str, name: str) -> str:
+    """What a message calls an argument: "simulate: duration" in Python, "duration" in the shell."""
+    return f"{function}: {name}" if _doors[-1] == "python" else name.replace("_", " ")
+
+
 @contextmanager
 def at_the_shell() -> Iterator[None]:
     """Within this context, messages name flags of the shell."""

@@ -10,6 +10,7 @@ from torch import nn
 
 from nbs_pin.base.arrays import matvec
 from nbs_pin.base.claims import Claim, Label, refuse
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import first_foreign, foreign_code
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -145,7 +146,7 @@ def _check_routes(provider: DynamicsProvider, skew: Claim) -> None:
 def _finite(function: Callable[..., np.ndarray], *arguments: np.ndarray) -> np.ndarray:
     try:
         value = function(*arguments)
-    except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+    except (ArgumentError, np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
         refuse(f"an inertia of the model is not positive definite ({error})", "load or build it again")
     if not np.isfinite(value).all():
         refuse("the model gives numbers that are not finite", "load the last sound checkpoint or build it again")

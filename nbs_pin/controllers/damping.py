@@ -143,14 +143,14 @@ class Damping(nn.Module):
         (z,) = as_vectors(self.nv, z=z)
         xp = array_namespace(z)
         d0, r = self._constants(numpy=not is_torch_array(z))
-        t = self._factor(r * z) * r
+        t = self.factor(r * z) * r
         return finite_result("D(z)", d0 + xp.matrix_transpose(t) @ t, z)
 
     def force(self, z: Vectors) -> Vectors:
         """D(z) z [N·m]."""
         (z,) = as_vectors(self.nv, z=z)
         d0, r = self._constants(numpy=not is_torch_array(z))
-        t = self._factor(r * z)
+        t = self.factor(r * z)
         force = matvec(d0, z) + r * matvec(array_namespace(z).matrix_transpose(t), matvec(t, r * z))
         return finite_result("D(z)z", force, z)
 

@@ -1,6 +1,7 @@
 """A model of an arm, judged on states and motions outside its data: one trial of the studies of models."""
 
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -119,7 +120,9 @@ def attempt(
     if model == MLP:
         mlp = fit_mlp(data, seed, transition=0.01 if friction else None, **settings)
         return Trial(*case, time.perf_counter() - began, **judge.torque_errors(mlp.torque))
-    found: Any = fit(data, model, seed, robot=robot, friction=friction, **settings)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*friction would explain")  # leaving it out is what is studied
+        found: Any = fit(data, model, seed, robot=robot, friction=friction, **settings)
     if found.report.stopped == "interrupted":
         raise KeyboardInterrupt
     errors = judge.torque_errors(motor_torque(found, found.friction)) | judge.model_errors(found)

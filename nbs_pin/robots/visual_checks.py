@@ -56,7 +56,7 @@ def _mesh_fault(mesh: Any) -> str:
         return "its mesh has no filename"
     if longest > LONGEST_NAME or len(name.encode()) > LONGEST_PATH:
         return f"its mesh {_quoted(name)} has a file name of {max(longest, len(name.encode()))} bytes"
-    words = mesh.get("scale", "1").replace(",", " ").split()
+    words = mesh.get("scale", "1").split()
     return _fault(mesh, "scale", 1 if len(words) == 1 else 3, default="1")
 
 
@@ -80,7 +80,7 @@ def _fault(
 ) -> str:
     """What is wrong with an attribute that is to hold `count` numbers of at most `largest` in size."""
     text = element.get(key, default)
-    numbers = [_number(word) for word in text.replace(",", " ").split()]
+    numbers = [_number(word) for word in text.split()]
     low = 0.0 if positive else -math.inf
     if len(numbers) == count and all(math.isfinite(x) and abs(x) <= largest and x > low for x in numbers):
         return ""
