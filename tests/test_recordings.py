@@ -385,7 +385,7 @@ def test_friction_beyond_the_effort_limit_is_named_if_it_is_kept(rubbing):
     with pytest.raises(ArgumentError, match=words):
         nbs.check_reference(motion, robot, 5.0, joint_friction="keep")
     nbs.check_reference(nbs.Hold(motion(0.0).q), robot, 5.0, joint_friction="keep")
-    with pytest.raises(ArgumentError, match="give 'drop' or 'keep'"):
+    with pytest.raises(ArgumentError, match="give one of drop, keep"):
         nbs.check_reference(motion, robot, 5.0, joint_friction="some")
 
 

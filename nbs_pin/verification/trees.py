@@ -102,7 +102,7 @@ def _stated(joint: dict[str, Any]) -> Link:
         raise FileFormatError(f"the placement of joint '{joint['name']}' is no rotation; write the file again.")
     inertia = balls(joint["inertia"])  # of which only the quadratic form counts
     body = (arb(joint["mass"]), balls(joint["centre"]), (inertia + inertia.T) / 2, arb(joint["armature"]))
-    return Link(joint["parent"], joint["prismatic"], nearest, balls(joint["position"]), *body, _travel(joint))
+    return Link(int(joint["parent"]), joint["prismatic"], nearest, balls(joint["position"]), *body, _travel(joint))
 
 
 def _travel(joint: dict[str, Any]) -> tuple[Any, Any] | None:
