@@ -296,7 +296,7 @@ def test_readings_that_are_late_and_coarse_are_proved_for_ur5_where_it_is_slow()
     certificate = nbs.certify(law, box, reference=reference, period=H, **given)
     assert certificate.label is Label.PROVED
     assert certificate.error < 3.0 * nbs.certify(law, box, reference=reference).error
-    assert "1 ms after its reading, on differences" in certificate.held.line.because
+    assert "1 ms after its reading, on encoder readings" in certificate.held.line.because
 
 
 def test_a_certificate_file_states_delay_and_encoders(tmp_path):
@@ -331,3 +331,32 @@ def test_times_out_of_range_are_refused():
         nbs.certify(law, np.full(2, 5.0), reference=reference, period=H, delay=0.5 * H, lookahead=2e-3)
     with pytest.raises(nbs.ArgumentError, match="control period"):
         nbs.certify(law, np.full(2, 5.0), reference=reference, delay=H)
+
+
+def test_a_recorded_motion_that_begins_at_speed_has_no_past_to_read():
+    """Held before its first sample, it jumps where the first readings fall, which no bound covers."""
+    robot = nbs.load_robot("two_link")
+    law = nbs.NeuralBackstepping.for_robot(robot, bandwidth=4.0, period=0.00025)
+    t = np.linspace(0.0, 1.0, 201)
+    start = np.array([0.2, -0.3])
+    ramp = nbs.Sampled(t, start + 0.5 * t[:, None])
+    rest = nbs.Sampled(t, start + 0.5 * (t**3)[:, None])
+    for motion, words in ((ramp, "begin at rest"), (rest, "")):
+        certificate = nbs.certify(law, [0.5, 0.5], reference=motion, duration=0.9, period=0.00025, delay=0.00025)
+        assert words in certificate.held.why_not
+        assert bool(words) == bool(certificate.held.why_not)
+        assert not words or not certificate.held.is_proved
+    plain = nbs.certify(law, [0.5, 0.5], reference=ramp, duration=0.9, period=0.00025)
+    assert plain.held.why_not == ""
+
+
+def test_the_storage_of_a_late_loop_has_the_bound_that_was_proved():
+    robot = nbs.load_robot("two_link")
+    law = nbs.NeuralBackstepping.for_robot(robot, bandwidth=4.0, period=0.00025)
+    motion = nbs.Sinusoid.for_robot(robot)
+    late = nbs.certify(law, [0.5, 0.5], reference=motion, period=0.00025, delay=0.00025)
+    assert late.held.is_proved
+    assert late.held.level / (1.0 - 0.5 * 0.00025 * late.constants.nu) == late.held_storage(0.0) < np.inf
+    assert late.held_storage(0.0) > late.storage
+    assert late.storage_bound(np.zeros(1), 0.0) == late.held_storage(0.0)
+    assert late.held_storage(1e3 * late.held.level) == np.inf

@@ -23,7 +23,7 @@ from nbs_pin.certificates.constants import Constants, constants_of
 from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.error_bounds import errors, radians
 from nbs_pin.certificates.friction_error import FrictionError, FrictionGap, friction_error
-from nbs_pin.certificates.held_torque import Readings, held_torque
+from nbs_pin.certificates.held_torque import Readings, held_torque, unknown_before
 from nbs_pin.certificates.margins import (
     effort_margin,
     hold_margin,
@@ -153,11 +153,16 @@ def _held(
     other = "an inexact model is not part of the proof" if inexact else ""
     if certificate.start is not None and not readings.is_plain:
         other = other or "a start away from the reference is not part of the proof with a delay or encoders"
+    jerk = _jerk(reference, motion)
+    if not readings.is_plain and reference is not None and motion is not None and jerk is not None:
+        other = other or unknown_before(reference, law.nv, jerk, readings.oldest)
+        # The first readings are of the time before t = 0.
+        motion = SampledMotion.of(lambda t: reference(t - readings.oldest), law.nv, motion.t[-1] + readings.oldest)
     gap = certificate.friction.gap
     # Of friction known to a share, the least is in D₀, and the most acts.
     loop = law, certificate.robot, constants, certificate.comparison, 2.0 * gap.arm.viscous - gap.damping
     begin = 0.0 if certificate.start is None else certificate.start.storage
-    held = held_torque(*loop, motion, _jerk(reference, motion), certificate.storage, begin, readings, other)
+    held = held_torque(*loop, motion, jerk, certificate.storage, begin, readings, other)
     if not held.is_proved:
         return replace(certificate, held=held)
     size, joints = radians(constants.stiffness, held.potential)

@@ -19,6 +19,8 @@ from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.motions.reference_files import Sampled
+from nbs_pin.motions.references import DesiredMotion, at_times
 from nbs_pin.robots.robot import Robot
 
 _HALVINGS, _BISECTIONS = 7, 4
@@ -63,8 +65,14 @@ class Readings:
 
     def __str__(self) -> str:
         late = f", {1e3 * self.delay:g} ms after its reading" if self.delay > 0.0 else ""
-        differences = "" if self.steps is None else ", on differences of encoder readings"
-        return f"torque held for {1e3 * self.period:g} ms{late}{differences}"
+        differences = "" if self.steps is None else ", on encoder readings and their differences over a period"
+        before = "" if self.is_plain else ", from an arm that was on the reference before t = 0"
+        return f"torque held for {1e3 * self.period:g} ms{late}{differences}{before}"
+
+    @property
+    def oldest(self) -> float:
+        """How long before t = 0 the first torque's readings reach back [s]."""
+        return self.delay + (self.period if self.steps is not None else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +104,7 @@ class HeldTorque:
     def after(self, initial: float) -> tuple[float, float]:
         """The level of V' and the largest Φ from V(0) = `initial` [J], as V' ≤ V; inf beyond what is proved."""
         # With a history, V(0) alone does not bound V'.
-        if not self.readings.is_plain and initial > 0.0:
+        if not self.readings.is_plain and initial > _ROUNDING * self.level:
             return math.inf, math.inf
         for level, potential in ((self.level, self.potential), (self.level_from_start, self.potential_from_start)):
             if self.is_proved and initial <= level * (1.0 + _ROUNDING):
@@ -105,8 +113,6 @@ class HeldTorque:
 
     def storage(self, initial: float, nu: float) -> float:
         """Bound of V at the control instants from V(0) = `initial` [J], as V' ≥ (1 − ½hν)V; inf if none is known."""
-        if not self.readings.is_plain:
-            return math.inf
         return self.after(initial)[0] / (1.0 - 0.5 * self.readings.period * nu)
 
     @property
@@ -170,7 +176,7 @@ def held_torque(
     near = kept_level(loop(period), least)
     far = near if begin == least else kept_level(loop(period), begin)
     if math.isfinite(far.potential):
-        levels = near.level, max(near.level, far.level)
+        levels = near.reached, max(near.reached, far.reached)
         found = *levels, near.potential, far.potential, room(max(near.seen, far.seen))
         return HeldTorque(readings, *found, period, "")
     shorter = (period * 0.5**k for k in range(1, _HALVINGS + 1))
@@ -180,6 +186,21 @@ def held_torque(
         middle = math.sqrt(low * high)
         low, high = (middle, high) if math.isfinite(kept_level(loop(middle), begin).potential) else (low, middle)
     return HeldTorque(readings, *_NOTHING, room(begin) if readings.is_plain else unknown, low, "")
+
+
+def unknown_before(reference: DesiredMotion, nv: int, jerk: JointArray, span: float) -> str:
+    """Why a reference has no smooth past of that length before t = 0 [s], from which it could have come; or nothing."""
+    late = "what the reference does before t = 0, where the first readings fall, is not the past of its motion"
+    now, past = at_times(reference, np.array([0.0]), nv), at_times(reference, np.array([-span]), nv)
+    if isinstance(reference, Sampled) and max(np.abs(now.v).max(), np.abs(now.a).max()) > 1e-9:  # held until then
+        return f"{late}: begin at rest"
+    slack = 1e-9 * (1.0 + np.abs(now.q) + np.abs(now.v) + np.abs(now.a))
+    for order, change in enumerate(
+        (now.a - past.a, now.v - past.v - span * now.a, now.q - past.q - span * now.v + 0.5 * span**2 * now.a), start=1
+    ):
+        if (np.abs(change) > (1.0 + 1e-6) * jerk * span**order / math.factorial(order) + slack).any():
+            return late
+    return ""
 
 
 def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None, jerk: JointArray | None) -> str:

@@ -55,9 +55,11 @@ class Kept(NamedTuple):
     """Largest Φ, also during the holds [J]."""
     seen: float
     """Largest Φ + ½z2ᵀM z2 of the states that the law is evaluated at [J]."""
+    reached: float
+    """Largest V' at the instants [J]: the level itself, unless it is that of V' with its history."""
 
 
-_NOTHING = Kept(math.inf, math.inf, math.inf)
+_NOTHING = Kept(*(math.inf,) * 4)
 
 
 def kept_level(loop: SampledLaw, least: float) -> Kept:
@@ -91,9 +93,10 @@ def _after(loop: SampledLaw, level: float) -> tuple[Kept, float]:
         if hold is not None:
             rate, gradient = hold.sups.rate, hold.sups.gradient
             bend = hold.curve.steepest * rate**2 + gradient * (hold.sups.acceleration + hold.turning * rate)
-            potential = begin(hold).potential + loop.h**2 / 8.0 * bend
-            return Kept(level, potential * UP, _seen(hold)), _limit(hold)
-    return Kept(level, math.inf, math.inf), math.inf
+            reached, potential = begin(hold)
+            potential += loop.h**2 / 8.0 * bend
+            return Kept(level, potential * UP, _seen(hold), reached * UP), _limit(hold)
+    return Kept(level, math.inf, math.inf, math.inf), math.inf
 
 
 def _seen(b: Hold) -> float:
