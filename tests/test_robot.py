@@ -252,3 +252,8 @@ def test_the_difference_has_unit_gradient():
     z1 = configuration_difference(q, torch.zeros_like(q), CONTINUOUS)
     assert z1[0, 0] < 0
     torch.testing.assert_close(torch.autograd.grad(z1.sum(), q)[0], torch.ones_like(q), rtol=0, atol=0)
+
+
+def test_a_home_that_is_not_there_is_a_sentence():
+    with pytest.raises(RobotNotFound, match="~nouser-of-this-name/x"):
+        load_robot("~nouser-of-this-name/x.urdf")

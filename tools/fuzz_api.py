@@ -15,6 +15,7 @@ import functools
 import multiprocessing
 import os
 import sys
+import tempfile
 import time
 import traceback
 import warnings
@@ -54,6 +55,7 @@ def main() -> int:
     parser.add_argument("--call", type=int, help="repeat this call alone, here")
     parser.add_argument("--show", action="store_true", help="print every fault as it occurs")
     options = parser.parse_args()
+    os.chdir(tempfile.mkdtemp(prefix="fuzz-"))  # hostile texts are taken as names of files to write
     if options.call is not None:
         print(attempt(options.seed, options.call, options.only, trace=True))
         return 0

@@ -17,7 +17,7 @@ def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = Tru
 
     A function as `label` is called whenever the bar is drawn.
     """
-    if not (show and sys.stderr.isatty()):
+    if not (show and _is_terminal()):
         yield from items
         return
     from rich.console import Console
@@ -34,10 +34,15 @@ def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = Tru
             yield item
 
 
+def _is_terminal() -> bool:
+    """Whether stderr is one; it may be closed."""
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
 @contextmanager
 def waiting(label: str, show: bool = True) -> Iterator[None]:
     """A spinner on stderr while the body of the `with` statement runs, if stderr is a terminal."""
-    if not (show and sys.stderr.isatty()):
+    if not (show and _is_terminal()):
         yield
         return
     from rich.console import Console

@@ -60,6 +60,8 @@ def at_times(reference: DesiredMotion, t: np.ndarray, nv: int) -> Reference:
 
 def instants(t: Any) -> np.ndarray:
     """Times as a float array of any shape; raises ArgumentError unless they are finite numbers."""
+    if type(t) is float and abs(t) <= LARGEST:
+        return np.array(t)
     array = floats("t", t)
     if not is_usual(array):
         raise ArgumentError(f"t is {told(t)}, expected a time or times, finite numbers [s]; correct it.")

@@ -60,7 +60,11 @@ def find(name_or_path: str) -> Entry:
         robots = example_robot_share() / "example-robot-data" / "robots"
         return Entry(name_or_path, robots / path, lock, zero_limits=zero_limits)
     try:
-        return _entry_of_file(Path(name_or_path).expanduser())
+        file = Path(name_or_path).expanduser()
+    except RuntimeError as error:  # a user who is not there
+        raise RobotNotFound(f"cannot read '{name_or_path:.200}': {error} Give the whole path.") from error
+    try:
+        return _entry_of_file(file)
     except OSError as error:
         if isinstance(error, RobotNotFound):
             raise

@@ -116,7 +116,8 @@ class MujocoPlant(Plant):
         Raises:
             SimulationDiverged: If an input or the result is not finite, or MuJoCo issues a warning.
         """
-        duration = _DURATION(duration)
+        if not (type(duration) is float and 0.0 < duration <= 1.0):
+            duration = _DURATION(duration)
         q, v, tau = self._vectors(q=q, v=v, tau=tau)
         with self._lock:
             self.model.opt.timestep = duration
