@@ -189,3 +189,10 @@ def test_numbers_of_other_widths_and_byte_orders_become_float64(path):
     arrays = {name: x.astype(">f4") if x.dtype.kind == "f" else x for name, x in np.load(path).items()}
     write_npz(path, arrays)
     assert {Run.load(path).q.dtype, Run.load(path).effort_limit.dtype} == {np.dtype(float)}
+
+
+@pytest.mark.parametrize("wrong", ["no", [1, 2, 3], [[True, False]], [True], 3.5])
+def test_which_joints_slide_is_one_truth_value_per_joint(wrong):
+    with pytest.raises(ArgumentError, match="Run: prismatic"):
+        dataclasses.replace(make_run(), prismatic=wrong)
+    assert dataclasses.replace(make_run(), prismatic=[False, True]).slides.tolist() == [False, True]

@@ -94,6 +94,13 @@ class Run:
             object.__setattr__(self, name, floats(f"Run: {name}", getattr(self, name)))
         wraps = floats("Run: continuous", self.continuous, truths=True).astype(bool)
         object.__setattr__(self, "continuous", wraps)
+        if self.prismatic is not None:
+            slides = floats("Run: prismatic", self.prismatic, truths=True).astype(bool)
+            if slides.shape != wraps.shape:
+                raise ArgumentError(
+                    f"Run: prismatic has shape {slides.shape}, expected {wraps.shape}, one truth value per joint."
+                )
+            object.__setattr__(self, "prismatic", slides)
         names = tuple(self.joint_names) if isinstance(self.joint_names, tuple | list) else ()
         object.__setattr__(self, "joint_names", names)
         shape = self.q.shape
