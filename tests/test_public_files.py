@@ -488,7 +488,7 @@ def test_shapes_fill_links_that_state_no_mass_at_all(tmp_path):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_inertia_that_is_printed_is_accepted_as_it_is_printed(seed, tmp_path):
-    rng = np.random.default_rng(seed)
+    rng, refused = np.random.default_rng(seed), 0
     for _ in range(25):
         stated = rng.normal(size=(3, 3)) + 2.0 * np.eye(3)
         stated = 0.5 * (stated + stated.T)
@@ -498,10 +498,12 @@ def test_the_inertia_that_is_printed_is_accepted_as_it_is_printed(seed, tmp_path
         try:
             load_robot(write(tmp_path, text))
         except RobotError as error:
+            refused += 1
             nearest = re.search(r"<inertia [^/]*/>", str(error))
             arm = load_robot(write(tmp_path, text.replace(f"<inertia {written}/>", nearest.group())))
             assert loaded(write(tmp_path, text), repair=True).sha256 == arm.sha256
             mujoco.MjModel.from_xml_string(arm.urdf.without_geometry().decode())
+    assert refused > 5
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, -0.7])
@@ -572,3 +574,31 @@ def test_arm_options_without_an_arm_are_refused(tmp_path, capsys):
         assert "was given, but no arm is loaded here" in capsys.readouterr().err
     assert main(["track", "two_link", "--effort-limit", "5", "--limits", "*.effort=3"]) == 2
     assert "choose one" in capsys.readouterr().err
+
+
+def test_an_arm_that_is_singular_in_a_one_sided_range_is_refused(tmp_path):
+    """A point mass on the first axis at q2 = −π/2 − 2π, which only a search below the upper limit meets."""
+    point = 'ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"'
+    text = (
+        '<robot name="arm"><link name="base"/><link name="a"><inertial><mass value="0.001"/>'
+        f'<inertia {point}/></inertial></link><link name="c"><inertial><origin xyz="1 0 0"/><mass value="1"/>'
+        f'<inertia {point}/></inertial></link><joint name="j1" type="continuous"><parent link="base"/><child link="a"/>'
+        '<axis xyz="0 0 1"/></joint><joint name="j2" type="revolute"><parent link="a"/><child link="c"/>'
+        '<axis xyz="0 1 0"/><limit lower="-20" upper="20" effort="5" velocity="1"/></joint></robot>'
+    )
+    path = write(tmp_path, text)
+    with pytest.raises(RobotError, match=r"M\(q\) is not finite and positive definite") as caught:
+        load_robot(path, limits={"j2": {"lower": None, "upper": -4.0}})
+    q2 = float(re.search(r"at q = \[\S+ (\S+)\]", str(caught.value))[1])
+    assert -4.0 - 2.0 * np.pi <= q2 <= -4.0
+    narrow = load_robot(path, limits={"j2": {"lower": -1.0, "upper": 1.0}})
+    assert narrow.upper[1] == 1.0
+
+
+def test_the_remedy_for_a_still_joint_keeps_what_is_locked(tmp_path):
+    still = (
+        "".join(ARM).replace('"0.02 0.01 0.15"', '"0 0.15 0"').replace('yy="0.03"', 'yy="0"').replace("0.04", "0.02")
+    )
+    path = write(tmp_path, robot(still, link("c"), joint("hand", "a", "c")))
+    with at_the_shell(), pytest.raises(RobotError, match=r"--lock hand,elbow"):
+        load_robot(path, lock=["hand"])

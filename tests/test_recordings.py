@@ -1,5 +1,6 @@
 """Files of recorded motions: units of time and angles, where time begins, wraps, outliers, clocks, columns."""
 
+import ast
 import re
 import warnings
 from contextlib import contextmanager
@@ -338,11 +339,11 @@ def test_a_saved_dataset_takes_no_settings_of_a_log(tmp_path, setting):
 def test_an_option_is_named_as_its_reader_types_it():
     assert option("time_unit", "ms") == "time_unit='ms'"
     assert option("degrees", False) == "degrees=False"
-    assert option("effort_limit", 80.0) == "Robot.with_effort_limit(80.0)"
+    assert option("limits", {"a": {"effort": 80.0}}) == "limits={'a': {'effort': 80.0}}"
     with at_the_shell():
         assert option("time_unit", "ms") == "--time-unit ms"
         assert (option("degrees", True), option("degrees", False)) == ("--degrees", "--radians")
-        assert option("effort_limit", 80.0) == "--effort-limit 80.0"
+        assert option("limits", {"a": {"effort": 80.0}}) == "--limits a.effort=80.0"
     assert option("degrees", True) == "degrees=True"
 
 
@@ -415,5 +416,39 @@ def test_the_remedy_for_too_large_a_torque_is_one_that_helps():
     weak = TWO.with_effort_limit(0.5 * weight)
     with pytest.raises(ArgumentError, match=r"its weight alone takes .*, so choose another posture or raise") as caught:
         nbs.check_reference(nbs.Hold(posture), weak, 1.0)
-    limit = float(re.search(r"with_effort_limit\((\S+)\)", str(caught.value))[1])
-    nbs.check_reference(nbs.Hold(posture), TWO.with_effort_limit(limit), 1.0)
+    limits = ast.literal_eval(re.search(r"limits=(\{.*\})", str(caught.value))[1])
+    stronger = {name: {"effort": weak.effort_limit[i]} for i, name in enumerate(weak.joint_names)} | limits
+    nbs.check_reference(nbs.Hold(posture), nbs.load_robot("two_link", limits=stronger), 1.0)
+    assert min(limit["effort"] for limit in limits.values()) >= 0.5 * weight
+
+
+def test_only_the_joints_that_are_too_weak_are_to_be_stronger_and_hold_their_weight(tmp_path, capsys):
+    out = ["--duration", "1", "--out", str(tmp_path)]
+    assert cli.main(["track", "two_link", "--limits", "joint2.effort=0.1", *out]) == 2
+    remedy = re.search(r"--limits (joint2\.effort=\S+?)\.? *$", capsys.readouterr().err.strip())[1]
+    assert cli.main(["track", "two_link", "--effort-limit", "95", "--limits", remedy, *out]) == 0
+    assert nbs.Run.load(tmp_path / "run.npz").effort_limit.tolist() == [95.0, float(remedy.partition("=")[2])]
+
+
+SLIDER = """<robot name="slider"><link name="base"/><link name="car"><inertial><mass value="2"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+<joint name="rail" type="prismatic"><parent link="base"/><child link="car"/><axis xyz="1 0 0"/>
+<limit lower="-1" upper="1" effort="100" velocity="3"/></joint></robot>"""
+
+
+def test_joints_that_slide_are_in_metres_in_every_sentence_about_a_motion(tmp_path):
+    (tmp_path / "slider.urdf").write_text(SLIDER)
+    arm, t = load_robot(tmp_path / "slider.urdf"), np.linspace(0.0, 4.0, 1001)
+    q = 0.3 * np.sin(t)[:, None]
+    jump = np.where(t > 2.0, q[:, 0] + 0.05, q[:, 0])[:, None]
+    for motion, v in ((jump, None), (q, 3.0 * np.cos(t)[:, None])):
+        np.savez(tmp_path / "m.npz", t=t, q=motion, **({} if v is None else {"v": v}))
+        with pytest.raises(FileFormatError, match=r" m/s ?") as caught:
+            nbs.load_reference(tmp_path / "m.npz", arm)
+        assert "rad" not in str(caught.value)
+    np.savez(tmp_path / "m.npz", t=t, q=q, v=300.0 * np.cos(t)[:, None])  # mm/s
+    with pytest.raises(FileFormatError, match=r"v of rail: 300 m/s, but q changes by 0\.3 m/s"):
+        nbs.load_reference(tmp_path / "m.npz", arm)
+    np.savez(tmp_path / "m.npz", t=1e3 * t, q=q, v=0.3 * np.cos(t)[:, None])
+    with pytest.raises(FileFormatError, match="t looks like milliseconds"):
+        nbs.load_reference(tmp_path / "m.npz", arm)

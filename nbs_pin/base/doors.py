@@ -12,8 +12,6 @@ _FLAGS = {"xacro_args": "--arg", "package_dirs": "--package-dir"}
 """Flags that are not called like the argument: they are given once for each value."""
 _OFF = {"degrees": "--radians"}
 """Flags that stand for False."""
-_CALLS = {"effort_limit": "Robot.with_effort_limit({})"}
-"""What stands in Python for an argument that no function of the library has."""
 
 
 class _Blank(str):
@@ -35,7 +33,7 @@ def option(name: str, value: Any) -> str:
     as in elbow.effort=50 for limits.
     """
     if _doors[-1] == "python":
-        return _CALLS[name].format(repr(value)) if name in _CALLS else f"{name}={value!r}"
+        return f"{name}={value!r}"
     if value is False:
         return _OFF[name]
     flag = _FLAGS.get(name, f"--{name.replace('_', '-')}")

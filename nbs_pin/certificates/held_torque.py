@@ -192,7 +192,8 @@ def unknown_before(reference: DesiredMotion, nv: int, jerk: JointArray, span: fl
     """Why a reference has no smooth past of that length before t = 0 [s], from which it could have come; or nothing."""
     late = "what the reference does before t = 0, where the first readings fall, is not the past of its motion"
     now, past = at_times(reference, np.array([0.0]), nv), at_times(reference, np.array([-span]), nv)
-    if isinstance(reference, Sampled) and max(np.abs(now.v).max(), np.abs(now.a).max()) > 1e-9:  # held until then
+    held = isinstance(reference, Sampled) and reference.t[0] > -span  # before its first sample
+    if held and max(np.abs(now.v).max(), np.abs(now.a).max()) > 1e-9:
         return f"{late}: begin at rest"
     slack = 1e-9 * (1.0 + np.abs(now.q) + np.abs(now.v) + np.abs(now.a))
     for order, change in enumerate(

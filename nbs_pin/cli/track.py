@@ -52,7 +52,7 @@ class Track(FileUnits):
     effort_limit: Annotated[
         float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), default("the arm's")
     ] = None
-    """Effort limit of every joint [N·m]."""
+    """Effort limit of every joint that --limits does not name [N·m]."""
     no_effort_limit: bool = False
     """Do not limit the torques."""
     integrator: Annotated[str | None, choice("--integrator", INTEGRATOR_NAMES), default("the plant's usual one")] = None

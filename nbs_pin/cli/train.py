@@ -57,7 +57,7 @@ class Train:
     effort_limit: Annotated[
         float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), default("the arm's")
     ] = None
-    """Effort limit of every joint [N·m]."""
+    """Effort limit of every joint that --limits does not name [N·m]."""
     no_effort_limit: bool = False
     """Do not limit the torques."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0

@@ -15,14 +15,17 @@ from nbs_pin.storage.checkpoints import load
 
 
 def arm_of(options: Track | Train) -> Robot:
-    """The arm with the effort limits of the options; raises OptionError if they contradict each other."""
+    """The arm with the effort limits of the options, that of --limits for the joints it names.
+
+    Raises OptionError if they contradict each other.
+    """
     if options.no_effort_limit and options.effort_limit is not None:
         raise OptionError("--effort-limit and --no-effort-limit were both given; choose one.")
     given = options.arm.given()
     if options.no_effort_limit or options.effort_limit is not None:
         limits = given.get("limits", {})
-        if any("effort" in stated for stated in limits.values()):
-            raise OptionError("--limits states an effort, and --effort-limit or --no-effort-limit another; choose one.")
+        if "effort" in limits.get(ALL, {}):
+            raise OptionError(f"--limits {ALL}.effort and --effort-limit or --no-effort-limit were given; choose one.")
         effort = {"effort": options.effort_limit or math.inf}
         given["limits"] = {**limits, ALL: {**limits.get(ALL, {}), **effort}}
     return load_robot(options.robot, **given)

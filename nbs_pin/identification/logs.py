@@ -152,7 +152,7 @@ def _in_units(
         v, a = (x if x is None else in_radians(x, joints.prismatic) for x in (columns.v, columns.a))
         columns = columns._replace(q=in_radians(columns.q, joints.prismatic), v=v, a=a)
     if not fault and time_unit is None:
-        fault = time_fault(columns.t, columns.q, columns.v, trajectory_slices(columns.trajectory))
+        fault = time_fault(columns.t, columns.q, columns.v, trajectory_slices(columns.trajectory), joints.prismatic)
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
     return columns if time_unit is None else columns._replace(t=columns.t * seconds_in(time_unit))

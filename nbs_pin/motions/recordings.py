@@ -12,6 +12,7 @@ from scipy.ndimage import median_filter
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.units import several, units
 from nbs_pin.robots.robot import Robot
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -76,11 +77,13 @@ def time_fault(
     q: Float[np.ndarray, "rows n"],
     v: Float[np.ndarray, "rows n"] | None,
     stretches: Sequence[slice],
+    prismatic: Bool[np.ndarray, " n"],
 ) -> str:
     """Why t cannot be in seconds.
 
-    If v is stated, its integral is that many times too large. Otherwise the rows are far apart, no joint gets anywhere
-    between them, and in the unit named it would move as arms do.
+    If v is stated, its integral is that many times too large, also where joints turn: that of a joint that slides may
+    be in mm/s. Otherwise the rows are far apart, no joint gets anywhere between them, and in the unit named it would
+    move as arms do.
     """
     kept = [rows for rows in stretches if rows.stop - rows.start > 1]
     if not kept:
@@ -92,14 +95,17 @@ def time_fault(
     step, unit, why = float(np.median(steps)), "", ""
     if v is not None and np.isfinite(v).all() and v.any():
         area = np.concatenate([0.5 * (v[rows][1:] + v[rows][:-1]) for rows in kept]) * steps[:, None]
-        ratio = float(np.vdot(moved, area) / np.vdot(area, area))
+        known = np.ones_like(prismatic) if step > _LONG_STEP else ~prismatic
+        moved_there, area = moved[:, known], area[:, known]
+        ratio = float(np.vdot(moved_there, area) / max(np.vdot(area, area), 1e-300))
         unit = next((u for u in _CALLED if abs(ratio / TIME_UNITS[u] - 1.0) < _LIKE_A_RATIO), "")
         why = f"in which q changes as v states; give {option('time_unit', unit)}"
     if not unit and step > _LONG_STEP:
         speed = float((np.where(np.abs(moved) > np.pi, 0.0, np.abs(moved)) / steps[:, None]).max(initial=0.0))
         unit = _unit_of_speed(speed, step)
         why = (
-            f"since in seconds its rows are {step:.4g} s apart and no joint is faster than {speed:.3g} rad/s; give "
+            f"since in seconds its rows are {step:.4g} s apart and no joint is faster than {speed:.3g} "
+            f"{several(units('velocity', prismatic))}; give "
             f"{option('time_unit', unit)}, or {option('time_unit', 's')} if it is that slow"
         )
     return f"t looks like {_CALLED[unit]}, {why}" if unit else ""
@@ -170,8 +176,8 @@ def unwrapped(
         elif found:
             k = found[0]
             fault = fault or (
-                f"{name} jumps by {q[k + 1, i] - q[k, i]:.4g} rad between rows {k + 1} and {k + 2}: a wrap? unwrap the "
-                "column (numpy.unwrap)"
+                f"{name} jumps by {q[k + 1, i] - q[k, i]:.4g} rad between rows {k + 1} and {k + 2}: a wrap? unwrap "
+                "that column"
             )
     return Unwrapped(q, tuple(notes), fault)
 

@@ -16,6 +16,7 @@ from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
+from nbs_pin.base.units import units
 from nbs_pin.motions.recordings import (
     Joints,
     degrees_fault,
@@ -137,12 +138,12 @@ def load_reference(
         q, v = in_radians(q, joints.prismatic), None if v is None else in_radians(v, joints.prismatic)
     first, t = t[0] if len(t) else 0.0, from_first_row(t) * seconds
     if not fault and time_unit is None:
-        fault = time_fault(t, q, v, [slice(0, len(t))])
+        fault = time_fault(t, q, v, [slice(0, len(t))], joints.prismatic)
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
     even = unwrapped(q, joints, [slice(0, len(t))], degrees)
     motion = Sampled(t, even.q)
-    fault = even.fault or _jump(motion, names) or ("" if v is None else _disagreement(motion, v, names))
+    fault = even.fault or _jump(motion, joints) or ("" if v is None else _disagreement(motion, v, joints))
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
     late = (f"time is counted from the first row, which is at t = {first:.12g} {time_unit or 's'}",) if first else ()
@@ -182,14 +183,15 @@ def _overflow(t: np.ndarray, q: np.ndarray, columns: list[str]) -> str:
     return ""
 
 
-def _jump(motion: Sampled, columns: list[str]) -> str:
+def _jump(motion: Sampled, joints: Joints) -> str:
     """Where the velocity jumps and what to do, or an empty string."""
     t, q = motion.t, motion.q
     jumps = _jumps(motion)
     if not jumps.any():
         return ""
     row, joint = (int(k) for k in np.unravel_index(np.argmax(jumps), jumps.shape))
-    at = f"velocity jump {jumps[row, joint]:.3g} rad/s of {columns[joint]} at t = {t[row]:.6g} s"
+    unit = units("velocity", joints.prismatic)[joint]
+    at = f"velocity jump {jumps[row, joint]:.3g} {unit} of {joints.names[joint]} at t = {t[row]:.6g} s"
     if row in (0, len(t) - 1):
         return f"{at}, where the motion {'ends' if row else 'starts'} and q is held; add samples at rest there"
     for k in range(max(row - 1, 1), min(row + 2, len(t) - 1)):
@@ -222,7 +224,7 @@ def _jumps(motion: Sampled) -> np.ndarray:
     return np.asarray(np.where(changes > np.maximum(bound, PLAUSIBLE_JUMP), changes, 0.0))
 
 
-def _disagreement(motion: Sampled, v: np.ndarray, columns: list[str]) -> str:
+def _disagreement(motion: Sampled, v: np.ndarray, joints: Joints) -> str:
     """Where the velocity stated in a file is not the derivative of q, and what to do, or an empty string."""
     slope = motion(motion.t).v
     bound = _MISREAD * np.maximum(np.abs(slope).max(axis=0), PLAUSIBLE_JUMP)
@@ -230,8 +232,9 @@ def _disagreement(motion: Sampled, v: np.ndarray, columns: list[str]) -> str:
     if not wrong.any():
         return ""
     row, joint = np.argwhere(wrong)[0]
-    at, stated, found = f"row {row + 1}, v of {columns[joint]}", v[row, joint], slope[row, joint]
-    return f"{at}: {stated:.6g} rad/s, but q changes by {found:.6g} rad/s; correct it or leave v out"
+    at, stated, found = f"row {row + 1}, v of {joints.names[joint]}", v[row, joint], slope[row, joint]
+    unit = units("velocity", joints.prismatic)[joint]
+    return f"{at}: {stated:.6g} {unit}, but q changes by {found:.6g} {unit}; correct it or leave v out"
 
 
 _Columns: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str]]

@@ -15,6 +15,7 @@ from nbs_pin.base.checks import LARGEST, SMALLEST, PerJoint, floats, is_usual, p
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
+from nbs_pin.base.units import units
 from nbs_pin.robots.robot import ARM, Robot
 
 DesiredMotion: TypeAlias = Callable[[Any], Reference]
@@ -254,8 +255,10 @@ def _check_torque(robot: Robot, t: np.ndarray, desired: Reference, friction: boo
     if not beyond.size:
         return
     k, i = beyond[0]
-    weight = abs(pin.computeGeneralizedGravity(robot.model, data, desired.q[k])[i])
-    enough = option("effort_limit", _rounded_up(float(np.abs(tau).max())))  # for every joint
+    weights = np.abs([pin.computeGeneralizedGravity(robot.model, data, q) for q in desired.q])
+    weight, most = weights[k, i], np.maximum(np.abs(tau), weights).max(axis=0)
+    wanted = {robot.joint_names[j]: {"effort": _rounded_up(float(most[j]))} for j in np.unique(beyond[:, 1])}
+    enough = option("limits", wanted)
     remedy = f"slow it down, choose another posture or raise the limit: {enough}"
     if weight > effort[i]:
         remedy = remedy.replace("slow it down, choose", f"its weight alone takes {weight:.4g}, so choose")
@@ -269,12 +272,12 @@ def _check_friction(robot: Robot, v: np.ndarray) -> None:
     stuck = (robot.friction >= robot.effort_limit) & v.any(axis=0)
     if stuck.any():
         joint = robot.joints[int(np.argmax(stuck))]
-        unit = _UNITS["torque"][joint.prismatic]
+        (unit,) = units("torque", [joint.prismatic])
         raise ArgumentError(
             f"the Coulomb friction {joint.friction:g} {unit} of joint '{joint.name}' is not below its effort limit "
             f"{joint.effort:g} {unit}, so that it cannot move; correct the URDF, leave friction out "
             f"({option('joint_friction', 'drop')}) or raise the limit "
-            f"({option('effort_limit', _rounded_up(2.0 * joint.friction))})."
+            f"({option('limits', {joint.name: {'effort': _rounded_up(2.0 * joint.friction)}})})."
         )
 
 
@@ -286,7 +289,6 @@ def _rounded_up(value: float) -> float:
 
 _TRANSITION = 0.01
 """Speed scale of Coulomb friction, that of `JointFriction.of` [rad/s]."""
-_UNITS = {"position": ("rad", "m"), "velocity": ("rad/s", "m/s"), "torque": ("N·m", "N")}
 
 
 def _check_range(
@@ -297,7 +299,7 @@ def _check_range(
         return
     k, i = np.argwhere(~inside)[0]
     joint = robot.joints[i]
-    unit = _UNITS[what][joint.prismatic]
+    (unit,) = units(what, [joint.prismatic])
     raise ArgumentError(
         f"the reference needs the {what} {x[k, i]:.6g} {unit} of joint '{joint.name}' at t = {t[k]:.4g} s, "
         f"outside [{lower[i]:.6g}, {upper[i]:.6g}]; {remedy}."

@@ -10,18 +10,16 @@ from jaxtyping import Float
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.packages import Packages
-from nbs_pin.robots.urdf_checks import Joint, check_origin, lock_too
+from nbs_pin.robots.urdf_checks import LONGEST_WAY, ROUNDING, Joint, check_origin, lock_too
 from nbs_pin.robots.urdf_options import UrdfOptions
 from nbs_pin.robots.urdf_source import Node
 
-_ROUNDING = 1e-6
-"""Relative tolerance for numbers that were rounded when the file was written."""
 _POINT = 1e-9
 """Radius of gyration below which a body counts as a point mass [m]."""
 _NEGLECTED = 1e-14
 """MuJoCo drops bodies below 1e-15 kg."""
-_HEAVIEST, _FARTHEST = 1e6, 100.0
-"""Largest mass [kg] and lever [m] that an arm can have."""
+_HEAVIEST = 1e6
+"""Largest mass that an arm can have [kg]."""
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -89,7 +87,7 @@ def _mass(link: Node, *, welded: bool, repair: bool) -> float:
         warnings.warn(f"{node.place}: {node.owner}: {problem}; the inertia is left out.", stacklevel=2)
         link.element.remove(inertial.element)
         return 0.0
-    if 0.0 < mass < _NEGLECTED or mass > _HEAVIEST or np.abs(inertia).max() > _HEAVIEST * _FARTHEST**2:
+    if 0.0 < mass < _NEGLECTED or mass > _HEAVIEST or np.abs(inertia).max() > _HEAVIEST * LONGEST_WAY**2:
         stated = f"mass {mass:g} kg with inertia up to {np.abs(inertia).max():g} kg·m² is none that an arm can have"
         raise inertial.need("mass").refuse(
             stated, f"give a mass from {_NEGLECTED:g} to {_HEAVIEST:g} kg, or 0 for none"
@@ -128,7 +126,7 @@ def _fault(mass: float, inertia: Float[np.ndarray, "3 3"]) -> str:
     """Why no rigid body has this inertia, or nothing."""
     moments = np.linalg.eigvalsh(inertia)
     small, middle, large = moments.tolist()
-    slack = _ROUNDING * abs(large) + _POINT**2 * mass
+    slack = ROUNDING * abs(large) + _POINT**2 * mass
     stated = f"({', '.join(f'{moment:.4g}' for moment in moments)} kg·m²)"
     if small < -slack:
         return f"inertia is not positive definite {stated}"

@@ -37,8 +37,10 @@ def weak_joints(model: pin.Model, low: JointArray, high: JointArray) -> tuple[li
     if still:
         return still, problem
     data, draws, reach = model.createData(), np.random.default_rng(0), _reach(model)
-    low, high = np.where(np.isfinite(low), low, -reach), np.where(np.isfinite(high), high, reach)
-    low, high = np.minimum(low, high - 1e-9), np.maximum(high, low + 1e-9)
+    low, high = (
+        np.where(np.isfinite(low), low, np.minimum(-reach, high - 2.0 * reach)),
+        np.where(np.isfinite(high), high, np.maximum(reach, low + 2.0 * reach)),
+    )
     poses = [np.clip(np.zeros(model.nv), low, high), *draws.uniform(low, high, (_STARTS, model.nv))]
     masses = [_mass(model, data, q) for q in poses]
     scale = np.sqrt(np.max([np.diag(mass) for mass in masses], axis=0))

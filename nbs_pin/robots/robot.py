@@ -17,13 +17,13 @@ from jaxtyping import Bool, Float, Int
 from nbs_pin.base.arguments import a, checked, mapping, maybe, path
 from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors
 from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
-from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError, RobotError
 from nbs_pin.base.storable import storable
 from nbs_pin.robots.catalogue import find
 from nbs_pin.robots.mass_matrix import weak_joints
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
-from nbs_pin.robots.urdf_options import read_options
+from nbs_pin.robots.urdf_checks import lock_too
+from nbs_pin.robots.urdf_options import UrdfOptions, read_options
 
 
 @storable(("name", "source", "options", "sha256", "effort_limit"))
@@ -243,7 +243,7 @@ def load_robot(
     stored = {"gravity": vector.tolist(), **options.stored()}
     said = {key: stored[key] for key, value in given.items() if value is not None}
     robot = Robot(entry.name or urdf.name, entry.name or str(entry.path), urdf, model, vector, said)
-    _check_inertia(robot)
+    _check_inertia(robot, options)
     return robot
 
 
@@ -280,7 +280,7 @@ def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
     return model
 
 
-def _check_inertia(robot: Robot) -> None:
+def _check_inertia(robot: Robot, options: UrdfOptions) -> None:
     """Raise RobotError unless M(q) ≻ 0 in every pose within the limits."""
     names, problem = weak_joints(robot.model, robot.lower, robot.upper)
     if not names:
@@ -291,5 +291,5 @@ def _check_inertia(robot: Robot) -> None:
     problem += "; it states no <axis>, which URDF reads as 1 0 0" if unsaid else ""
     remedy = f"{'add <axis xyz=…>, ' if unsaid else ''}give the links behind it inertia about its axis"
     raise RobotError(
-        f"{robot.urdf.path}: joint '{names[0]}': {problem}; {remedy}, or lock it ({option('lock', names)})."
+        f"{robot.urdf.path}: joint '{names[0]}': {problem}; {remedy}, or lock it ({lock_too(options, names)})."
     )

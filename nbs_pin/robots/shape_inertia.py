@@ -8,11 +8,9 @@ import trimesh
 
 from nbs_pin.robots.meshes import MeshError, find_mesh, read_mesh
 from nbs_pin.robots.packages import Packages
-from nbs_pin.robots.urdf_checks import check_origin
+from nbs_pin.robots.urdf_checks import LONGEST_WAY, check_origin
 from nbs_pin.robots.urdf_source import Node
 
-LONGEST = 100.0
-"""Longest extent of a shape [m]."""
 DENSITY = 1000.0
 """Density that MuJoCo fills shapes with as well [kg/m³]."""
 
@@ -63,7 +61,7 @@ def _meshes(geometry: Node, packages: Packages) -> list[trimesh.Trimesh]:
     faces = np.concatenate([part.faces + first for part, first in zip(parts, counts, strict=False)])
     whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), faces)
     if (
-        not np.abs(whole.vertices).max() <= LONGEST
+        not np.abs(whole.vertices).max() <= LONGEST_WAY
         or np.linalg.matrix_rank(np.ptp(whole.vertices, axis=0) * np.eye(3)) < 3
     ):
         raise mesh.refuse("its inertia cannot be guessed: it is flat or too large", "give the link an <inertial>")
@@ -72,7 +70,7 @@ def _meshes(geometry: Node, packages: Packages) -> list[trimesh.Trimesh]:
 
 def _size(shape: Node, key: str, value: float) -> float:
     """The size of a shape; raises RobotError unless it encloses a volume that an arm can have."""
-    if not 0.0 < value <= LONGEST:
+    if not 0.0 < value <= LONGEST_WAY:
         raise shape.refuse(f"{key} {value:g} m encloses no volume of an arm", "give the link an <inertial>")
     return value
 

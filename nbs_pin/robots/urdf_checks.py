@@ -29,7 +29,7 @@ MOVING = ("revolute", "continuous", "prismatic")
 """Supported joint types with one degree of freedom."""
 
 _UNSUPPORTED = ("floating", "planar")
-_ROUNDING = 1e-6
+ROUNDING = 1e-6
 """Relative tolerance for numbers that were rounded when the file was written."""
 LONGEST_WAY, MOST_TURNED = 100.0, 1e6
 """Largest distance [m] and angle [rad] in an origin or a position that an arm can have."""
@@ -142,7 +142,7 @@ def check_axis(joint: Joint) -> None:
     length = math.hypot(*xyz)
     if length < 1e-9:
         raise axis.refuse(f"axis xyz '{axis.text('xyz')}' has zero length", "fix <axis xyz=…>")
-    if abs(length - 1.0) > _ROUNDING:
+    if abs(length - 1.0) > ROUNDING:
         text = f"{axis.place}: {axis.owner}: axis xyz '{axis.text('xyz')}' is not a unit vector; it was normalised."
         warnings.warn(text, stacklevel=2)
         axis.element.set("xyz", " ".join(repr(x / length) for x in xyz))
