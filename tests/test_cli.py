@@ -265,6 +265,20 @@ def test_a_stop_in_the_simulation_leaves_nothing(tmp_path, number, code):
     assert not folder.exists()
 
 
+def test_a_stop_within_text_that_is_executed_has_its_exit_code(tmp_path):
+    """Python remembers an interrupt that leaves an exec of text, though it was handled, and ends by the signal."""
+    script = (
+        "import os, signal, sys\nimport nbs_pin.cli.shell as shell\nfrom nbs_pin.cli import main\n"
+        "def run(arguments, stops, ready):\n"
+        "    ready()\n"
+        "    try:\n        exec('import os, signal; os.kill(os.getpid(), signal.SIGINT); sum(range(10**7))')\n"
+        "    except KeyboardInterrupt:\n        print('kept')\n        return stops[0]\n"
+        "shell.run = run\nsys.argv = ['nbs-pin']\nsys.exit(main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "kept\n", "")
+
+
 def is_handled(process, number):
     """Whether the process has a handler for the signal; before that it is the interpreter that starts."""
     caught = re.search(r"SigCgt:\s*(\w+)", Path(f"/proc/{process.pid}/status").read_text())

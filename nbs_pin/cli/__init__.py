@@ -37,7 +37,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     # While modules are imported an exception could be swallowed or reappear as another one, and nothing is to be kept.
     previous = _handle(_leave if alone else stop)
     try:
-        return _shell().run(arguments, stops, lambda: _handle(stop))
+        code: int = _shell().run(arguments, stops, lambda: _handle(stop))
+        if alone and stops:
+            # Where the interrupt met an exec of text, as dataclasses make it, the interpreter would end by the signal.
+            sys.stdout.flush()
+            os._exit(code)
+        return code
     except KeyboardInterrupt:  # in the moments that `run` does not cover
         code = stops[0] if stops else SIGNALLED + signal.SIGINT
         if alone:
