@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check mutants fuzz fuzz-calls fuzz-files fuzz-descriptions monitor-campaign certificate-campaign bench-history clean
+.PHONY: help setup demo test check mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make test           the test suite"
@@ -12,6 +12,7 @@ help:
 	@echo "make fuzz-calls     10,000 calls with hostile arguments at every public function"
 	@echo "make fuzz-files     10,000 damaged files at every reader; about five minutes"
 	@echo "make fuzz-descriptions  20,000 broken URDF and xacro files; about ten minutes"
+	@echo "make random-arms    50 random arms with rotors and friction, untuned; about five minutes"
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
 	@echo "make bench-history  append this machine's figures to bench-history.jsonl; leave it alone meanwhile"
@@ -48,6 +49,9 @@ fuzz-files: $(READY)
 
 fuzz-descriptions: $(READY)
 	$(BIN)/python tools/fuzz_descriptions.py
+
+random-arms: $(READY)
+	$(BIN)/python tools/random_arms.py
 
 monitor-campaign: $(READY)
 	$(BIN)/python tools/monitor_campaign.py

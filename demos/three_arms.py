@@ -38,7 +38,7 @@ def main(out: Path = Path("out/demo"), duration: float = 8.0) -> dict[str, dict]
         run = nbs.simulate(nbs.MujocoPlant(robot), law, reference, duration, PERIOD, q0=start, progress=True)
         wall_time = time.perf_counter() - began
         run.save(out / name / "run.npz")
-        nbs.plot_tracking(run, out / name / "tracking.png")
+        nbs.plot_tracking(run, out / name / "tracking.png", robot=robot)
         nbs.replay(run, out / name / "replay.html")
         figures = results[name] = {
             "near_after_s": float(nbs.metrics.convergence_time(run)),

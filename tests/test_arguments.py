@@ -189,9 +189,10 @@ def test_finite_numbers_never_give_a_torque_that_is_none(large):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_hostile_arguments_meet_a_sentence_at_every_door():
+def test_hostile_arguments_meet_a_sentence_at_every_door(tmp_path, monkeypatch):
     from fuzz_api import FAULTS, attempt
 
+    monkeypatch.chdir(tmp_path)  # some name files to write
     found = [attempt(0, call, quick=True) for call in range(2000)]
     assert not [outcome for outcome in found if outcome.kind in FAULTS]
     assert len({outcome.door for outcome in found}) > 150

@@ -49,6 +49,8 @@ class Track(FileUnits):
     A comma-separated list has one per joint: constant:5,5,3."""
     joint_friction: Literal["drop", "keep"] = "drop"
     """Joint friction of the URDF: not simulated, or simulated and fed forward by every law with a model."""
+    joint_stops: Literal["drop", "keep"] = "drop"
+    """Position limits of the joints: not simulated, or stops at which they are held (mujoco)."""
     effort_limit: Annotated[
         float | None, number("--effort-limit", above=0.0, most=1e9, unit="N·m"), default("the arm's")
     ] = None

@@ -8,6 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.npz import LARGEST
 from nbs_pin.base.progress import waiting
@@ -60,7 +61,8 @@ def run(options: Track, console: Console, notes: Console) -> None:
     with results.made() as folder:
         recorded, compile_time, wall_time = track(robot, **given, progress=True)
         recorded.info.update(reference=options.reference, **results.facts)
-        found = figures(recorded, robot)
+        found = figures(recorded, robot) | {"joint_stops": options.joint_stops}
+        found["not_simulated"] = not_simulated(robot, options.joint_friction)
         with notes.status(f"writing run, picture and replay into {folder}"):
             times = {"compile_time_s": compile_time, "wall_time_s": wall_time}
             write_results(recorded, results, robot, found, seed=options.seed, **times)
@@ -91,6 +93,7 @@ def track(
     start: Sequence[float] | None = None,
     disturbance: Disturbance | None = None,
     joint_friction: str = "drop",
+    joint_stops: str = "drop",
     integrator: str | None = None,
     plant_step: float | None = None,
     lookahead: float | None = None,
@@ -102,7 +105,8 @@ def track(
     plant, controller: by name (`build_plant`, `law_of`) or built. reference: None takes
     `Sinusoid.for_robot(robot)`. start_error: initial error of every joint, with alternating sign, at rest [rad]; 0
     starts on the reference. start: configuration to start from at rest [rad], in place of `start_error`.
-    joint_friction: "keep" simulates the URDF's friction, fed forward by laws that model it. integrator: of a plant by
+    joint_friction: "keep" simulates the URDF's friction, fed forward by laws that model it. joint_stops:
+    "keep" stops joints at their position limits. integrator: of a plant by
     name, None its usual one. plant_step, lookahead [s]: as in `simulate`. seed: of the network weights.
 
     Raises:
@@ -116,7 +120,7 @@ def track(
     if not isinstance(controller, Controller):
         controller = law_of(controller, robot, bandwidth=bandwidth, period=period, friction=friction, seed=seed)
     if not isinstance(plant, Plant):
-        plant = build_plant(plant, robot, integrator=integrator, joint_friction=joint_friction)
+        plant = build_plant(plant, robot, integrator=integrator, joint_friction=joint_friction, joint_stops=joint_stops)
     if start is None and start_error:
         start = Reference(*reference(0.0)).q + start_error * (-1.0) ** np.arange(robot.nv)
     begun = time.perf_counter()
@@ -154,6 +158,20 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     return values
 
 
+def not_simulated(robot: Robot, joint_friction: str) -> list[str]:
+    """What the description states and the run leaves out, each with the option that takes it in."""
+    left_out = []
+    if joint_friction == "drop" and (robot.damping.any() or robot.friction.any()):
+        most = {"viscous": robot.damping, "Coulomb": robot.friction}
+        kinds = " and ".join(f"{kind} up to {x.max():.3g}" for kind, x in most.items() if x.any())
+        left_out.append(f"joint friction, {kinds}: {option('joint_friction', 'keep')}")
+    names = robot.urdf.without_rotor
+    if names:
+        text = f"rotor inertia of {', '.join(names)}, which have a gear but state no rotor"
+        left_out.append(f"{text}: {option('rotor_inertia', {names[0]: BLANK})}")
+    return left_out
+
+
 def write_results(run: Run, results: Results, robot: Robot, figures: dict[str, Any], **more: Any) -> None:
     """Write `FILES`, the run and summary.json first; a picture that cannot be drawn is told in a warning.
 
@@ -163,7 +181,7 @@ def write_results(run: Run, results: Results, robot: Robot, figures: dict[str, A
     with results.replaced(FILES, figures, **more) as draft:
         run.save(draft / FILES[0])
     with drawing(folder / FILES[1]) as path:
-        plot_tracking(run, path)
+        plot_tracking(run, path, robot=robot)
     with drawing(folder / FILES[2]) as path:
         replay(run, path, robot)
 
@@ -226,12 +244,14 @@ def _converged(figures: dict[str, Any]) -> str:
 def _lines(figures: dict[str, Any], compile_time: float, wall_time: float) -> list[str]:
     saturated, late = figures["saturated_fraction"], figures["saturated_fraction_late"]
     units = figures["units"]["position"]
+    remedy = f": {option('joint_stops', 'keep')} stops it" if figures["joint_stops"] == "drop" else ""
     outside = zip(figures["joints"], figures["outside_position_range_rad"], units, strict=True)
     return [
         f"converged (‖error‖ < 0.1 {several(units)} to the end): {_converged(figures)}",
         f"some joint at its effort limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
-        *(f"{joint} left its range by {excess:.3g} {unit}: the plant has no joint stops"
+        *(f"{joint} left its range by {excess:.3g} {unit}{remedy}"
           for joint, excess, unit in outside if excess > 0.0),
+        *([f"not simulated: {'; '.join(figures['not_simulated'])}"] if figures["not_simulated"] else []),
         *([f"compiled the law in {compile_time:.1f} s, once on this machine"] if compile_time > _NOTICEABLE else []),
         f"simulated {figures['duration_s']:g} s in {wall_time:.1f} s",
     ]  # fmt: skip

@@ -15,15 +15,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from nbs_pin.base.arguments import checked, count, writable
+from nbs_pin.base.arguments import checked, count, maybe, writable
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import RUN, Run
-from nbs_pin.robots.robot import configuration_difference
+from nbs_pin.robots.robot import ARM, Robot, configuration_difference
+from nbs_pin.robots.urdf import JointData
 from nbs_pin.simulation.metrics import saturated_fraction
 
 ACTUAL, REFERENCE, ERROR = "#1f5fbf", "#ff8c1a", "#b3261e"
-TORQUE, LIMIT, SATURATED = "#22734d", "#8a8f98", "#f6c945"
+TORQUE, LIMIT, SATURATED, FAST = "#22734d", "#8a8f98", "#f6c945", "#7b3fa0"
 MAX_POINTS = 4000
 """Longer curves are thinned, keeping the extremes of every stretch."""
 
@@ -51,15 +52,17 @@ def picture(path: str | Path, width: float, height: float, dpi: int = 120) -> It
     write_whole(path, buffer.getvalue())
 
 
-@checked(run=RUN, path=writable, start=count(0))
-def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
+@checked(run=RUN, path=writable, start=count(0), robot=maybe(ARM))
+def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | None = None) -> Path:
     """Plot how each joint follows its reference and write the picture (PNG); returns its path.
 
     Each row shows actual and desired position, |error| on a logarithmic scale (wrapped on continuous joints), and the
-    applied torque with the effort limits, saturated stretches shaded. `start` selects one start of a batched run.
+    applied torque with the effort limits, saturated stretches shaded. `start` selects one start of a batched run. With
+    a `robot`, position limits are drawn where the joint comes near them, and stretches are shaded in which it is
+    outside them or faster than its velocity limit.
 
     Raises:
-        ArgumentError: If the start does not exist.
+        ArgumentError: If the start does not exist, or the robot has another number of joints.
 
     Example:
         >>> import tempfile
@@ -74,8 +77,11 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
     starts = int(np.prod(run.q.shape[1:-1], dtype=int))
     if not 0 <= start < starts:
         raise ArgumentError(f"start={start} does not exist: the run has starts 0 to {starts - 1}.")
-    q, q_ref, tau, asked = (
-        np.array(x.reshape(len(run.t), starts, run.nv)[:, start]) for x in (run.q, run.q_ref, run.tau, run.tau_command)
+    if robot is not None and robot.nv != run.nv:
+        raise ArgumentError(f"the run has {run.nv} joints and {robot!r} {robot.nv}; give the robot of the run.")
+    q, v, q_ref, tau, asked = (
+        np.array(x.reshape(len(run.t), starts, run.nv)[:, start])
+        for x in (run.q, run.v, run.q_ref, run.tau, run.tau_command)
     )
     error = np.abs(configuration_difference(q, q_ref, run.continuous))
     cut = np.abs(asked) > run.effort_limit
@@ -85,6 +91,8 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
         grid = figure.subplots(run.nv, 3, sharex=True, squeeze=False)
         for joint, (position_axes, error_axes, torque_axes) in enumerate(grid):
             _draw_position(position_axes, run.t, q[:, joint], q_ref[:, joint])
+            if robot is not None:
+                _draw_stops(position_axes, run.t, q[:, joint], v[:, joint], robot.joints[joint])
             _draw_error(error_axes, run.t, error[:, joint])
             _draw_torque(torque_axes, run.t, tau[:, joint], float(run.effort_limit[joint]), cut[:, joint])
             position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color="#1d2733")
@@ -102,6 +110,23 @@ def _draw_position(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarra
     axes.plot(*thin(t, q_ref), color=REFERENCE, linewidth=2.6, alpha=0.75)
     axes.plot(*thin(t, q), color=ACTUAL)
     axes.yaxis.set_major_locator(MaxNLocator(4))
+
+
+def _draw_stops(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarray, " rows"], v: Float[np.ndarray, " rows"],
+                joint: JointData) -> None:  # fmt: skip
+    """The position limits that the joint comes near, and the stretches beyond them or its velocity limit."""
+    reach = max(float(np.ptp(q)), 0.05 * (joint.upper - joint.lower) if np.isfinite(joint.upper - joint.lower) else 0.0)
+    for stop in (joint.lower, joint.upper):
+        if np.isfinite(stop) and min(abs(q.min() - stop), abs(q.max() - stop)) < 0.5 * reach:
+            axes.axhline(stop, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
+    outside, fast = (q < joint.lower) | (q > joint.upper), np.abs(v) > joint.velocity
+    said = []
+    for flags, color, what in ((outside, ERROR, "outside its range"), (fast, FAST, "above its velocity limit")):
+        bars = [(t[begin], t[min(end, len(t) - 1)] - t[begin]) for begin, end in stretches(flags)]
+        axes.broken_barh(bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=color, alpha=0.18, linewidth=0)
+        said += [f"{what} {flags.mean():.1%} of the time"] if flags.any() else []
+    axes.annotate("; ".join(said), (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom", fontsize=7,
+                  color=ERROR)  # fmt: skip
 
 
 def _draw_error(axes: Axes, t: Float[np.ndarray, " rows"], error: Float[np.ndarray, " rows"]) -> None:

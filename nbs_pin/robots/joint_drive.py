@@ -33,7 +33,7 @@ def read_drives(robot: Node, joints: list[Joint], options: UrdfOptions) -> dict[
     Raises:
         RobotError: If a value is not a number ≥ 0, or a rotor inertia is given for a joint without a transmission.
     """
-    ratios = _reductions(robot)
+    ratios = reductions(robot)
     return {joint.name: _drive(joint, ratios, options) for joint in joints if joint.moves}
 
 
@@ -84,7 +84,7 @@ def _write(joint: Joint, drive: Drive) -> None:
             element.set(key, repr(float(value)))
 
 
-def _reductions(robot: Node) -> dict[str, float]:
+def reductions(robot: Node) -> dict[str, float]:
     """The gear ratio N of each joint that has a transmission: `mechanicalReduction`, of the joint or its actuator.
 
     Transmissions of ros2_control call it `mechanical_reduction`.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nbs_pin.robots.attachments import attach
 from nbs_pin.robots.bodies import check_bodies
-from nbs_pin.robots.joint_drive import Drive, read_drives
+from nbs_pin.robots.joint_drive import Drive, read_drives, reductions
 from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.urdf_checks import Joint, check_axis, check_tree
 from nbs_pin.robots.urdf_limits import Limits, read_limits
@@ -47,6 +47,8 @@ class Urdf:
     path: Path
     xml: bytes
     joints: tuple[JointData, ...]
+    without_rotor: tuple[str, ...] = ()
+    """Joints whose transmission states a reduction, while no rotor inertia is known."""
 
     def without_geometry(self) -> bytes:
         """The dynamics alone: links with inertias and joints, without visual, collision, material or extension."""
@@ -78,7 +80,9 @@ def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
     check_bodies(robot, joints, options, packages)
     limits, drives = read_limits(joints, options), read_drives(robot, joints, options)
     moving = tuple(_settle(joint, limits[joint.name], drives[joint.name], options) for joint in joints if joint.moves)
-    return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving)
+    geared = reductions(robot)
+    bare = tuple(joint.name for joint in moving if geared.get(joint.name, 1.0) != 1.0 and not joint.armature)
+    return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving, bare)
 
 
 def _settle(joint: Joint, limits: Limits, drive: Drive, options: UrdfOptions) -> JointData:

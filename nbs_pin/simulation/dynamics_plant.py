@@ -7,7 +7,8 @@ import numpy as np
 from nbs_pin.base.arguments import DURATION, checked, choice, maybe
 from nbs_pin.base.arrays import Array, Vectors, as_vectors, is_torch_array
 from nbs_pin.base.checks import all_finite
-from nbs_pin.base.exceptions import SimulationDiverged, TooLarge
+from nbs_pin.base.doors import option
+from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged, TooLarge
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
@@ -45,15 +46,27 @@ class DynamicsPlant(Plant):
         self._step = INTEGRATORS[integrator]
 
     @classmethod
-    @checked(robot=ARM, integrator=maybe(choice(*INTEGRATORS)), joint_friction=choice("drop", "keep"))
+    @checked(
+        robot=ARM,
+        integrator=maybe(choice(*INTEGRATORS)),
+        joint_friction=choice("drop", "keep"),
+        joint_stops=choice("drop", "keep"),
+    )
     def for_robot(
-        cls, robot: Robot, integrator: IntegratorName | None = None, joint_friction: str = "drop"
+        cls,
+        robot: Robot,
+        integrator: IntegratorName | None = None,
+        joint_friction: str = "drop",
+        joint_stops: str = "drop",
     ) -> "DynamicsPlant":
         """Pinocchio's dynamics of the arm, RK4 by default; joint_friction "keep" adds the friction of the URDF.
 
         Raises:
-            ArgumentError: If integrator is unknown, or joint_friction is not "drop" or "keep".
+            ArgumentError: If integrator is unknown, joint_friction is not "drop" or "keep", or joint_stops is "keep",
+                which MuJoCo alone has.
         """
+        if joint_stops == "keep":
+            raise ArgumentError(f"the plant pinocchio has no joint stops; {option('plant', 'mujoco')} has.")
         friction = JointFriction.of(robot) if joint_friction == "keep" else None
         return cls(PinocchioDynamics(robot), integrator or "rk4", friction)
 

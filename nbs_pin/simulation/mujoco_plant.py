@@ -30,15 +30,17 @@ _INTEGRATORS = {
 _OFF = mujoco.mjtDisableBit
 # Autoreset would silently reset a diverged arm; a warm start would make a step depend on the one before.
 _ALWAYS_OFF = _OFF.mjDSBL_AUTORESET | _OFF.mjDSBL_WARMSTART | _OFF.mjDSBL_ACTUATION
-_ALL_BUT_FRICTION = _OFF.mjDSBL_LIMIT | _OFF.mjDSBL_CONTACT | _OFF.mjDSBL_EQUALITY  # dry friction is a constraint
+_UNWANTED = _OFF.mjDSBL_CONTACT | _OFF.mjDSBL_EQUALITY  # dry friction and stops are constraints
 # By default a tenth of the free acceleration passes dry friction, so that a light joint neither sticks nor slides; with
 # the hardest setting it is Coulomb friction to 1e-4 of the torque.
 _DRY_FRICTION_SOLREF = (0.002, 1.0)
+# A stop that yields in 4 ms, the shortest time that MuJoCo keeps at a step of 1 or 2 ms.
+_STOP_SOLREF = (0.004, 1.0)
 _DRY_FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 
 class MujocoPlant(Plant):
-    """The arm in MuJoCo, without contacts, position limits or effort limits, which `simulate` applies.
+    """The arm in MuJoCo, without contacts or effort limits, which `simulate` applies.
 
     MuJoCo's warnings raise SimulationDiverged; for the whole process they go to the logger "nbs_pin.mujoco" instead of
     a file in the working directory. Each plant owns a scratch `mujoco.MjData`, which one thread uses at a time: several
@@ -50,9 +52,10 @@ class MujocoPlant(Plant):
             without friction, else "implicitfast", since joint damping can be too stiff for explicit steps.
         joint_friction: "drop" omits the damping and dry friction of the URDF, as Pinocchio does; "keep" applies both,
             dry friction as MuJoCo's hardest constraint; a `JointFriction` replaces them (its transition is not used).
+        joint_stops: "drop" lets joints leave their position limits; "keep" stops them there, by a constraint.
 
     Raises:
-        ArgumentError: If integrator or joint_friction is unknown.
+        ArgumentError: If integrator, joint_friction or joint_stops is unknown.
         RobotError: If MuJoCo cannot build the arm.
 
     Example:
@@ -62,10 +65,17 @@ class MujocoPlant(Plant):
     """
 
     @checked(
-        robot=ARM, integrator=maybe(choice(*_INTEGRATORS)), joint_friction=either(FRICTION, choice("drop", "keep"))
+        robot=ARM,
+        integrator=maybe(choice(*_INTEGRATORS)),
+        joint_friction=either(FRICTION, choice("drop", "keep")),
+        joint_stops=choice("drop", "keep"),
     )
     def __init__(
-        self, robot: Robot, integrator: MujocoIntegrator | None = None, joint_friction: JointFrictionChoice = "drop"
+        self,
+        robot: Robot,
+        integrator: MujocoIntegrator | None = None,
+        joint_friction: JointFrictionChoice = "drop",
+        joint_stops: Literal["drop", "keep"] = "drop",
     ) -> None:
         is_dropped = isinstance(joint_friction, str) and joint_friction == "drop"
         integrator = integrator or ("rk4" if is_dropped else "implicitfast")
@@ -74,8 +84,8 @@ class MujocoPlant(Plant):
         mujoco.set_mju_user_warning(_LOGGER.info)
         self._robot, self._nv = robot, robot.nv
         self.integrator = integrator
-        self.joint_friction = joint_friction
-        self.model = build_model(robot, integrator, joint_friction)
+        self.joint_friction, self.joint_stops = joint_friction, joint_stops
+        self.model = build_model(robot, integrator, joint_friction, joint_stops)
         ids = [self.model.joint(name).id for name in robot.joint_names]
         self._at_q = _in_order(self.model.jnt_qposadr[ids])
         self._at_v = _in_order(self.model.jnt_dofadr[ids])
@@ -98,7 +108,8 @@ class MujocoPlant(Plant):
         self._bind()
 
     def __repr__(self) -> str:
-        return f"MujocoPlant({self._robot.name}, {self.integrator}, joint_friction={self.joint_friction})"
+        stops = ", joint_stops=keep" if self.joint_stops == "keep" else ""
+        return f"MujocoPlant({self._robot.name}, {self.integrator}, joint_friction={self.joint_friction}{stops})"
 
     @property
     def nv(self) -> int:
@@ -198,7 +209,9 @@ class MujocoPlant(Plant):
 _DURATION = partial(DURATION, "duration")
 
 
-def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: JointFrictionChoice) -> mujoco.MjModel:
+def build_model(
+    robot: Robot, integrator: MujocoIntegrator, joint_friction: JointFrictionChoice, joint_stops: str = "drop"
+) -> mujoco.MjModel:
     """MuJoCo's model of the arm, from its URDF without shapes; raises RobotError if it cannot be built.
 
     It is built with `MjSpec`, as MuJoCo's XML writer keeps only six digits.
@@ -216,9 +229,13 @@ def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: Join
                 viscous, dry = other.get(joint.name, (0.0, 0.0))
                 joint.damping, joint.frictionloss = np.array([viscous, 0.0, 0.0]), dry
             joint.solref_friction, joint.solimp_friction = _DRY_FRICTION_SOLREF, _DRY_FRICTION_SOLIMP
+            if joint_stops == "keep":
+                joint.solref_limit = _STOP_SOLREF
         spec.option.gravity = robot.gravity_vector
         spec.option.integrator = _INTEGRATORS[integrator]
-        off = _OFF.mjDSBL_CONSTRAINT if joint_friction == "drop" else _ALL_BUT_FRICTION
+        off = _UNWANTED if joint_stops == "keep" else _UNWANTED | _OFF.mjDSBL_LIMIT
+        if joint_friction == joint_stops == "drop":
+            off = _OFF.mjDSBL_CONSTRAINT
         spec.option.disableflags = _ALWAYS_OFF | off
         return spec.compile()
     except ValueError as error:

@@ -21,6 +21,7 @@ from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.motions.disturbances import Disturbance, TorqueNoise
 from nbs_pin.motions.references import MOTION, DesiredMotion
+from nbs_pin.simulation.guards import check_loop
 from nbs_pin.simulation.loop import Loop
 from nbs_pin.simulation.plant import PLANT, Plant
 
@@ -39,6 +40,7 @@ _LOOP = {
     "plant_step": maybe(PERIOD),
     "disturbance": maybe(function(3, "a disturbance, a function of t, q and v that returns torques, or None")),
     "lookahead": maybe(number(least=0.0, most=1000.0, unit="s")),
+    "check": flag,
     "progress": flag,
 }
 
@@ -58,6 +60,7 @@ def simulate(
     disturbance: Disturbance | None = None,
     lookahead: float | None = None,
     workers: int = 1,
+    check: bool = True,
     progress: bool = False,
 ) -> Run:
     """The motion of the plant under the controller, sampled at the control instants.
@@ -81,10 +84,12 @@ def simulate(
             that lag (the tracking error of panda at 1 kHz falls tenfold). 0 is the plain sampled law.
         workers: Processes that share the starts along the first axis of q0. `TorqueNoise` is the same for any number;
             another disturbance is called with the starts of one process at a time.
+        check: First compare the motion with the position, velocity and effort limits of the plant's arm, the start with
+            its position limits, and the law's arm with the plant's. False simulates what the arm cannot do.
         progress: Show a progress bar on a terminal after 2 s.
 
     Raises:
-        ArgumentError: If arguments are out of range or do not match.
+        ArgumentError: If arguments are out of range or do not match, or `check` finds a fault.
         SimulationDiverged: If a torque or the state is not finite, or the engine warns; it states the time.
 
     Example:
@@ -96,6 +101,8 @@ def simulate(
     """
     loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance)
     start = loop.start(reference, q0, v0)
+    if check:
+        check_loop(loop, controller, reference, start)
     loop.check_size(math.prod(start[0].shape[:-1]))
     if workers > 1:
         return _shared(loop, reference, start, workers)
@@ -163,6 +170,7 @@ def stream(
     effort_limit: Any = None,
     disturbance: Disturbance | None = None,
     lookahead: float | None = None,
+    check: bool = True,
     progress: bool = False,
 ) -> Iterator[Run]:
     """`simulate` with bounded memory, for hours of motion: one Run per `block` control periods.
@@ -179,7 +187,10 @@ def stream(
         [101, 101]
     """
     loop = _closed(plant, controller, duration, period, plant_step, effort_limit, lookahead, disturbance, MOST_STREAMED)
-    return _blocks(loop, reference, loop.start(reference, q0, v0), block, progress)
+    start = loop.start(reference, q0, v0)
+    if check:
+        check_loop(loop, controller, reference, start)
+    return _blocks(loop, reference, start, block, progress)
 
 
 def _blocks(
