@@ -20,7 +20,8 @@ class Entry:
     zero_limits: ZeroLimits = "refuse"
 
 
-_BUNDLED = {"two_link": 9.8, "three_link": 9.81}
+_OUR_FILES = ("two_link", "three_link", "fr3", "ur3e", "ur5e", "ur10e", "gen3", "iiwa14")
+_GRAVITY = {"two_link": 9.8}  # the paper's
 _FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 _EXAMPLES: dict[str, tuple[str, tuple[str, ...], ZeroLimits]] = {
     "panda": ("panda_description/urdf/panda.urdf", _FINGERS, "refuse"),
@@ -36,7 +37,7 @@ _EXAMPLES: dict[str, tuple[str, tuple[str, ...], ZeroLimits]] = {
     "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", (), "unlimited"),
 }
 _SUFFIXES = (".urdf", ".xacro")
-ROBOT_NAMES: tuple[str, ...] = (*_BUNDLED, *_EXAMPLES)
+ROBOT_NAMES: tuple[str, ...] = (*_OUR_FILES, *_EXAMPLES)
 """Names of all arms that `load_robot` knows."""
 
 
@@ -51,10 +52,10 @@ def find(name_or_path: str) -> Entry:
 
     Raises RobotNotFound, with the nearest names, if it is neither, and RobotError if the path cannot be read.
     """
-    if name_or_path in _BUNDLED:
+    if name_or_path in _OUR_FILES:
         folder = Path(__file__).parent.parent / "_urdf"
         folder = folder if folder.is_dir() else Path(__file__).parent.parent.parent / "urdf"
-        return Entry(name_or_path, folder / f"{name_or_path}.urdf", gravity=_BUNDLED[name_or_path])
+        return Entry(name_or_path, folder / f"{name_or_path}.urdf", gravity=_GRAVITY.get(name_or_path, 9.81))
     if name_or_path in _EXAMPLES:
         path, lock, zero_limits = _EXAMPLES[name_or_path]
         robots = example_robot_share() / "example-robot-data" / "robots"
