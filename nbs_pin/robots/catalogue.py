@@ -27,7 +27,7 @@ class Entry:
 
 _OUR_FILES: dict[str, Mapping[str, Any]] = {
     "two_link": {"gravity": 9.8},
-    **dict.fromkeys(("three_link", "fr3", "ur3e", "ur5e", "ur10e", "gen3", "iiwa14"), {}),
+    **{name: {} for name in ("three_link", "fr3", "ur3e", "ur5e", "ur10e", "gen3", "iiwa14")},
 }
 _FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 _EXAMPLES: dict[str, tuple[str, Mapping[str, Any]]] = {
