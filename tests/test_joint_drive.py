@@ -181,3 +181,15 @@ def test_wrong_words_name_their_flag(words, capsys):
     line = refusal(cli.main(["track", "two_link", words]), capsys)
     assert words.split("=")[0] in line
     assert "JOINT=NUMBER" in line
+
+
+@pytest.mark.parametrize("model", ["identify", "chain"])
+def test_rotors_of_the_arm_are_found_without_asking(tmp_path, model):
+    """M, C and G of a learned model are those of the geared arm: a rotor is no body of the tree."""
+    robot = nbs.load_robot(arm(tmp_path, "", "")).with_armature([0.6, 0.25])
+    data = nbs.collect(robot, "uniform", 400)
+    learned = nbs.identify(data, robot) if model == "identify" else nbs.fit(data, "chain", robot=robot, starts=1)
+    q, v, a = states(2)
+    truth = nbs.PinocchioDynamics(robot)
+    np.testing.assert_allclose(learned.mass_matrix(q), truth.mass_matrix(q), atol=1e-6)
+    np.testing.assert_allclose(learned.reference_torque(q, v, v, a), truth.reference_torque(q, v, v, a), atol=1e-5)
