@@ -6,6 +6,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import nbs_pin as nbs
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.robots.visuals import link_visuals
 
@@ -116,6 +119,31 @@ def test_limits_are_those_of_the_data_sheet(arm):
     *_, speeds, torques = PUBLISHED[arm.name]
     np.testing.assert_allclose(np.rad2deg(arm.velocity_limit), speeds, rtol=0.005)
     np.testing.assert_array_equal(arm.effort_limit, torques)
+
+
+def test_rotor_inertia_is_the_rotors_behind_its_gear():
+    """Drake's estimate for the iiwa, motors and gears of the DLR LWR III."""
+    ratio, rotor = np.array([160, 160, 160, 160, 100, 160, 160]), np.array([1.321e-4] * 5 + [4.54e-5] * 2)
+    np.testing.assert_allclose(load_robot("iiwa14").armature, ratio**2 * rotor, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "with_rotors", "without"), [("fr3", 0.17, 0.5), ("gen3", 0.04, 1.0)])
+def test_rotor_inertia_makes_a_bound_useful(name, with_rotors, without):
+    """‖z1‖ for 5 N·m on every joint [rad], without joint friction."""
+    robot = load_robot(name).with_friction(0.0, 0.0)
+    bare = robot.with_armature(0.0)
+    errors = [nbs.certify(NeuralBackstepping.for_robot(arm), np.full(arm.nv, 5.0)).error for arm in (robot, bare)]
+    assert errors[0] < with_rotors
+    assert errors[1] > without
+
+
+def test_the_default_motion_is_within_the_limits_with_rotors_and_friction(arm):
+    motion, dynamics, friction = nbs.Sinusoid.for_robot(arm), PinocchioDynamics(arm), nbs.JointFriction.of(arm)
+    for t in np.linspace(0.0, 6.3, 200):
+        wanted = motion(t)
+        torque = nbs.inverse_dynamics(dynamics, wanted.q, wanted.v, wanted.a) + friction.torque(wanted.v)
+        assert (np.abs(torque) < 0.6 * arm.effort_limit).all()
+        assert (np.abs(wanted.v) < 0.6 * arm.velocity_limit).all()
 
 
 def test_every_link_is_a_body_that_can_exist(arm):
