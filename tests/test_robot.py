@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import xml.etree.ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
@@ -119,9 +120,14 @@ def test_pinocchio_carries_our_limits(robot):
 def test_the_dynamics_are_those_of_the_file(robot):
     """Rewriting the URDF changes no number: M, bias and gravity as Pinocchio reads the untouched file.
 
-    Locked joints are removed by Pinocchio's own reduction; a continuous joint is (cos q, sin q) there.
+    Locked joints are removed by Pinocchio's own reduction; a continuous joint is (cos q, sin q) there. Pinocchio reads
+    no rotor inertia.
     """
     model = pin.buildModelFromUrdf(str(robot.urdf.path))
+    for joint in ET.parse(robot.urdf.path).getroot().iter("joint"):
+        if joint.find("dynamics") is not None and model.existJointName(joint.get("name")):
+            at = model.joints[model.getJointId(joint.get("name"))].idx_v
+            model.armature[at] = float(joint.find("dynamics").get("armature", "0"))
     locked = [model.getJointId(name) for name in find(robot.source).options.get("lock", ())]
     if locked:
         model = pin.buildReducedModel(model, locked, pin.neutral(model))

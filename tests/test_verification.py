@@ -549,6 +549,25 @@ def test_every_known_arm_is_read_as_it_is(name):
         assert differences(stated_tree(joints), urdf_tree(find(name).path, joints)) == []
 
 
+@pytest.mark.parametrize(
+    ("stated", "felt"),
+    [('armature="0.3" motor_inertia="9"', 0.3), ('motor_inertia="2e-5" gear_ratio="100"', 0.2), ('damping="1"', 0.0)],
+)
+def test_rotors_are_read_from_a_urdf(tmp_path, stated, felt):
+    text = find("two_link").path.read_text()
+    path = tmp_path / "arm.urdf"
+    path.write_text(text.replace('effort="100" velocity="20"/>', f'effort="100" velocity="20"/><dynamics {stated}/>'))
+    robot = nbs.load_robot(str(path))
+    joints = certificate_document(certified(str(path)))["arm"]["joints"]
+    assert [joint["armature"] for joint in joints] == pytest.approx([felt, felt], abs=1e-15)
+    with ctx.workprec(192):
+        assert differences(stated_tree(joints), urdf_tree(path, joints)) == []
+    joints[0]["armature"] += 1e-6
+    with ctx.workprec(192):
+        assert differences(stated_tree(joints), urdf_tree(path, joints)) == ["rotor inertia of joint 1"]
+    np.testing.assert_allclose(robot.armature, felt, atol=1e-15)
+
+
 def test_premises_are_listed(rubbing, tmp_path):
     taken = statuses(verify(written(rubbing, tmp_path / "c.json")), TAKEN)
     assert {"disturbance", "law SlotineLi", "joint friction and |v_d|", "V(0) of the start"} <= set(taken)

@@ -25,7 +25,10 @@ class Entry:
     """Arguments of `load_robot` where none are given."""
 
 
-_BUNDLED = {"two_link": 9.8, "three_link": 9.81}
+_OUR_FILES: dict[str, Mapping[str, Any]] = {
+    "two_link": {"gravity": 9.8},
+    **{name: {} for name in ("three_link", "fr3", "ur3e", "ur5e", "ur10e", "gen3", "iiwa14")},
+}
 _FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 _EXAMPLES: dict[str, tuple[str, Mapping[str, Any]]] = {
     "panda": ("panda_description/urdf/panda.urdf", {"lock": _FINGERS}),
@@ -41,7 +44,7 @@ _EXAMPLES: dict[str, tuple[str, Mapping[str, Any]]] = {
     "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", {"zero_limits": "unlimited"}),
 }
 _SUFFIXES = (".urdf", ".xacro", ".toml")
-ROBOT_NAMES: tuple[str, ...] = (*_BUNDLED, *_EXAMPLES)
+ROBOT_NAMES: tuple[str, ...] = (*_OUR_FILES, *_EXAMPLES)
 """Names of all arms that `load_robot` knows."""
 
 
@@ -56,11 +59,11 @@ def find(name_or_path: str) -> Entry:
 
     Raises RobotNotFound, with the nearest names, if it is neither, and RobotError if the path cannot be read.
     """
-    if name_or_path in _BUNDLED:
+    if name_or_path in _OUR_FILES:
         folder = Path(__file__).parent.parent / "_urdf"
         folder = folder if folder.is_dir() else Path(__file__).parent.parent.parent / "urdf"
         path = folder / f"{name_or_path}.urdf"
-        return Entry(name_or_path, path, path, {"gravity": _BUNDLED[name_or_path]})
+        return Entry(name_or_path, path, path, _OUR_FILES[name_or_path])
     if name_or_path in _EXAMPLES:
         within, options = _EXAMPLES[name_or_path]
         path = example_robot_share() / "example-robot-data" / "robots" / within

@@ -147,7 +147,7 @@ class _Description:
                 raise ValueError(f"joint {i + 1} comes before its parent")
             centre, slides = first[i] / mass[i], self.elements[i].get("type") == "prismatic"
             self.check_kind(self.elements[i], self.joints[i])
-            body = (mass[i], centre, second[i] + mass[i] * skew(centre) @ skew(centre), arb(0))
+            body = (mass[i], centre, second[i] + mass[i] * skew(centre) @ skew(centre), _rotor(self.elements[i]))
             found.append(Link(parent, slides, rotation @ self.axes[i], position, *body, _travel(self.joints[i])))
         return found
 
@@ -180,6 +180,13 @@ class _Description:
             about = balls(np.eye(3)[axis])
             turn = turn @ (np.outer(about, about) + angle.sin() * skew(about) - angle.cos() * skew(about) @ skew(about))
         return i, rotation @ turn, position + rotation @ _words(origin, "xyz", "0 0 0")
+
+
+def _rotor(joint: Any) -> Any:
+    """The rotor inertia that a joint feels [kg·m², kg]: what <dynamics> states, or its motor's behind its gear."""
+    stated = {} if joint.find("dynamics") is None else joint.find("dynamics").attrib
+    behind_gear = arb(stated.get("motor_inertia", "0")) * arb(stated.get("gear_ratio", "1")) ** 2
+    return arb(stated["armature"]) if "armature" in stated else behind_gear
 
 
 def _words(element: Any, key: str, default: str) -> Balls:
