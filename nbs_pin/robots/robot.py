@@ -236,7 +236,8 @@ def load_robot(
     }
     options = read_options(told)
     urdf = read_urdf(entry.path, options)
-    vector = _gravity_vector(entry.gravity if gravity is None else gravity)
+    stated = entry.gravity if urdf.gravity is None else urdf.gravity
+    vector = _gravity_vector(stated if gravity is None else gravity)
     model = _build_model(urdf)
     model.gravity.linear = vector
     given = {"gravity": gravity, **told, "lock": lock, "zero_limits": zero_limits}

@@ -44,6 +44,8 @@ class Urdf:
     path: Path
     xml: bytes
     joints: tuple[JointData, ...]
+    gravity: tuple[float, float, float] | None = None
+    """Gravitational acceleration that the file states [m/s²], as MJCF does."""
 
     def without_geometry(self) -> bytes:
         """The dynamics alone: links with inertias and joints, without visual, collision, material or extension."""
@@ -57,7 +59,7 @@ class Urdf:
 
 
 def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
-    """The checked description in the `.urdf` or `.xacro` file `path`, read as `options` say.
+    """The checked description in the `.urdf`, `.xacro` or MJCF file `path`, read as `options` say.
 
     An arm without a name, which drawing tools refuse, is named after its file.
 
@@ -68,13 +70,18 @@ def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
     """
     options = UrdfOptions() if options is None else options
     packages = Packages(path, options.package_dirs)
-    robot = read_source(path, options.xacro_args, packages)
+    robot, gravity = read_source(path, options.xacro_args, packages), None
+    is_mjcf = robot.element.tag == "mujoco"
+    if is_mjcf:
+        from nbs_pin.robots.mjcf import as_urdf  # MuJoCo takes time to import, and URDF files do not need it
+
+        robot, gravity = as_urdf(path, robot, options)
     robot.element.set("name", robot.element.get("name", path.stem))
     joints = check_tree(robot, options)
     check_bodies(robot, joints, options, packages)
-    limits = read_limits(joints, options)
+    limits = read_limits(joints, options, left_out="unlimited" if is_mjcf else "refuse")
     moving = tuple(_settle(joint, limits[joint.name], options) for joint in joints if joint.moves)
-    return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving)
+    return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving, gravity)
 
 
 def _settle(joint: Joint, limits: Limits, options: UrdfOptions) -> JointData:
