@@ -5,6 +5,8 @@ them: an arm loads without its mesh files. A geom of a mesh that is not read sta
 """
 
 import logging
+import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -59,18 +61,22 @@ def compile_mjcf(files: MjcfFiles) -> MjcfModel:
     """
     mujoco.set_mju_user_warning(_LOGGER.info)  # else MuJoCo writes a file in the working directory
     try:
-        spec = mujoco.MjSpec.from_file(str(files.main))
-        shown = _lean(spec, files)
-        model = spec.compile()
+        with warnings.catch_warnings(record=True) as said:  # about the form of the file, in MuJoCo's words
+            warnings.simplefilter("always")
+            spec = mujoco.MjSpec.from_file(str(files.main))
+            shown = _lean(spec, files)
+            model = spec.compile()
     except RobotError:
         raise
     except (ValueError, RuntimeError) as error:  # a RuntimeError if there is no memory for it
-        said = " ".join(str(error).replace("XML Error: ", "").split())
-        raise RobotError(f"{files.main}: MuJoCo cannot read it ({shorten_said(said)}); correct the file.") from error
+        reason = " ".join(str(error).replace("XML Error: ", "").split())
+        raise RobotError(f"{files.main}: MuJoCo cannot read it ({_shortened(reason)}); correct the file.") from error
+    for warning in said:
+        _LOGGER.info("%s: %s", files.main, warning.message)
     return MjcfModel(model, spec.modelname, {geom.id: mesh for geom, mesh in shown})
 
 
-def shorten_said(text: str) -> str:
+def _shortened(text: str) -> str:
     """MuJoCo's words for use in a sentence."""
     safe = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text).rstrip(". ")
     return safe if len(safe) <= 300 else safe[:297] + "..."
@@ -117,7 +123,8 @@ def _weighs(spec: Any, geom: Any) -> bool:
         compiler.inertiafromgeom == _FROM_GEOMS.mjINERTIAFROMGEOM_AUTO and not body.explicitinertial
     )
     least, most = compiler.inertiagrouprange
-    if not inferred or not least <= geom.group <= most or (geom.density == 0.0 and not geom.mass > 0.0):
+    weightless = geom.mass == 0.0 or (math.isnan(geom.mass) and geom.density == 0.0)
+    if not inferred or weightless or not least <= geom.group <= most:
         return False
     if spec.compiler.settotalmass > 0.0:
         return body.name != "world"
