@@ -15,12 +15,14 @@ from nbs_pin.robots.urdf_source import Node
 _UNNAMED = "MuJoCo Model"
 
 
-def as_urdf(path: Path, root: Node, options: UrdfOptions) -> tuple[Node, tuple[float, float, float]]:
+def as_urdf(
+    path: Path, root: Node, options: UrdfOptions, *, is_tool: bool = False
+) -> tuple[Node, tuple[float, float, float]]:
     """The <robot> element that means the same as the <mujoco> element `root` of a file, and its gravity [m/s²].
 
     Links are named after bodies and have their frames. Joints keep their names and coordinates; those without a name
     are "joint3" if they are the third. What MJCF leaves out is no limit: a hinge without a range is continuous. A joint
-    that an equality makes follow another has <mimic>.
+    that an equality makes follow another has <mimic>. Every joint of a tool counts as locked.
 
     Raises:
         RobotError: If a file is missing or too large, if MuJoCo cannot compile it, or if it has a part that changes the
@@ -29,7 +31,8 @@ def as_urdf(path: Path, root: Node, options: UrdfOptions) -> tuple[Node, tuple[f
     files = scan(path, root)
     compiled = compile_mjcf(files)
     model, names = compiled.model, names_of(compiled.model, "joint", "joint")
-    described = Described(model, str(path), names, options)
+    locked = set(names) if is_tool else set(options.lock)
+    described = Described(model, str(path), names, locked, options)
     follows = couplings(described)
     check_dynamics(described, follows)
     gravity = gravity_of(described, follows)

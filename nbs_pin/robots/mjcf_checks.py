@@ -34,17 +34,18 @@ class Described:
     source: str
     """What messages call it."""
     joints: list[str]
+    locked: set[str]
     options: UrdfOptions
 
     def refuse(self, problem: str, joints: Iterable[int], remedy: str) -> RobotError:
         """A RobotError whose remedy may also be to lock joints."""
-        free = [self.joints[k] for k in joints if self.joints[k] not in self.options.lock]
+        free = [self.joints[k] for k in joints if self.joints[k] not in self.locked]
         lock = f", or lock what it acts on ({lock_too(self.options, free)})" if free else ""
         return RobotError(f"{self.source}: {problem}; {remedy}{lock}.")
 
     def free(self, joints: Iterable[int], followers: Iterable[int] = ()) -> list[int]:
         """Those of the joints that are neither locked nor follow another."""
-        return [k for k in joints if self.joints[k] not in self.options.lock and k not in set(followers)]
+        return [k for k in joints if self.joints[k] not in self.locked and k not in set(followers)]
 
     def named(self, kind: str, k: int) -> str:
         """An element of the description as messages call it."""
@@ -68,6 +69,8 @@ def couplings(it: Described) -> dict[int, Follows]:
         start = float(model.qpos0[model.jnt_qposadr[joint]])
         bent = model.eq_data[k, 2:5].any()
         if source < 0 or bent or joint in found or source == joint:
+            if it.joints[joint] in it.locked:
+                continue
             text = "keeps" if source < 0 else "couples"
             at = f" at {start + model.eq_data[k, 0]:g}" if source < 0 else ""
             how = " by more than a straight line" if bent and source >= 0 else ""
