@@ -9,6 +9,7 @@ from typing import Any
 
 from nbs_pin.base.exceptions import RobotError, RobotNotFound
 from nbs_pin.robots.arm_file import read_arm_file
+from nbs_pin.robots.public_descriptions import PREFIX, find_public
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Entry:
     path: Path
     """The description."""
     source: Path
-    """The file that was given: the description, or the `.toml` file that names it."""
+    """What was given: the description, the `.toml` file that names it, or a name in robot_descriptions."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of `load_robot` where none are given."""
 
@@ -54,7 +55,8 @@ def example_robot_share() -> Path:
 def find(name_or_path: str) -> Entry:
     """The catalogue's entry for a name, or an entry with default settings for a path.
 
-    Raises RobotNotFound, with the nearest names, if it is neither, and RobotError if the path cannot be read.
+    "robot_descriptions:NAME" is a description of that package. Raises RobotNotFound, with the nearest names, if it is
+    none of these, and RobotError if the path cannot be read.
     """
     if name_or_path in _BUNDLED:
         folder = Path(__file__).parent.parent / "_urdf"
@@ -65,6 +67,9 @@ def find(name_or_path: str) -> Entry:
         within, options = _EXAMPLES[name_or_path]
         path = example_robot_share() / "example-robot-data" / "robots" / within
         return Entry(name_or_path, path, path, options)
+    if name_or_path.startswith(PREFIX):
+        path, options = find_public(name_or_path.removeprefix(PREFIX))
+        return Entry("", path, Path(name_or_path), options)
     try:
         file = Path(name_or_path).expanduser()
     except RuntimeError as error:  # a user who is not there

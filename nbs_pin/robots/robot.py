@@ -296,7 +296,8 @@ def load_robot(
     `description` (name or path) and any of the arguments below.
 
     Args:
-        name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), or the path of a file.
+        name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), the path of a file, or
+            "robot_descriptions:NAME" for a description of that package, such as robot_descriptions:fr3_mj_description.
         gravity: Downward acceleration [m/s²] or a vector in the world frame. None takes the catalogue's or
             that of an MJCF file, else 9.81.
         lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. None takes the catalogue's list.
@@ -322,7 +323,8 @@ def load_robot(
         RobotNotFound: If no such name or file exists.
         RobotError: If the description would give a wrong model.
         ArgumentError: If an argument is of another type or out of range.
-        MissingExtra: If the file must be expanded by xacro and the extra `xacro` is not installed.
+        MissingExtra: If the file must be expanded by xacro and the extra `xacro` is not installed, or a description
+            is asked of robot_descriptions and the extra `descriptions` is not.
 
     Example:
         >>> import nbs_pin as nbs
