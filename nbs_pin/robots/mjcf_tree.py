@@ -13,10 +13,12 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 
+from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.mjcf_files import MjcfFiles
 from nbs_pin.robots.mjcf_joints import JointTerms
 from nbs_pin.robots.rotations import about, from_quaternion, to_rpy
-from nbs_pin.robots.urdf_source import Place
+from nbs_pin.robots.urdf_checks import LONGEST_WAY, MOST_TURNED
+from nbs_pin.robots.urdf_source import Place, shorten
 
 _KINDS = {
     int(mujoco.mjtJoint.mjJNT_FREE): "floating",
@@ -50,6 +52,14 @@ class Tree:
     def place(self, kind: str, name: str) -> Place:
         """Where an element of the description is written, or the root where this is not known."""
         return self.files.places.get((kind, name), self.places[self.robot])
+
+    def rotation(self, kind: str, name: str, quaternion: np.ndarray) -> np.ndarray:
+        """The rotation of a unit quaternion; raises RobotError for another one, which MuJoCo leaves as it is."""
+        length = float(np.linalg.norm(quaternion))
+        if not abs(length - 1.0) <= 1e-6:
+            problem = f"its quaternion has the length {length:g}"
+            raise RobotError(f"{self.place(kind, name)}: {kind} '{shorten(name)}': {problem}; give one of length 1.")
+        return from_quaternion(quaternion)
 
 
 def free_name(name: str, taken: set[str]) -> str:
@@ -96,7 +106,11 @@ def add_origin(tree: Tree, element: ET.Element, pose: pin.SE3) -> None:
 def _add_inertial(tree: Tree, link: ET.Element, body: int) -> None:
     model, place = tree.model, tree.places[link]
     inertial = tree.add(link, place, "inertial")
-    add_origin(tree, inertial, pin.SE3(from_quaternion(model.body_iquat[body]), model.body_ipos[body].copy()))
+    add_origin(
+        tree,
+        inertial,
+        pin.SE3(tree.rotation("body", tree.bodies[body], model.body_iquat[body]), model.body_ipos[body].copy()),
+    )
     tree.add(inertial, place, "mass", value=numbers(model.body_mass[body]))
     xx, yy, zz = (numbers(x) for x in model.body_inertia[body])
     tree.add(inertial, place, "inertia", ixx=xx, ixy="0.0", ixz="0.0", iyy=yy, iyz="0.0", izz=zz)
@@ -105,11 +119,15 @@ def _add_inertial(tree: Tree, link: ET.Element, body: int) -> None:
 def _add_joints(tree: Tree, body: int, name: str, parent: str, joints: list[JointTerms]) -> None:
     """The joints of a body and the links between them; a fixed joint if it has none, or if the last has an anchor."""
     model, above = tree.model, parent
-    pose = pin.SE3(from_quaternion(model.body_quat[body]), model.body_pos[body].copy())
+    pose = pin.SE3(tree.rotation("body", name, model.body_quat[body]), model.body_pos[body].copy())
     first = int(model.body_jntadr[body])
     for k in range(first, first + int(model.body_jntnum[body])):
         kind, axis, anchor = _KINDS[int(model.jnt_type[k])], model.jnt_axis[k].copy(), model.jnt_pos[k].copy()
         reference = float(model.qpos0[model.jnt_qposadr[k]])
+        most = LONGEST_WAY if kind == "prismatic" else MOST_TURNED
+        if not abs(reference) <= most:
+            place = tree.place("joint", joints[k].name)
+            raise RobotError(f"{place}: joint '{joints[k].name}': ref {reference:g} is beyond ±{most:g}; fix ref.")
         moved = pin.SE3.Identity()
         if kind == "prismatic":
             pose = pose * pin.SE3(np.eye(3), -reference * axis)

@@ -185,7 +185,9 @@ def parse(
         parser.feed(data)
         root = parser.close()
     except ET.ParseError as error:
-        raise RobotError(f"{label}:{error.position[0]}: not well-formed XML: {error}; give a URDF file.") from error
+        raise RobotError(
+            f"{label}:{error.position[0]}: not well-formed XML: {error}; give a URDF or MJCF file."
+        ) from error
     except DefusedXmlException as error:
         line = parser.parser.CurrentLineNumber
         raise RobotError(f"{label}:{line}: DTD and entities are not allowed; remove <!DOCTYPE …>.") from error
