@@ -13,6 +13,7 @@ than 1 GB, printed something or left a file, or an accepted arm was not sound.
 
 import argparse
 import collections
+import faulthandler
 import os
 import random
 import re
@@ -247,7 +248,9 @@ def attempt(place: Path, texts: list[tuple[str, str]], seed: int, case: int) -> 
     with heard.open("wb") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
+    faulthandler.dump_traceback_later(0.8 * PATIENCE, file=streams[1])  # says where it hangs before it is killed
     told = verdict(path)
+    faulthandler.cancel_dump_traceback_later()
     for stream, kept in zip((1, 2), streams, strict=True):
         os.dup2(kept, stream)
         os.close(kept)

@@ -29,7 +29,7 @@ def as_urdf(
             dynamics and is not modelled here; names the part and what to do.
     """
     files = scan(path, root)
-    compiled = compile_mjcf(files)
+    compiled = compile_mjcf(files, is_tool=is_tool)
     model, names = compiled.model, names_of(compiled.model, "joint", "joint")
     locked = set(names) if is_tool else set(options.lock)
     described = Described(model, str(path), names, locked, options)
@@ -38,7 +38,7 @@ def as_urdf(
     gravity = gravity_of(described, follows)
     name = root.element.get("model") or (path.stem if compiled.name == _UNNAMED else compiled.name)
     robot = ET.Element("robot", {"name": name or path.stem})
-    tree = Tree(robot, model, files, {robot: root.place})
+    tree = Tree(robot, model, files, is_tool, {robot: root.place})
     build_tree(tree, [read_joint(model, k, joint, follows.get(k)) for k, joint in enumerate(names)])
     add_shapes(tree, compiled.meshes)
     return Node(tree.places, robot, f"robot '{name}'"), gravity

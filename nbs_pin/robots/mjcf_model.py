@@ -53,8 +53,8 @@ class MjcfModel:
     """The mesh of each geom that shows one, None where it has no file."""
 
 
-def compile_mjcf(files: MjcfFiles) -> MjcfModel:
-    """The model of a description whose files were scanned.
+def compile_mjcf(files: MjcfFiles, *, is_tool: bool = False) -> MjcfModel:
+    """The model of a description whose files were scanned; of a tool also what is fixed to its world weighs.
 
     Raises:
         RobotError: If MuJoCo cannot read or compile it, or a mesh is missing from which a mass is inferred.
@@ -64,7 +64,7 @@ def compile_mjcf(files: MjcfFiles) -> MjcfModel:
         with warnings.catch_warnings(record=True) as said:  # about the form of the file, in MuJoCo's words
             warnings.simplefilter("always")
             spec = mujoco.MjSpec.from_file(str(files.main))
-            shown = _lean(spec, files)
+            shown = _lean(spec, files, is_tool)
             model = spec.compile()
     except RobotError:
         raise
@@ -82,7 +82,7 @@ def _shortened(text: str) -> str:
     return safe if len(safe) <= 300 else safe[:297] + "..."
 
 
-def _lean(spec: Any, files: MjcfFiles) -> list[tuple[Any, MeshShape | None]]:
+def _lean(spec: Any, files: MjcfFiles, is_tool: bool) -> list[tuple[Any, MeshShape | None]]:
     """Remove what is not needed; the geoms that show meshes, with these."""
     for material in spec.materials:
         material.textures = [""] * len(material.textures)
@@ -94,6 +94,7 @@ def _lean(spec: Any, files: MjcfFiles) -> list[tuple[Any, MeshShape | None]]:
             setattr(spec, name, -1)
     spec.nkey = spec.nuserdata = 0
     spec.compiler.fusestatic = spec.compiler.discardvisual = False
+    spec.compiler.usethread = False
     spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_NONE
     meshes = {mesh.name: mesh for mesh in spec.meshes}
     shown, read = [], set()
@@ -104,7 +105,7 @@ def _lean(spec: Any, files: MjcfFiles) -> list[tuple[Any, MeshShape | None]]:
         mesh = meshes.get(geom.meshname)
         is_fitted = geom.type not in (_MESH, _SDF)
         shown.append((geom, None if mesh is None or is_fitted else _shape(spec, mesh, files)))
-        if mesh is not None and _weighs(spec, geom):
+        if mesh is not None and _weighs(spec, geom, is_tool):
             _check_mesh(spec, geom, mesh, files)
             read.add(geom.meshname)
         else:
@@ -116,7 +117,7 @@ def _lean(spec: Any, files: MjcfFiles) -> list[tuple[Any, MeshShape | None]]:
     return shown
 
 
-def _weighs(spec: Any, geom: Any) -> bool:
+def _weighs(spec: Any, geom: Any, is_tool: bool) -> bool:
     """Whether the mass of what moves depends on a geom."""
     body, compiler = geom.parent, geom.parent.compiler or spec.compiler
     inferred = compiler.inertiafromgeom == _FROM_GEOMS.mjINERTIAFROMGEOM_TRUE or (
@@ -126,7 +127,7 @@ def _weighs(spec: Any, geom: Any) -> bool:
     weightless = geom.mass == 0.0 or (math.isnan(geom.mass) and geom.density == 0.0)
     if not inferred or weightless or not least <= geom.group <= most:
         return False
-    if spec.compiler.settotalmass > 0.0:
+    if is_tool or spec.compiler.settotalmass > 0.0:
         return body.name != "world"
     while body is not None:
         if body.joints:

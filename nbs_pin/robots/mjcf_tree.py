@@ -35,6 +35,8 @@ class Tree:
     robot: ET.Element
     model: Any
     files: MjcfFiles
+    is_tool: bool
+    """Whether what is fixed to its world moves."""
     places: dict[ET.Element, Place]
     bodies: list[str] = field(default_factory=list)
     """The names of the bodies, those of the links in which their frames are."""
@@ -50,8 +52,12 @@ class Tree:
         return element
 
     def place(self, kind: str, name: str) -> Place:
-        """Where an element of the description is written, or the root where this is not known."""
-        return self.files.places.get((kind, name), self.places[self.robot])
+        """Where an element of the description is written, or the root where this is not known.
+
+        <attach> and <replicate> put something before and behind the names that are written.
+        """
+        written = [own for tag, own in self.files.places if tag == kind and own in name]
+        return self.files.places[kind, max(written, key=len)] if written else self.places[self.robot]
 
     def rotation(self, kind: str, name: str, quaternion: np.ndarray) -> np.ndarray:
         """The rotation of a unit quaternion; raises RobotError for another one, which MuJoCo leaves as it is."""
@@ -86,7 +92,11 @@ def build_tree(tree: Tree, joints: list[JointTerms]) -> None:
     for body, name in enumerate(bodies):
         tree.taken["link"].discard(name)
         link = tree.add(tree.robot, tree.place("body", name), "link", name=name)
-        if model.body_weldid[body] != 0 and model.body_mass[body] != 0.0:
+        far = float(np.abs(model.body_ipos[body]).max())
+        if far > LONGEST_WAY:  # also of a body that does not move: MuJoCo computes about the centre of the tree
+            problem = f"its centre of mass is {far:g} m away"
+            raise RobotError(f"{tree.place('body', name)}: body '{shorten(name)}': {problem}; give a smaller arm.")
+        if (tree.is_tool or model.body_weldid[body] != 0) and model.body_mass[body] != 0.0:
             _add_inertial(tree, link, body)
         if body:
             _add_joints(tree, body, name, bodies[model.body_parentid[body]], joints)

@@ -1,5 +1,6 @@
 """MuJoCo's own model of an MJCF file, and how far an arm loaded from the file is from it."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -24,7 +25,9 @@ def original_model(path: Path) -> mujoco.MjModel:
     for mesh in list(spec.meshes):
         if mesh.name in missing:
             spec.delete(mesh)
-    model = spec.compile()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about the form of the file
+        model = spec.compile()
     model.opt.disableflags |= int(_OFF)
     return model
 
