@@ -71,7 +71,7 @@ def _count(node: Node, found: MjcfFiles, times: int, depth: int) -> int:
     inner = [(node.at(child), depth + 1) for child in element]
     if tag == "include":
         inner = [(child, depth) for child in _included(node, found)]
-    elif tag == "model" and "file" in element.attrib:
+    elif tag == "model":
         inner = [(_parsed(node, found, ("mujoco",)), depth + 1)]
     for child, at in inner:
         count += _count(child, found, times, at)

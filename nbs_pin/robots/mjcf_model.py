@@ -7,6 +7,7 @@ them: an arm loads without its mesh files. A geom of a mesh that is not read sta
 import logging
 import math
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -59,6 +60,13 @@ def compile_mjcf(files: MjcfFiles, *, is_tool: bool = False) -> MjcfModel:
     Raises:
         RobotError: If MuJoCo cannot read or compile it, or a mesh is missing from which a mass is inferred.
     """
+    # A thread of its own: a failure within MuJoCo 4.0 leaves the handler of warnings of its thread in a loop, in which
+    # the next file with a warning would never end.
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        return thread.submit(_compiled, files, is_tool).result()
+
+
+def _compiled(files: MjcfFiles, is_tool: bool) -> MjcfModel:
     mujoco.set_mju_user_warning(_LOGGER.info)  # else MuJoCo writes a file in the working directory
     try:
         with warnings.catch_warnings(record=True) as said:  # about the form of the file, in MuJoCo's words
@@ -105,12 +113,12 @@ def _lean(spec: Any, files: MjcfFiles, is_tool: bool) -> list[tuple[Any, MeshSha
         mesh = meshes.get(geom.meshname)
         is_fitted = geom.type not in (_MESH, _SDF)
         shown.append((geom, None if mesh is None or is_fitted else _shape(spec, mesh, files)))
-        if mesh is not None and _weighs(spec, geom, is_tool):
+        if geom.type != _HFIELD and _weighs(spec, geom, is_tool):
             _check_mesh(spec, geom, mesh, files)
             read.add(geom.meshname)
         else:
             geom.type, geom.meshname, geom.hfieldname = mujoco.mjtGeom.mjGEOM_SPHERE, "", ""
-            geom.size = [_DOT, 0.0, 0.0]
+            geom.size, geom.mass = [_DOT, 0.0, 0.0], 0.0
     for name, mesh in meshes.items():
         if name not in read:
             spec.delete(mesh)
@@ -155,8 +163,8 @@ def _path(spec: Any, mesh: Any, files: MjcfFiles) -> Path | None:
 
 def _check_mesh(spec: Any, geom: Any, mesh: Any, files: MjcfFiles) -> None:
     """Raise RobotError if the file of a mesh that weighs is missing or too large."""
-    path, body = _path(spec, mesh, files), f"body '{shorten(geom.parent.name)}'"
-    if path is None:
+    path, body = None if mesh is None else _path(spec, mesh, files), f"body '{shorten(geom.parent.name)}'"
+    if path is None:  # stated in the description, or not at all, which MuJoCo refuses
         return
     if not is_file(path):
         problem = f"its mass is that of mesh '{shorten(mesh.file)}', which was not found at {path}"
