@@ -399,6 +399,45 @@ def test_a_capsule_is_drawn_as_a_cylinder_with_round_ends(tmp_path):
     assert away.max() > 0.04 - 1e-12
 
 
+def test_an_ellipsoid_is_drawn_with_its_axes(tmp_path):
+    text = arm(
+        '<body name="two"><geom type="ellipsoid" size="0.1 0.2 0.3" pos="0 1 0" euler="0.1 0.2 0.3" mass="1"/></body>'
+    )
+    robot = loaded(tmp_path, text)
+    (drawn,) = (visual for visual in link_visuals(robot) if visual.link == "two")
+    geom = original_model(tmp_path / "arm.xml").geom(1)
+    points = drawn.vertices @ drawn.placement[:3, :3].T + drawn.placement[:3, 3]
+    own = (points - geom.pos) @ from_quaternion(geom.quat) / [0.1, 0.2, 0.3]
+    np.testing.assert_allclose(np.linalg.norm(own, axis=1), 1.0, rtol=1e-12)
+
+
+def test_a_failure_within_mujoco_leaves_nothing_behind(tmp_path):
+    """MuJoCo 4.0 loops in its handler of warnings after such a failure, at the next file with a NaN in this thread."""
+    (tmp_path / "bad.xml").write_text(arm("", '<asset><model name="x"/></asset>'))
+    (tmp_path / "nan.xml").write_text(arm('<body pos="nan 0 0"/>'))
+    code = """
+import sys, pathlib, nbs_pin as nbs
+from nbs_pin.robots.mjcf_files import MjcfFiles
+from nbs_pin.robots.mjcf_model import compile_mjcf
+bad = pathlib.Path(sys.argv[1])
+for read, path in ((compile_mjcf, MjcfFiles(bad, [bad])), (nbs.load_robot, sys.argv[2])):
+    try: read(path)
+    except nbs.RobotError as error: print(error)
+"""
+    names = [str(tmp_path / name) for name in ("bad.xml", "nan.xml")]
+    command = [sys.executable, "-c", code, *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert "unknown exception" in done.stdout
+    assert "is not 3 finite numbers" in done.stdout
+
+
+def test_inertial_axes_that_mujoco_takes_to_be_the_body_s(tmp_path):
+    """Within 1e-6 MuJoCo computes as if both frames were one, and the arm is as it computes."""
+    inertial = '<inertial pos="0.1 0 0.2" quat="1e6 0.2 0 0" mass="2" diaginertia="0.02 0.03 0.011"/>'
+    robot = loaded(tmp_path, arm(f'<body><joint axis="0 1 0.5"/>{inertial}</body>'))
+    assert max(deviations(robot, original_model(tmp_path / "arm.xml"), {}).values()) < 1e-12
+
+
 def test_a_run_and_a_controller_of_it_are_loaded_with_it_again(tmp_path):
     robot = nbs.load_robot(FILES / "continuous.xml", gravity=3.7)
     law = nbs.PID.for_robot(robot)

@@ -13,12 +13,15 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import mujoco
+import numpy as np
+from jaxtyping import Float
 
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.meshes import MAX_BYTES
 from nbs_pin.robots.mjcf_files import MjcfFiles
 from nbs_pin.robots.packages import is_file
 from nbs_pin.robots.urdf_source import shorten
+from nbs_pin.robots.visual_checks import LARGEST
 
 _LOGGER = logging.getLogger("nbs_pin.mujoco")
 _UNUSED = (
@@ -144,6 +147,16 @@ def _weighs(spec: Any, geom: Any, is_tool: bool) -> bool:
     return False
 
 
+def _is_flat(vertices: Float[np.ndarray, "v 3"]) -> bool:
+    """Whether vertices that a description states enclose next to nothing, or are too far away."""
+    if len(vertices) < 4:
+        return False
+    if not np.abs(vertices).max() <= LARGEST:
+        return True
+    sizes = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
+    return bool(sizes[-1] <= 1e-6 * sizes[0])
+
+
 def _shape(spec: Any, mesh: Any, files: MjcfFiles) -> MeshShape | None:
     """The file of a mesh as it is to be drawn; None if it has none."""
     path = _path(spec, mesh, files)
@@ -164,9 +177,11 @@ def _path(spec: Any, mesh: Any, files: MjcfFiles) -> Path | None:
 def _check_mesh(spec: Any, geom: Any, mesh: Any, files: MjcfFiles) -> None:
     """Raise RobotError if the file of a mesh that weighs is missing or too large."""
     path, body = None if mesh is None else _path(spec, mesh, files), f"body '{shorten(geom.parent.name)}'"
-    if path is None:  # stated in the description, or not at all, which MuJoCo refuses
+    if mesh is not None and _is_flat(np.array(mesh.uservert).reshape(-1, 3)):  # qhull would print that
+        problem = f"its mass is that of mesh '{shorten(mesh.name)}', which encloses no volume of an arm"
+    elif path is None:  # stated in the description, or not at all, which MuJoCo refuses
         return
-    if not is_file(path):
+    elif not is_file(path):
         problem = f"its mass is that of mesh '{shorten(mesh.file)}', which was not found at {path}"
     elif path.stat().st_size > MAX_BYTES:
         problem = f"its mass is that of mesh '{shorten(mesh.file)}', which has more than {MAX_BYTES} bytes"

@@ -11,9 +11,11 @@ import pinocchio as pin
 from nbs_pin.robots.mjcf_model import MeshShape
 from nbs_pin.robots.mjcf_tree import Tree, add_origin, numbers
 from nbs_pin.robots.rotations import from_quaternion
+from nbs_pin.robots.visual_checks import UNIT_SPHERE
 
-_BOX, _SPHERE, _CYLINDER, _CAPSULE, _IS_MESH = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("BOX", "SPHERE", "CYLINDER", "CAPSULE", "MESH")
+_BOX, _SPHERE, _ELLIPSOID, _CYLINDER, _CAPSULE, _IS_MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
+    for kind in ("BOX", "SPHERE", "ELLIPSOID", "CYLINDER", "CAPSULE", "MESH")
 )
 _SHOWN = 2
 """Largest group that viewers show by default; others are for collisions."""
@@ -59,6 +61,8 @@ def _pieces(model: Any, geom: int) -> Iterator[_Piece]:
         yield "box", {"size": numbers(*(2.0 * size))}, pose
     elif kind == _SPHERE:
         yield "sphere", {"radius": numbers(size[0])}, pose
+    elif kind == _ELLIPSOID:
+        yield "mesh", {"filename": UNIT_SPHERE, "scale": numbers(*size)}, pose
     elif kind in (_CYLINDER, _CAPSULE):
         yield "cylinder", {"radius": numbers(size[0]), "length": numbers(2.0 * size[1])}, pose
         for end in (-size[1], size[1]) if kind == _CAPSULE else ():

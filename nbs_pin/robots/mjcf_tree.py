@@ -27,6 +27,8 @@ _KINDS = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "revolute",
 }
 
+_SAME_FRAME, _SAME_AXES = int(mujoco.mjtSameFrame.mjSAMEFRAME_BODY), int(mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT)
+
 
 @dataclass
 class Tree:
@@ -114,13 +116,14 @@ def add_origin(tree: Tree, element: ET.Element, pose: pin.SE3) -> None:
 
 
 def _add_inertial(tree: Tree, link: ET.Element, body: int) -> None:
+    """The inertia of a body in its principal axes; those that MuJoCo takes to be the body's own within 1e-6 are so."""
     model, place = tree.model, tree.places[link]
+    turn, centre = tree.rotation("body", tree.bodies[body], model.body_iquat[body]), model.body_ipos[body].copy()
+    same = int(model.body_sameframe[body])
+    turn = np.eye(3) if same in (_SAME_FRAME, _SAME_AXES) else turn
+    centre = np.zeros(3) if same == _SAME_FRAME else centre
     inertial = tree.add(link, place, "inertial")
-    add_origin(
-        tree,
-        inertial,
-        pin.SE3(tree.rotation("body", tree.bodies[body], model.body_iquat[body]), model.body_ipos[body].copy()),
-    )
+    add_origin(tree, inertial, pin.SE3(turn, centre))
     tree.add(inertial, place, "mass", value=numbers(model.body_mass[body]))
     xx, yy, zz = (numbers(x) for x in model.body_inertia[body])
     tree.add(inertial, place, "inertia", ixx=xx, ixy="0.0", ixz="0.0", iyy=yy, iyz="0.0", izz=zz)
