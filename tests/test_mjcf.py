@@ -177,14 +177,23 @@ def test_what_else_moves_the_arm_is_refused_unless_its_joints_are_locked(joint, 
     third = '<body name="three" pos="0 0.2 0"><joint name="free"/><geom size="0.1"/></body>'
     text = arm(SECOND.format(joint), outside).replace("<worldbody>", f'<worldbody><site name="base"/>{third}')
     message = refusal(tmp_path, text)
-    names = ["free", *lock] if "fluid" in told or "no joint" in told else lock
     assert told in message
-    assert f"lock what it acts on (lock={names!r})" in message
-    if len(names) < 3:
+    everything = "fluid" in told or "no joint" in told
+    assert everything != (f"lock what moves with it (lock={lock!r})" in message)
+    if not everything:
         robot = loaded(tmp_path, text, lock=dict.fromkeys(lock, 0.2))
         model = original_model(tmp_path / "arm.xml")
         model.tendon_stiffness[:], model.jnt_stiffness[:] = 0.0, 0.0  # they act on what is locked
         assert max(deviations(robot, model, dict.fromkeys(lock, 0.2)).values()) < 1e-12
+
+
+def test_one_refusal_names_all_that_must_be_locked(tmp_path):
+    third = '<body name="three" pos="0 0.2 0"><joint name="c"/><geom size="0.1"/></body>'
+    text = arm(SECOND.format('stiffness="3"') + third.replace("/>", ' stiffness="1"/>', 1))
+    message = refusal(tmp_path, text)
+    assert "joint 'b' has a spring of stiffness 3 (and 1 more such parts)" in message
+    assert "(lock=['b', 'c'])" in message
+    assert loaded(tmp_path, text, lock=["b", "c"]).joint_names == ("a",)
 
 
 def test_a_part_that_is_switched_off_is_no_part(tmp_path):
@@ -228,7 +237,7 @@ def test_joints_that_nothing_drives_are_named_where_others_are_driven():
 def test_the_models_that_mujoco_ships_are_named_in_words():
     path = Path(mujoco.__file__).parent / "testdata" / "model.xml"
     with pytest.raises(
-        nbs.RobotError, match=r"joint 'hipz_0' has a spring of stiffness 10; remove its stiffness, or lock"
+        nbs.RobotError, match=r"joint 'hipz_0' has a spring of stiffness 10 \(and 8 more such parts\); remove its"
     ):
         nbs.load_robot(path)
 

@@ -40,7 +40,7 @@ class Described:
     def refuse(self, problem: str, joints: Iterable[int], remedy: str) -> RobotError:
         """A RobotError whose remedy may also be to lock joints."""
         free = [self.joints[k] for k in joints if self.joints[k] not in self.locked]
-        lock = f", or lock what it acts on ({lock_too(self.options, free)})" if free else ""
+        lock = f", or lock what moves with it ({lock_too(self.options, free)})" if free else ""
         return RobotError(f"{self.source}: {problem}; {remedy}{lock}.")
 
     def free(self, joints: Iterable[int], followers: Iterable[int] = ()) -> list[int]:
@@ -83,13 +83,20 @@ def couplings(it: Described) -> dict[int, Follows]:
 
 
 def check_dynamics(it: Described, followers: Iterable[int]) -> None:
-    """Raise RobotError for what changes the dynamics of joints that are not locked and is not modelled here."""
+    """Raise RobotError for what changes the dynamics of joints that are not locked and is not modelled here.
+
+    It names the first such part, and every joint that must be locked to be rid of all of them.
+    """
     followers = set(followers)
     checks = (_springs, _damping, _fluid, _equalities, _tendons, _actuators, _plugins)
-    for check in checks:
-        for problem, joints, remedy in check(it):
-            if it.free(joints, followers):
-                raise it.refuse(problem, it.free(joints, followers), remedy)
+    found = [(problem, it.free(joints, followers), remedy) for check in checks for problem, joints, remedy in check(it)]
+    found = [one for one in found if one[1]]
+    if found:
+        problem, _, remedy = found[0]
+        more = f" (and {len(found) - 1} more such parts)" if len(found) > 1 else ""
+        concerned = sorted({k for _, joints, _ in found for k in joints})
+        all_of_them = len(concerned) == len(it.free(range(it.model.njnt), followers))
+        raise it.refuse(problem + more, [] if all_of_them else concerned, remedy)
     _warn_of_idle(it, followers)
 
 
