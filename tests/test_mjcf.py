@@ -22,7 +22,7 @@ from fuzz.original import deviations, followers, joint_names, original_model  # 
 FILES = ROOT / "tests" / "data" / "mjcf"
 ARMS = (
     "seven_joints", "continuous", "six_servos", "from_geoms", "universal", "gantry", "two_arms", "scara", "gripper",
-    "scene", "unnamed", "meshes",
+    "scene", "unnamed", "meshes", "neutral",
 )  # fmt: skip
 IDLE = "ignore:.*no actuator drives joints"
 
@@ -165,6 +165,7 @@ WIRE = '<tendon><spatial name="w" stiffness="3"><site site="base"/><site site="s
             ["b"],
         ),
         ("", '<equality><joint joint1="b" polycoef="0.4"/></equality>', "keeps joint 'b' at 0.4", ["b"]),
+        ("", TENDON.format("") + '<equality><tendon tendon1="t"/></equality>', "couples joints in a way", ["a", "b"]),
         (
             "",
             TENDON.format("") + '<actuator><motor tendon="t" armature="0.1"/></actuator>',
@@ -313,6 +314,11 @@ def test_meshes_that_weigh_nothing_may_be_missing_and_others_may_not(tmp_path):
         nbs.RobotError, match=r"body 'first': its mass is that of mesh 'wedge\.obj', which was not found"
     ):
         nbs.load_robot(tmp_path / "meshes.xml")
+
+
+def test_errors_name_the_line_of_what_has_no_name(tmp_path):
+    text = arm('\n<body>\n<joint damping="-1"/><geom size="0.1"/></body>')
+    assert "arm.xml:4: joint 'joint2': dynamics damping '-1.0'" in refusal(tmp_path, text)
 
 
 @pytest.mark.filterwarnings(IDLE)

@@ -10,7 +10,7 @@ from nbs_pin.robots.mjcf_model import compile_mjcf
 from nbs_pin.robots.mjcf_shapes import add_shapes
 from nbs_pin.robots.mjcf_tree import Tree, build_tree, names_of
 from nbs_pin.robots.urdf_options import UrdfOptions
-from nbs_pin.robots.urdf_source import Node
+from nbs_pin.robots.urdf_source import Node, Place
 
 _UNNAMED = "MuJoCo Model"
 
@@ -38,6 +38,10 @@ def as_urdf(
     gravity = gravity_of(described, follows)
     name = root.element.get("model") or (path.stem if compiled.name == _UNNAMED else compiled.name)
     robot = ET.Element("robot", {"name": name or path.stem})
+    for (kind, k), line in compiled.lines.items():
+        if line > 0 and not files.attaches:  # 0 is one of an included file, and attached files count their own lines
+            unnamed = {"joint": names, "body": names_of(model, "body", "body")}[kind][k]
+            files.places.setdefault((kind, unnamed), Place(str(path), line))
     tree = Tree(robot, model, files, is_tool, {robot: root.place})
     build_tree(tree, [read_joint(model, k, joint, follows.get(k)) for k, joint in enumerate(names)])
     add_shapes(tree, compiled.meshes)

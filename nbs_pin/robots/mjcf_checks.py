@@ -173,7 +173,8 @@ def _equalities(it: Described) -> Found:
             joints = sorted({joint for tendon in ends for joint in _of_tendon(model, tendon)})
         else:
             joints = list(range(model.njnt))
-        yield f"{it.named('equality', k)} closes a loop", joints, "remove it"
+        does = "closes a loop" if kind in _OF_BODIES else "couples joints in a way that is not modelled"
+        yield f"{it.named('equality', k)} {does}", joints, "remove it"
 
 
 def _tendons(it: Described) -> Found:

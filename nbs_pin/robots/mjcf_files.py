@@ -30,6 +30,8 @@ class MjcfFiles:
 
     main: Path
     files: list[Path] = field(default_factory=list)
+    attaches: bool = False
+    """Whether a model is attached."""
     places: dict[tuple[str, str], Place] = field(default_factory=dict)
     """Where the element of a tag and a name is written."""
 
@@ -72,6 +74,7 @@ def _count(node: Node, found: MjcfFiles, times: int, depth: int) -> int:
     if tag == "include":
         inner = [(child, depth) for child in _included(node, found)]
     elif tag == "model":
+        found.attaches = True
         inner = [(_parsed(node, found, ("mujoco",)), depth + 1)]
     for child, at in inner:
         count += _count(child, found, times, at)

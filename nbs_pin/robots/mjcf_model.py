@@ -55,6 +55,8 @@ class MjcfModel:
     name: str
     meshes: dict[int, MeshShape | None]
     """The mesh of each geom that shows one, None where it has no file."""
+    lines: dict[tuple[str, int], int]
+    """The lines of joints and bodies in the main file, by "joint" or "body" and number."""
 
 
 def compile_mjcf(files: MjcfFiles, *, is_tool: bool = False) -> MjcfModel:
@@ -84,7 +86,9 @@ def _compiled(files: MjcfFiles, is_tool: bool) -> MjcfModel:
         raise RobotError(f"{files.main}: MuJoCo cannot read it ({_shortened(reason)}); correct the file.") from error
     for warning in said:
         _LOGGER.info("%s: %s", files.main, warning.message)
-    return MjcfModel(model, spec.modelname, {geom.id: mesh for geom, mesh in shown})
+    written = [("joint", joint) for joint in spec.joints] + [("body", body) for body in spec.bodies]
+    lines = {(kind, element.id): int(element.info.removeprefix("line ") or 0) for kind, element in written}
+    return MjcfModel(model, spec.modelname, {geom.id: mesh for geom, mesh in shown}, lines)
 
 
 def _shortened(text: str) -> str:
