@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mujoco
@@ -95,6 +96,15 @@ def test_bodies_stand_where_mujoco_puts_them(name):
         np.testing.assert_allclose(frame.rotation, data.xmat[body].reshape(3, 3), atol=1e-14)
 
 
+def test_a_body_is_one_link_where_its_last_joint_has_no_anchor():
+    described = ET.fromstring(nbs.load_robot(FILES / "seven_joints.xml").urdf.xml)
+    names = ["world", *(f"link{k}" for k in range(8)), "flange"]
+    assert [link.get("name") for link in described.findall("link")] == names
+    described = ET.fromstring(nbs.load_robot(FILES / "universal.xml").urdf.xml)
+    hip = [link.get("name") for link in described.findall("link") if "hip" in link.get("name")]
+    assert hip == ["hip", "hip_hip_x", "hip_hip_y", "hip_hip_z"]
+
+
 def test_numbers_of_joints_and_actuators():
     servos = nbs.load_robot(FILES / "six_servos.xml")
     assert servos.effort_limit.tolist() == [140.0, 140.0, 140.0, 28.0, 28.0, 28.0]  # the smaller of both ranges
@@ -149,6 +159,8 @@ WIRE = '<tendon><spatial name="w" stiffness="3"><site site="base"/><site site="s
         ('damping="1 0.2"', "", "joint 'b' has damping that is not proportional to its speed", ["b"]),
         ("", '<option density="1.2"/>', "it moves in a fluid of density 1.2", ["a", "b"]),
         ("", TENDON.format('damping="2"'), "tendon 't' has damping, which couples joints", ["a", "b"]),
+        ("", TENDON.format('stiffness="0 0.3"'), "tendon 't' has stiffness, which couples joints", ["a", "b"]),
+        ('stiffness="0 0.3"', "", "joint 'b' has a spring of stiffness 0", ["b"]),
         ("", TENDON.format('armature="2"'), "tendon 't' has armature, which couples joints", ["a", "b"]),
         ("", WIRE, "tendon 'w' has stiffness, which couples joints", ["a", "b"]),
         (
@@ -184,7 +196,8 @@ def test_what_else_moves_the_arm_is_refused_unless_its_joints_are_locked(joint, 
     if not everything:
         robot = loaded(tmp_path, text, lock=dict.fromkeys(lock, 0.2))
         model = original_model(tmp_path / "arm.xml")
-        model.tendon_stiffness[:], model.jnt_stiffness[:] = 0.0, 0.0  # they act on what is locked
+        for stiffness in (model.tendon_stiffness, model.tendon_stiffnesspoly, model.jnt_stiffness):
+            stiffness[:] = 0.0  # it acts on what is locked
         assert max(deviations(robot, model, dict.fromkeys(lock, 0.2)).values()) < 1e-12
 
 
@@ -360,6 +373,14 @@ def test_errors_name_the_file_and_the_line_where_it_is_written(tmp_path):
 )
 def test_files_that_give_no_arm_are_refused_in_one_sentence(text, told, tmp_path):
     assert told in refusal(tmp_path, text)
+
+
+def test_files_in_files_are_not_nested_too_deeply(tmp_path):
+    deep, end = "<body>" * 60, "</body>" * 60
+    (tmp_path / "one.xml").write_text(f'<mujocoinclude>{deep}<include file="two.xml"/>{end}</mujocoinclude>')
+    (tmp_path / "two.xml").write_text(f"<mujocoinclude>{deep}<site/>{end}</mujocoinclude>")
+    assert "too deep: more than 128 nested elements" in refusal(tmp_path, arm(f'{deep}<include file="one.xml"/>{end}'))
+    assert loaded(tmp_path, arm('<body pos="0 0 1"><include file="two.xml"/></body>')).nv == 1
 
 
 def test_nothing_is_printed_and_no_file_is_left(tmp_path):
