@@ -278,6 +278,9 @@ def test_a_link_without_mass_between_joints_loads_if_m_is_positive_definite(kind
 def test_a_link_without_mass_is_refused_where_m_is_singular(tmp_path):
     same = CROSSED.format(kind="revolute", axis="1 0 0").replace('<origin xyz="0 0.1 0.05" rpy="0 0.3 0.1"/>', "")
     assert "not finite and positive definite" in refusal_of(tmp_path, same)
+    shape = '<link name="cross"><visual><geometry><sphere radius="0.1"/></geometry></visual></link>'
+    forgotten = CROSSED.format(kind="revolute", axis="0 1 0").replace('<link name="cross"/>', shape)
+    assert "moves link 'cross', which has no mass though it has a shape" in refusal_of(tmp_path, forgotten)
     bare = CROSSED.format(kind="revolute", axis="0 1 0")
     bare = bare[: bare.index("<inertial>")] + bare[bare.index("</inertial>") + 11 :]
     assert "moves link 'cross', which has no mass" in refusal_of(tmp_path, bare)

@@ -27,8 +27,8 @@ def check_bodies(robot: Node, joints: list[Joint], options: UrdfOptions, package
     """Check that every inertia that moves is physical and that every moving joint carries mass.
 
     Links fixed to each other count as one body, so a tool frame or a flange of a massive link may have no mass; nor
-    need a link between two joints, as where two axes cross: whether M(q) ≻ 0 is tested on the whole arm. What is welded
-    to the world is not judged: an inertia there that no body has is taken away.
+    need a link without shapes between two joints, as where two axes cross: whether M(q) ≻ 0 is tested on the whole arm.
+    What is welded to the world is not judged: an inertia there that no body has is taken away.
     """
     above = {joint.child: joint for joint in joints}
     mass: dict[str, float] = defaultdict(float)
@@ -42,10 +42,12 @@ def check_bodies(robot: Node, joints: list[Joint], options: UrdfOptions, package
     empty = [joint for joint in joints if joint.moves and mass[joint.child] == 0.0]
     if options.inertia_from == "shapes":
         empty = _fill(empty, links, packages)
-    empty = _without_mass_behind(empty, joints)
+    bare = _without_mass_behind(empty, joints)
+    empty = [joint for joint in empty if joint in bare or any(_has_shape(link) for link in links[joint.child])]
     if empty:
         joint, names = empty[0], [joint.name for joint in empty]
-        problem = f"moves link '{joint.child}', which has no mass (M would be singular)"
+        why = "(M would be singular)" if joint in bare else "though it has a shape"
+        problem = f"moves link '{joint.child}', which has no mass {why}"
         remedy = f"give link '{joint.child}' an <inertial> with mass > 0"
         if len(names) < sum(joint.moves for joint in joints):
             remedy += f", lock what moves none ({lock_too(options, names)})"
@@ -65,6 +67,10 @@ def _without_mass_behind(empty: list[Joint], joints: list[Joint]) -> list[Joint]
         if joint.child in carry or (joint.moves and joint.name not in bare):
             carry.add(joint.parent)
     return [joint for joint in empty if joint.child not in carry]
+
+
+def _has_shape(link: Node) -> bool:
+    return link.element.find("visual") is not None or link.element.find("collision") is not None
 
 
 def _from_the_tips(joints: list[Joint], below: dict[str, list[Joint]]) -> list[Joint]:
