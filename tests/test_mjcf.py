@@ -332,6 +332,11 @@ def test_meshes_that_weigh_nothing_may_be_missing_and_others_may_not(tmp_path):
         nbs.load_robot(tmp_path / "meshes.xml")
 
 
+def test_errors_name_the_line_of_a_name_that_contains_another(tmp_path):
+    text = arm('\n<body>\n<joint name="a_b" damping="-1"/><joint name="b" pos="0 1 0"/><geom size="0.1"/></body>')
+    assert "arm.xml:4: joint 'a_b': dynamics damping '-1.0'" in refusal(tmp_path, text)
+
+
 def test_errors_name_the_line_of_what_has_no_name(tmp_path):
     text = arm('\n<body>\n<joint damping="-1"/><geom size="0.1"/></body>')
     assert "arm.xml:4: joint 'joint2': dynamics damping '-1.0'" in refusal(tmp_path, text)
@@ -436,6 +441,15 @@ def test_a_capsule_is_drawn_as_a_cylinder_with_round_ends(tmp_path):
     away = np.linalg.norm(np.concatenate(points) - start - along[:, None] * end, axis=1)
     assert away.max() < 0.04 + 1e-12
     assert away.max() > 0.04 - 1e-12
+    reach = np.concatenate(points) @ end / np.linalg.norm(end)
+    np.testing.assert_allclose([reach.min(), reach.max()], [-0.04, np.linalg.norm(end) + 0.04], atol=1e-4)
+
+
+def test_a_box_is_drawn_with_whole_edges(tmp_path):
+    robot = loaded(tmp_path, arm('<body name="two"><geom type="box" size="0.1 0.2 0.3" pos="0 1 0" mass="1"/></body>'))
+    (drawn,) = (visual for visual in link_visuals(robot) if visual.link == "two")
+    np.testing.assert_allclose(np.ptp(drawn.vertices, axis=0), [0.2, 0.4, 0.6])
+    np.testing.assert_allclose(drawn.placement[:3, 3], [0.0, 1.0, 0.0])
 
 
 def test_an_ellipsoid_is_drawn_with_its_axes(tmp_path):
