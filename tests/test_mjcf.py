@@ -3,7 +3,9 @@
 import shutil
 import subprocess
 import sys
+import warnings
 import xml.etree.ElementTree as ET
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import mujoco
@@ -482,6 +484,15 @@ for read, path in ((compile_mjcf, MjcfFiles(bad, [bad])), (nbs.load_robot, sys.a
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
     assert "unknown exception" in done.stdout
     assert "is not 3 finite numbers" in done.stdout
+
+
+def test_several_threads_may_load_at_once():
+    before = list(warnings.filters)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(nbs.load_robot, [FILES / "unnamed.xml", FILES / "scara.xml"] * 8))
+    assert [robot.nv for robot in found] == [4, 4] * 8
+    assert len({robot.sha256 for robot in found}) == 2
+    assert warnings.filters == before
 
 
 def test_inertial_axes_that_mujoco_takes_to_be_the_body_s(tmp_path):

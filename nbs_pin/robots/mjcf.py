@@ -38,10 +38,10 @@ def as_urdf(
     gravity = gravity_of(described, follows)
     name = root.element.get("model") or (path.stem if compiled.name == _UNNAMED else compiled.name)
     robot = ET.Element("robot", {"name": name or path.stem})
+    named = {"joint": names, "body": names_of(model, "body", "body")}
     for (kind, k), line in compiled.lines.items():
         if line > 0 and not files.attaches:  # 0 is one of an included file, and attached files count their own lines
-            unnamed = {"joint": names, "body": names_of(model, "body", "body")}[kind][k]
-            files.places.setdefault((kind, unnamed), Place(str(path), line))
+            files.places.setdefault((kind, named[kind][k]), Place(str(path), line))
     tree = Tree(robot, model, files, is_tool, {robot: root.place})
     build_tree(tree, [read_joint(model, k, joint, follows.get(k)) for k, joint in enumerate(names)])
     add_shapes(tree, compiled.meshes)

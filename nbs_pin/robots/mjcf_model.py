@@ -6,6 +6,8 @@ them: an arm loads without its mesh files. A geom of a mesh that is not read sta
 
 import logging
 import math
+import re
+import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,6 +26,9 @@ from nbs_pin.robots.urdf_source import shorten
 from nbs_pin.robots.visual_checks import LARGEST
 
 _LOGGER = logging.getLogger("nbs_pin.mujoco")
+_LINE = re.compile(r"line (\d+)", re.ASCII)
+_lock = threading.Lock()
+"""Filters of warnings belong to the process: one thread at a time may change them."""
 _UNUSED = (
     "keys", "sensors", "tuples", "numerics", "texts", "skins", "hfields", "textures", "pairs", "excludes", "lights",
     "cameras",
@@ -74,20 +79,21 @@ def compile_mjcf(files: MjcfFiles, *, is_tool: bool = False) -> MjcfModel:
 def _compiled(files: MjcfFiles, is_tool: bool) -> MjcfModel:
     mujoco.set_mju_user_warning(_LOGGER.info)  # else MuJoCo writes a file in the working directory
     try:
-        with warnings.catch_warnings(record=True) as said:  # about the form of the file, in MuJoCo's words
+        with _lock, warnings.catch_warnings(record=True) as said:  # about the form of the file, in MuJoCo's words
             warnings.simplefilter("always")
             spec = mujoco.MjSpec.from_file(str(files.main))
             shown = _lean(spec, files, is_tool)
             model = spec.compile()
     except RobotError:
         raise
-    except (ValueError, RuntimeError) as error:  # a RuntimeError if there is no memory for it
+    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:  # whatever MuJoCo makes of a failure
         reason = " ".join(str(error).replace("XML Error: ", "").split())
         raise RobotError(f"{files.main}: MuJoCo cannot read it ({_shortened(reason)}); correct the file.") from error
     for warning in said:
         _LOGGER.info("%s: %s", files.main, warning.message)
     written = [("joint", joint) for joint in spec.joints] + [("body", body) for body in spec.bodies]
-    lines = {(kind, element.id): int(element.info.removeprefix("line ") or 0) for kind, element in written}
+    found = [(kind, element.id, _LINE.fullmatch(element.info)) for kind, element in written]
+    lines = {(kind, k): int(line[1]) for kind, k, line in found if line}
     return MjcfModel(model, spec.modelname, {geom.id: mesh for geom, mesh in shown}, lines)
 
 
