@@ -1,5 +1,6 @@
 """MJCF files: the arm is the one that MuJoCo itself builds from the file, whatever engine computes it here."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -409,6 +410,19 @@ def test_nothing_is_printed_and_no_file_is_left(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, *names], cwd=work, capture_output=True, check=True, env=None)
     assert (done.stdout, done.stderr) == (b"", b"")
     assert not list(work.iterdir())
+
+
+def test_broken_files_are_refused_or_give_the_arm_of_mujoco():
+    """A short form of `make fuzz-descriptions`."""
+    command = [sys.executable, str(ROOT / "tools" / "fuzz_descriptions.py"), "--format", "mjcf", "--count", "150"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*command, "--workers", "1"], capture_output=True, text=True, check=False, env=environment, timeout=300
+    )
+    assert done.returncode == 0, done.stdout
+    counts = {words[1]: int(words[0]) for words in map(str.split, done.stdout.splitlines()) if words[0].isdecimal()}
+    assert counts["refused"] > 50
+    assert counts["accepted"] > 20
 
 
 # What is built on it.
