@@ -11,7 +11,7 @@ help:
 	@echo "make fuzz           the next three: every door of the package, broken at random; about half an hour"
 	@echo "make fuzz-calls     10,000 calls with hostile arguments at every public function"
 	@echo "make fuzz-files     10,000 damaged files at every reader; about five minutes"
-	@echo "make fuzz-descriptions  20,000 broken URDF and xacro files; about ten minutes"
+	@echo "make fuzz-descriptions  20,000 broken URDF and xacro files and 5,000 in MJCF; about ten minutes"
 	@echo "make random-arms    50 random arms with rotors and friction, untuned; about five minutes"
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
@@ -49,6 +49,7 @@ fuzz-files: $(READY)
 
 fuzz-descriptions: $(READY)
 	$(BIN)/python tools/fuzz_descriptions.py
+	$(BIN)/python tools/fuzz_descriptions.py --format mjcf --count 5000
 
 random-arms: $(READY)
 	$(BIN)/python tools/random_arms.py

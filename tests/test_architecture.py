@@ -28,7 +28,15 @@ FLOORS = [
 ]
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
 HOMES = {
-    "mujoco": {"simulation.mujoco_plant"},
+    "mujoco": {
+        "simulation.mujoco_plant",
+        "simulation.massless",
+        "robots.mjcf_checks",
+        "robots.mjcf_joints",
+        "robots.mjcf_model",
+        "robots.mjcf_shapes",
+        "robots.mjcf_tree",
+    },
     "matplotlib": {"reports"},
     "meshcat": {"reports.replay"},
     "yourdfpy": {"robots.visuals"},

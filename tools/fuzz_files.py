@@ -13,7 +13,6 @@ is a fault: the exit code is 1 and the cases are listed.
 import argparse
 import io
 import json
-import multiprocessing
 import os
 import random
 import sys
@@ -23,7 +22,7 @@ import warnings
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +31,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import safetensors.torch
 import torch
+from fuzz.guarded import guarded, peak
 
 import nbs_pin as nbs
 from nbs_pin.base.archives import read_archive, write_archive
@@ -317,7 +317,7 @@ def attempt(folder: Path, targets: list[str], seed: int, case: int, *, trace: bo
     with tempfile.TemporaryDirectory(dir=folder) as place:
         path = Path(place) / name
         path.write_bytes(mutated(sample, draw))
-        before = _peak(reset=True)
+        before = peak(reset=True)
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
@@ -329,56 +329,19 @@ def attempt(folder: Path, targets: list[str], seed: int, case: int, *, trace: bo
             kind, told = "untyped", f"{type(error).__name__}: {error}"
             if trace:
                 traceback.print_exc()
-    if _peak() - before > MEMORY:
-        kind, told = "memory", f"{(_peak() - before) // 1024} MB"
+    if peak() - before > MEMORY:
+        kind, told = "memory", f"{(peak() - before) // 1024} MB"
     return Outcome(case, name, kind, told)
 
 
-def _peak(*, reset: bool = False) -> int:
-    """Largest resident memory since the last reset [kB]."""
-    if reset:
-        Path("/proc/self/clear_refs").write_text("5")
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmHWM:")[2].split()[0])
-
-
-def _work(folder: Path, targets: list[str], seed: int, cases: list[int], pipe: Connection) -> None:
-    for case in cases:
-        pipe.send(attempt(folder, targets, seed, case))
-
-
 def attempts(folder: Path, targets: list[str], options: argparse.Namespace) -> Iterator[Outcome]:
-    """The outcomes of all cases, by processes that are replaced when one of them hangs or dies."""
-    context = multiprocessing.get_context("fork")
-    left = {k: list(range(k, options.count, options.workers)) for k in range(options.workers)}
-    running: dict[int, tuple[Any, Connection]] = {}
+    """The outcomes of all cases."""
 
-    def start(k: int) -> None:
-        if left[k]:
-            mine, theirs = context.Pipe(duplex=False)
-            process = context.Process(target=_work, args=(folder, targets, options.seed, left[k], theirs))
-            process.start()
-            theirs.close()
-            running[k] = process, mine
+    def lost(case: int, kind: str, told: str) -> Outcome:
+        return Outcome(case, targets[case % len(targets)], kind, told)
 
-    for k in left:
-        start(k)
-    while running:
-        for k, (process, pipe) in list(running.items()):
-            case = left[k][0]
-            try:
-                outcome = (
-                    pipe.recv() if pipe.poll(PATIENCE) else Outcome(case, targets[case % len(targets)], "hang", "")
-                )
-            except EOFError:
-                outcome = Outcome(case, targets[case % len(targets)], "crash", f"exit code {process.exitcode}")
-            left[k].pop(0)
-            yield outcome
-            if outcome.kind in ("hang", "crash") or not left[k]:
-                process.kill()
-                process.join()
-                del running[k]
-                start(k)
+    attempt_one = partial(attempt, folder, targets, options.seed)
+    return guarded(attempt_one, options.count, options.workers, PATIENCE, lost)
 
 
 if __name__ == "__main__":

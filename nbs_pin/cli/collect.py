@@ -20,7 +20,7 @@ class Collect:
     """
 
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
-    """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
+    """An arm by name (see nbs-pin robots) or a path to a .urdf, .xacro or MJCF file."""
     recipe: Literal["excited", "reference", "passive", "uniform"] = "excited"
     """excited: random multisine torques about a soft PD. reference: tracking of sinusoids.
     passive: one swing without torque from q = 0, as in the paper; it does not determine the scale of the torque.

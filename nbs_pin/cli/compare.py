@@ -38,7 +38,7 @@ class Compare:
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """A .nbs file with a model, or with a controller that has one; or an arm by name or path, to compare two URDFs."""
     against: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the model's own arm")] = None
-    """The true arm, by name or a path to a .urdf or .xacro file."""
+    """The true arm, by name or a path to a .urdf, .xacro or MJCF file."""
     samples: Annotated[int, integer("--samples", least=2, most=1_000_000)] = 2_000
     """Number of uniformly distributed states."""
     speed: Annotated[

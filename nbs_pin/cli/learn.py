@@ -30,7 +30,7 @@ class Learn(FileUnits):
     unconstrained: a Lagrangian without structure. residual: a network that corrects the arm's URDF.
     identified: inertias by least squares, in the geometry of the URDF."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the one named in the data")] = None
-    """The arm by name or a path to a .urdf or .xacro file; a log does not name it."""
+    """The arm by name or a path to a .urdf, .xacro or MJCF file; a log does not name it."""
     window: Annotated[float | None, number("--window", above=0.0, most=100.0, unit="s"), default("0.1")] = None
     """Width of the window in which a log without v and a is differentiated [s]."""
     resample: Annotated[float | None, number("--resample", least=1e-6, most=10.0, unit="s"), default("off")] = None

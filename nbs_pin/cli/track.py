@@ -22,7 +22,7 @@ class Track(FileUnits):
     """
 
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
-    """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
+    """An arm by name (see nbs-pin robots) or a path to a .urdf, .xacro or MJCF file."""
     plant: Annotated[str, choice("--plant", PLANTS)] = "mujoco"
     """Simulator of the arm."""
     controller: Annotated[str, choice("--controller", LAWS, SAVED)] = "nbs"

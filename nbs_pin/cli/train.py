@@ -23,7 +23,7 @@ class Train:
     """
 
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
-    """An arm by name (see nbs-pin robots) or a path to a .urdf or .xacro file."""
+    """An arm by name (see nbs-pin robots) or a path to a .urdf, .xacro or MJCF file."""
     controller: Annotated[str, choice("--controller", LAWS, SAVED)] = "nbs"
     """The law to start from, by name, or a .nbs file with a controller."""
     frequencies: Annotated[str, positive_list("--frequencies", most=1000.0, unit="rad/s")] = "0.5,1,2"

@@ -37,7 +37,7 @@ FILES = ("errors.png", "errors.csv", SUMMARY)
 """Files of `write_results`."""
 TRAJECTORIES = 374
 """Starts with which the bound on δ holds for 95 % of further ones, at confidence 1 − 1e-6 (`accuracy/mismatch.py`)."""
-_ENDINGS = ("", ".nbs", ".urdf", ".xacro", ".xml")
+_ENDINGS = ("", ".nbs", ".urdf", ".xacro", ".xml", ".toml")
 _PRINTED = {"mass_matrix": "M", "coriolis": "C v", "gravity": "G", "inverse": "torque", "forward": "acceleration"}
 
 
@@ -80,8 +80,8 @@ def model_of(text: str, **load_options: Any) -> DynamicsProvider:
     """
     if Path(text).suffix not in _ENDINGS:
         raise ArgumentError(
-            f"'{text}' is neither a model nor an arm; give a .nbs file with a model, or an arm by name or as a .urdf "
-            "or .xacro file."
+            f"'{text}' is neither a model nor an arm; give a .nbs file with a model, or an arm by name or as a .urdf, "
+            ".xacro or MJCF file."
         )
     if not text.endswith(".nbs"):
         return PinocchioDynamics(load_robot(text, **load_options))

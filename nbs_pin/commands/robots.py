@@ -39,8 +39,8 @@ def run(options: Robots, console: Console, notes: Console) -> None:
             shown.add_row(*_cells(arm))
     console.print(shown)
     console.print(
-        "ROBOT may also be a path to a .urdf file, or .xacro with the extra nbs-pin[xacro]:\n"
-        "with a fixed base and at most 64 moving joints, whose limits are stated.",
+        "ROBOT may also be a path to a .urdf or MJCF .xml file, or .xacro with the extra nbs-pin[xacro]:\n"
+        "with a fixed base and at most 64 moving joints, whose limits a .urdf states.",
         highlight=False,
         markup=False,
     )

@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from nbs_pin.base.doors import BLANK, option
+from nbs_pin.robots.description import read_description
 from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.urdf_checks import MOVING
 from nbs_pin.robots.urdf_options import Payload, UrdfOptions
-from nbs_pin.robots.urdf_source import Node, read_source, shorten
+from nbs_pin.robots.urdf_source import Node, shorten
 
 MOUNT = "mount"
 """The link to which a base that is tilted or displaced is fixed."""
@@ -64,7 +65,7 @@ def _add_tool(robot: Node, options: UrdfOptions) -> UrdfOptions:
     tool = options.tool
     assert tool is not None
     frame = _frame(robot, tool.frame, "tool")
-    source = read_source(tool.file, {}, Packages(tool.file, options.package_dirs))
+    source = read_description(tool.file, options, Packages(tool.file, options.package_dirs), is_tool=True).robot
     robot.places.update(source.places)
     base = _ends(source, parents=True)[0]
     own = {(part.tag, part.get("name")) for part in robot.element}

@@ -26,8 +26,9 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 def check_bodies(robot: Node, joints: list[Joint], options: UrdfOptions, packages: Packages) -> None:
     """Check that every inertia that moves is physical and that every moving joint carries mass.
 
-    Links fixed to each other count as one body, so a tool frame or a flange of a massive link may have no mass. What is
-    welded to the world is not judged: an inertia there that no body has is taken away.
+    Links fixed to each other count as one body, so a tool frame or a flange of a massive link may have no mass; nor
+    need a link without shapes between two joints, as where two axes cross: whether M(q) ≻ 0 is tested on the whole arm.
+    What is welded to the world is not judged: an inertia there that no body has is taken away.
     """
     above = {joint.child: joint for joint in joints}
     mass: dict[str, float] = defaultdict(float)
@@ -41,15 +42,44 @@ def check_bodies(robot: Node, joints: list[Joint], options: UrdfOptions, package
     empty = [joint for joint in joints if joint.moves and mass[joint.child] == 0.0]
     if options.inertia_from == "shapes":
         empty = _fill(empty, links, packages)
+    bare = _without_mass_behind(empty, joints)
+    empty = [joint for joint in empty if joint in bare or any(_has_shape(link) for link in links[joint.child])]
     if empty:
         joint, names = empty[0], [joint.name for joint in empty]
-        problem = f"moves link '{joint.child}', which has no mass (M would be singular)"
+        why = "(M would be singular)" if joint in bare else "though it has a shape"
+        problem = f"moves link '{joint.child}', which has no mass {why}"
         remedy = f"give link '{joint.child}' an <inertial> with mass > 0"
         if len(names) < sum(joint.moves for joint in joints):
             remedy += f", lock what moves none ({lock_too(options, names)})"
         if options.inertia_from != "shapes":
             remedy += f", or take the inertia of its shapes as a guess ({option('inertia_from', 'shapes')})"
         raise joint.node.refuse(problem, remedy)
+
+
+def _without_mass_behind(empty: list[Joint], joints: list[Joint]) -> list[Joint]:
+    """Those of the joints that carry a body without mass behind which there is none with mass either."""
+    bare, below = {joint.name for joint in empty}, defaultdict[str, list[Joint]](list)
+    for joint in joints:
+        below[joint.parent].append(joint)
+    carry: set[str] = set()
+    """Links that have mass behind a moving joint."""
+    for joint in _from_the_tips(joints, below):
+        if joint.child in carry or (joint.moves and joint.name not in bare):
+            carry.add(joint.parent)
+    return [joint for joint in empty if joint.child not in carry]
+
+
+def _has_shape(link: Node) -> bool:
+    return link.element.find("visual") is not None or link.element.find("collision") is not None
+
+
+def _from_the_tips(joints: list[Joint], below: dict[str, list[Joint]]) -> list[Joint]:
+    """The joints, each after those behind it."""
+    children = {joint.child for joint in joints}
+    order = [joint for joint in joints if joint.parent not in children]
+    for joint in order:
+        order.extend(below[joint.child])
+    return order[::-1]
 
 
 def nearest_body(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

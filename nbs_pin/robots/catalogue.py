@@ -9,6 +9,7 @@ from typing import Any
 
 from nbs_pin.base.exceptions import RobotError, RobotNotFound
 from nbs_pin.robots.arm_file import read_arm_file
+from nbs_pin.robots.public_descriptions import PREFIX, find_public
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Entry:
     path: Path
     """The description."""
     source: Path
-    """The file that was given: the description, or the `.toml` file that names it."""
+    """What was given: the description, the `.toml` file that names it, or a name in robot_descriptions."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of `load_robot` where none are given."""
 
@@ -43,7 +44,7 @@ _EXAMPLES: dict[str, tuple[str, Mapping[str, Any]]] = {
     "talos_left_arm": ("talos_data/robots/talos_left_arm.urdf", {}),
     "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", {"zero_limits": "unlimited"}),
 }
-_SUFFIXES = (".urdf", ".xacro", ".toml")
+_SUFFIXES = (".urdf", ".xacro", ".xml", ".toml")
 ROBOT_NAMES: tuple[str, ...] = (*_OUR_FILES, *_EXAMPLES)
 """Names of all arms that `load_robot` knows."""
 
@@ -57,7 +58,8 @@ def example_robot_share() -> Path:
 def find(name_or_path: str) -> Entry:
     """The catalogue's entry for a name, or an entry with default settings for a path.
 
-    Raises RobotNotFound, with the nearest names, if it is neither, and RobotError if the path cannot be read.
+    "robot_descriptions:NAME" is a description of that package. Raises RobotNotFound, with the nearest names, if it is
+    none of these, and RobotError if the path cannot be read.
     """
     if name_or_path in _OUR_FILES:
         folder = Path(__file__).parent.parent / "_urdf"
@@ -68,6 +70,9 @@ def find(name_or_path: str) -> Entry:
         within, options = _EXAMPLES[name_or_path]
         path = example_robot_share() / "example-robot-data" / "robots" / within
         return Entry(name_or_path, path, path, options)
+    if name_or_path.startswith(PREFIX):
+        path, options = find_public(name_or_path.removeprefix(PREFIX))
+        return Entry("", path, Path(name_or_path), options)
     try:
         file = Path(name_or_path).expanduser()
     except RuntimeError as error:  # a user who is not there

@@ -33,11 +33,11 @@ def read_drives(robot: Node, joints: list[Joint], options: UrdfOptions) -> dict[
     Raises:
         RobotError: If a value is not a number ≥ 0, or a rotor inertia is given for a joint without a transmission.
     """
-    ratios = reductions(robot)
+    ratios = _reductions(robot)
     return {joint.name: _drive(joint, ratios, options) for joint in joints if joint.moves}
 
 
-def _drive(joint: Joint, ratios: dict[str, float], options: UrdfOptions) -> Drive:
+def _drive(joint: Joint, ratios: dict[str, Node], options: UrdfOptions) -> Drive:
     stated = joint.node.child("dynamics")
     values = {key: options.drive(joint.name, name) for key, name in _GIVEN.items()}
     if stated is not None:
@@ -52,7 +52,7 @@ def _drive(joint: Joint, ratios: dict[str, float], options: UrdfOptions) -> Driv
         if joint.name not in ratios:
             remedy = f"give what the joint feels, I·N² ({option('armature', {joint.name: BLANK})})"
             raise joint.node.refuse("a rotor inertia is given, but no transmission states its reduction", remedy)
-        values["armature"] = rotor * ratios[joint.name] ** 2
+        values["armature"] = rotor * ratios[joint.name].content() ** 2
     drive = Drive(*(values[key] or 0.0 for key in Drive._fields))
     _write(joint, drive)
     return drive
@@ -84,17 +84,23 @@ def _write(joint: Joint, drive: Drive) -> None:
             element.set(key, repr(float(value)))
 
 
-def reductions(robot: Node) -> dict[str, float]:
-    """The gear ratio N of each joint that has a transmission: `mechanicalReduction`, of the joint or its actuator.
+def geared_joints(robot: Node) -> set[str]:
+    """The joints whose transmission states a reduction other than 1."""
+    stated = {name: (node.element.text or "").strip() for name, node in _reductions(robot).items()}
+    return {name for name, text in stated.items() if text not in ("", "1", "1.0")}
+
+
+def _reductions(robot: Node) -> dict[str, Node]:
+    """The elements with the gear ratio N of joints: `mechanicalReduction` of a transmission's joint or its actuator.
 
     Transmissions of ros2_control call it `mechanical_reduction`.
     """
-    ratios: dict[str, float] = {}
+    found: dict[str, Node] = {}
     for transmission in robot.element.iter("transmission"):
         for joint in transmission.findall("joint"):
             for element in (*transmission.findall("actuator"), joint):
                 for tag in ("mechanicalReduction", "mechanical_reduction"):
-                    found = element.find(tag)
-                    if found is not None and joint.get("name"):
-                        ratios[str(joint.get("name"))] = robot.at(found).content()
-    return ratios
+                    stated = element.find(tag)
+                    if stated is not None and joint.get("name"):
+                        found[str(joint.get("name"))] = robot.at(stated)
+    return found

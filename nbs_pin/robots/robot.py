@@ -290,14 +290,16 @@ def load_robot(
     base_rpy: Iterable[float] | None = None,
     base_xyz: Iterable[float] | None = None,
 ) -> Robot:
-    """Load an arm by name, from a `.urdf` or `.xacro` file, or from a `.toml` file that adds to one.
+    """Load an arm by name, from a `.urdf`, `.xacro` or MJCF file, or from a `.toml` file that adds to one.
 
     Joints that mimic another are locked where the other is at zero, and named in a warning. A `.toml` file has the
     `description` (name or path) and any of the arguments below.
 
     Args:
-        name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), or the path of a file.
-        gravity: Downward acceleration [m/s²] or a vector in the world frame. None takes the catalogue's, else 9.81.
+        name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), the path of a file, or
+            "robot_descriptions:NAME" for a description of that package, such as robot_descriptions:fr3_mj_description.
+        gravity: Downward acceleration [m/s²] or a vector in the world frame. None takes the catalogue's or
+            that of an MJCF file, else 9.81.
         lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. None takes the catalogue's list.
         zero_limits: "refuse" joints that state no limits, an effort or velocity that is not > 0, or an empty range at
             zero, or read these as "unlimited". None takes the catalogue's, else "refuse".
@@ -321,7 +323,8 @@ def load_robot(
         RobotNotFound: If no such name or file exists.
         RobotError: If the description would give a wrong model.
         ArgumentError: If an argument is of another type or out of range.
-        MissingExtra: If the file must be expanded by xacro and the extra `xacro` is not installed.
+        MissingExtra: If the file must be expanded by xacro and the extra `xacro` is not installed, or a description
+            is asked of robot_descriptions and the extra `descriptions` is not.
 
     Example:
         >>> import nbs_pin as nbs
@@ -339,10 +342,12 @@ def load_robot(
 
 def _load(entry: Entry, given: dict[str, Any]) -> Robot:
     """The arm of a catalogue's entry or a file, with the arguments of `load_robot` that were given."""
-    told = {"gravity": 9.81, **entry.options, **given}
-    vector = _gravity_vector(told.pop("gravity"))
+    told = {**entry.options, **given}
+    gravity = _gravity_vector(told.pop("gravity", 9.81))
     options = read_options(told)
     urdf = read_urdf(entry.path, options)
+    is_stated = urdf.gravity is not None and "gravity" not in {**entry.options, **given}
+    vector = np.array(urdf.gravity) if is_stated else gravity
     model = build_model(urdf)
     model.gravity.linear = vector
     stored = {"gravity": vector.tolist(), **options.stored()}

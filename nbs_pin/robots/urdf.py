@@ -7,12 +7,12 @@ from pathlib import Path
 
 from nbs_pin.robots.attachments import attach
 from nbs_pin.robots.bodies import check_bodies
-from nbs_pin.robots.joint_drive import Drive, read_drives, reductions
+from nbs_pin.robots.description import read_description
+from nbs_pin.robots.joint_drive import Drive, geared_joints, read_drives
 from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.urdf_checks import Joint, check_axis, check_tree
 from nbs_pin.robots.urdf_limits import Limits, read_limits
 from nbs_pin.robots.urdf_options import LIMITS, UrdfOptions
-from nbs_pin.robots.urdf_source import read_source
 
 _UNLIMITED = 1e9
 """Value of an absent limit in the XML, because no engine reads "inf"."""
@@ -47,6 +47,8 @@ class Urdf:
     path: Path
     xml: bytes
     joints: tuple[JointData, ...]
+    gravity: tuple[float, float, float] | None = None
+    """Gravitational acceleration that the file states [m/s²], as MJCF does."""
     without_rotor: tuple[str, ...] = ()
     """Joints whose transmission states a reduction, while no rotor inertia is known."""
 
@@ -62,7 +64,7 @@ class Urdf:
 
 
 def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
-    """The checked description in the `.urdf` or `.xacro` file `path`, read as `options` say.
+    """The checked description in the `.urdf`, `.xacro` or MJCF file `path`, read as `options` say.
 
     An arm without a name, which drawing tools refuse, is named after its file.
 
@@ -73,16 +75,18 @@ def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
     """
     options = UrdfOptions() if options is None else options
     packages = Packages(path, options.package_dirs)
-    robot = read_source(path, options.xacro_args, packages)
+    source = read_description(path, options, packages)
+    robot = source.robot
     robot.element.set("name", robot.element.get("name", path.stem))
     options = attach(robot, options, packages)
     joints = check_tree(robot, options)
     check_bodies(robot, joints, options, packages)
-    limits, drives = read_limits(joints, options), read_drives(robot, joints, options)
+    limits = read_limits(joints, options, left_out="unlimited" if source.is_mjcf else "refuse")
+    drives = read_drives(robot, joints, options)
     moving = tuple(_settle(joint, limits[joint.name], drives[joint.name], options) for joint in joints if joint.moves)
-    geared = reductions(robot)
-    bare = tuple(joint.name for joint in moving if geared.get(joint.name, 1.0) != 1.0 and not joint.armature)
-    return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving, bare)
+    geared = geared_joints(robot)
+    bare = tuple(joint.name for joint in moving if joint.name in geared and not joint.armature)
+    return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving, source.gravity, bare)
 
 
 def _settle(joint: Joint, limits: Limits, drive: Drive, options: UrdfOptions) -> JointData:

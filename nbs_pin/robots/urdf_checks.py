@@ -28,7 +28,7 @@ MAX_NAME = 128
 MOVING = ("revolute", "continuous", "prismatic")
 """Supported joint types with one degree of freedom."""
 
-_UNSUPPORTED = ("floating", "planar")
+_UNSUPPORTED = ("floating", "planar", "ball")
 ROUNDING = 1e-6
 """Relative tolerance for numbers that were rounded when the file was written."""
 LONGEST_WAY, MOST_TURNED = 100.0, 1e6

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from nbs_pin.base.doors import BLANK, option
 from nbs_pin.robots.urdf_checks import LONGEST_WAY, MOST_TURNED, Joint, lock_too
-from nbs_pin.robots.urdf_options import LIMITS, UrdfOptions
+from nbs_pin.robots.urdf_options import LIMITS, UrdfOptions, ZeroLimits
 from nbs_pin.robots.urdf_source import Node
 
 _ENDLESS, _MOST = 1e9, 1e39
@@ -35,6 +35,8 @@ class _Wanted:
     zeros: list[str] = field(default_factory=list)
     """What `zero_limits` would read as no limit, one entry for each fault that it settles."""
     faults: int = 0
+    may_omit: bool = False
+    """Whether an effort or velocity that is left out is none, as in MJCF."""
 
     def add(self, node: Node, problem: str, joint: str, keys: Iterable[str], zero: str = "") -> None:
         """A fault of a joint, the limits that must be given, and what a zero would have to mean."""
@@ -45,17 +47,18 @@ class _Wanted:
         self.zeros += [zero] if zero else []
 
 
-def read_limits(joints: list[Joint], options: UrdfOptions) -> dict[str, Limits]:
+def read_limits(joints: list[Joint], options: UrdfOptions, left_out: ZeroLimits = "refuse") -> dict[str, Limits]:
     """The limits of the moving joints by name: those given in `options.limits`, else those that the file states.
 
     A continuous joint has no position limits and may omit the others; every other moving joint must state all four.
     `zero_limits`: "refuse" no limits, an effort or velocity ≤ 0 and an empty range at zero, or read these as
-    "unlimited". URDF reads a lower or upper limit that is left out as 0.
+    "unlimited". `left_out`: the same for an effort or velocity that is left out, which in MJCF means none. URDF reads
+    a lower or upper limit that is left out as 0.
 
     Raises:
         RobotError: If limits are missing or wrong; names every joint that needs some.
     """
-    wanted = _Wanted()
+    wanted = _Wanted(may_omit=left_out == "unlimited")
     limits = {joint.name: _limits(joint, options, wanted) for joint in joints if joint.moves}
     if wanted.first is None:
         return limits
@@ -124,7 +127,7 @@ def _strength(
     value = limit.number(key) if limit is not None and stated else math.inf
     if given is not None:
         return given
-    if not stated and not free:
+    if not stated and not free and not wanted.may_omit:
         wanted.add(node, f"<limit> states no {key}", joint.name, [key], "it has none")
     elif value <= 0.0:
         if free and joint.kind != "continuous":

@@ -23,6 +23,7 @@ MAX_DEPTH = 128
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _LATE = re.compile(rb"(\s+)<\?xml[^>]*\?>")
 """A declaration that is not at the start, which XML does not allow and readers of URDF pass over."""
+_ROOTS = {"robot": "a URDF <robot>", "mujoco": "an MJCF <mujoco>"}
 _FOREIGN = {"xacro": 'declare xmlns:xacro="http://www.ros.org/wiki/xacro"', "xinclude": "insert the included text"}
 
 
@@ -144,25 +145,35 @@ def shorten(text: str) -> str:
 def read_source(path: Path, xacro_args: Mapping[str, str], packages: Packages) -> Node:
     """The <robot> element of a file, expanded by xacro if it is a `.xacro` file or has elements of xacro.
 
-    Raises RobotNotFound if the file does not exist, RobotError if it cannot be read, parsed or expanded, and
-    MissingExtra where it must be expanded and the extra `xacro` is not installed.
+    That of an MJCF file is <mujoco>. Raises RobotNotFound if the file does not exist, RobotError if it cannot be read,
+    parsed or expanded, and MissingExtra where it must be expanded and the extra `xacro` is not installed.
     """
-    label, data = str(path), _read_bytes(path)
-    source = parse(data, label, expanded=False)
-    if path.suffix != ".xacro" and not any(_foreign(element) == "xacro" for element in source.element.iter()):
+    label, data = str(path), read_bytes(path)
+    source = parse(data, label, expanded=False, roots=("robot", "mujoco"))
+    is_mjcf = source.element.tag == "mujoco"
+    foreign = path.suffix == ".xacro" or any(_foreign(element) == "xacro" for element in source.element.iter())
+    if is_mjcf or not foreign:
         if xacro_args:
             raise RobotError(f"{label}: it has nothing of xacro, which could take {', '.join(xacro_args)}; omit that.")
-        return parse(data, label)
+        return source if is_mjcf else parse(data, label)
     expanded, files = expand(path, source.element, xacro_args, packages)
     robot = parse(expanded, label, files)
     robot.element.set("name", robot.element.get("name") or source.element.get("name") or path.stem)
     return robot
 
 
-def parse(data: bytes, label: str, files: list[str] | None = None, *, expanded: bool = True) -> Node:
+def parse(
+    data: bytes,
+    label: str,
+    files: list[str] | None = None,
+    *,
+    expanded: bool = True,
+    roots: tuple[str, ...] = ("robot",),
+) -> Node:
     """The <robot> element in the bytes of a URDF; `label` names them in messages, or the `files` that they came from.
 
-    They must be UTF-8 without DTD, entity or (if `expanded`) xacro and XInclude, within MAX_BYTES and MAX_DEPTH.
+    `roots` are the elements that the root may be, any if there are none. The bytes must be UTF-8 without DTD, entity or
+    (if `expanded`) xacro and XInclude, within MAX_BYTES and MAX_DEPTH.
     """
     _check_text(data, label)
     late = _LATE.match(data)
@@ -174,14 +185,18 @@ def parse(data: bytes, label: str, files: list[str] | None = None, *, expanded: 
         parser.feed(data)
         root = parser.close()
     except ET.ParseError as error:
-        raise RobotError(f"{label}:{error.position[0]}: not well-formed XML: {error}; give a URDF file.") from error
+        raise RobotError(
+            f"{label}:{error.position[0]}: not well-formed XML: {error}; give a URDF or MJCF file."
+        ) from error
     except DefusedXmlException as error:
         line = parser.parser.CurrentLineNumber
         raise RobotError(f"{label}:{line}: DTD and entities are not allowed; remove <!DOCTYPE …>.") from error
     _drop_default_namespace(root)
-    node = Node(builder.places, root, f"robot '{shorten(root.get('name', ''))}'")
-    if root.tag != "robot":
-        raise node.refuse(f"the root element is <{shorten(root.tag)}>", "a URDF <robot> is needed")
+    name = root.get("name", root.get("model", ""))
+    node = Node(builder.places, root, f"{'model' if root.tag == 'mujoco' else 'robot'} '{shorten(name)}'")
+    if roots and root.tag not in roots:
+        needed = " or ".join(_ROOTS[tag] for tag in roots)
+        raise node.refuse(f"the root element is <{shorten(root.tag)}>", f"{needed} is needed")
     for element in root.iter() if expanded else ():
         kind = _foreign(element)
         if kind:
@@ -249,7 +264,7 @@ def _check_text(data: bytes, label: str) -> None:
         raise RobotError(f"{label}: not UTF-8 text: NUL at byte {data.index(0)}; save the file as UTF-8.")
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
     """The first MAX_BYTES + 1 bytes of the file."""
     try:
         with path.open("rb") as file:

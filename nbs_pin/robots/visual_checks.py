@@ -16,6 +16,8 @@ LONGEST_PATH = 4000
 """Longest path of a mesh [bytes]."""
 _SIZES = {"box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}, "sphere": {"radius": 1}}
 SHAPES = (*_SIZES, "mesh")
+UNIT_SPHERE = "nbs_pin:///unit_sphere"
+"""Name of the mesh of a sphere with radius 1 m, which a scale makes an ellipsoid."""
 
 
 def material_faults(root: Any) -> dict[str, str]:

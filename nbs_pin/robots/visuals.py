@@ -21,7 +21,7 @@ from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.meshes import Color, MeshError, Part, find_mesh, read_mesh, shaded
 from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.robot import Robot
-from nbs_pin.robots.visual_checks import material_faults, visual_fault
+from nbs_pin.robots.visual_checks import UNIT_SPHERE, material_faults, visual_fault
 
 MAX_SHAPES = 2000
 """Links with further shapes than this many in all are drawn as capsules."""
@@ -177,6 +177,8 @@ def _parts(geometry: Any, packages: Packages) -> tuple[Part, ...]:
     """A URDF geometry as triangle meshes."""
     if geometry.mesh is not None:
         scale = np.ones(3) if geometry.mesh.scale is None else np.broadcast_to(geometry.mesh.scale, (3,)).astype(float)
+        if geometry.mesh.filename == UNIT_SPHERE:
+            return (shaded(trimesh.creation.uv_sphere(1.0, count=[24, 48]), None, scale),)
         return read_mesh(find_mesh(geometry.mesh.filename, packages), scale)
     if geometry.box is not None:
         return (shaded(trimesh.creation.box(geometry.box.size), None),)

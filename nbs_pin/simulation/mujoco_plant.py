@@ -15,6 +15,7 @@ from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.dynamics.friction import FRICTION, JointFriction, friction_of_size
 from nbs_pin.robots.robot import ARM, Robot
+from nbs_pin.simulation.massless import gather_joints
 from nbs_pin.simulation.plant import Plant
 
 _SCRATCH = ("_lock", "_data", "_qpos", "_qvel", "_torque", "_warnings")
@@ -231,6 +232,7 @@ def build_model(
             joint.solref_friction, joint.solimp_friction = _DRY_FRICTION_SOLREF, _DRY_FRICTION_SOLIMP
             if joint_stops == "keep":
                 joint.solref_limit = _STOP_SOLREF
+        gather_joints(spec)
         spec.option.gravity = robot.gravity_vector
         spec.option.integrator = _INTEGRATORS[integrator]
         off = _UNWANTED if joint_stops == "keep" else _UNWANTED | _OFF.mjDSBL_LIMIT
