@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeAlias
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from nbs_pin.base.checks import LARGEST
 from nbs_pin.base.exceptions import NbsPinError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -169,7 +170,9 @@ def parse_disturbance(text: str) -> DisturbanceText:
         kind, listed, frequency = parts[1] or parts[3], parts[2] or parts[4], plain_number(parts[5] or "0")
         sizes = [plain_number(size) for size in listed.split(",")]
         usable = frequency is not None and (frequency > 0.0 or not parts[5])
-        usable = usable and all(size is not None and (size >= 0.0 or kind != "noise") for size in sizes)
+        usable = usable and all(
+            size is not None and abs(size) <= LARGEST and (size >= 0.0 or kind != "noise") for size in sizes
+        )
         if usable:
             return DisturbanceText(text, kind, tuple(sizes), frequency)  # type: ignore[arg-type]
     raise OptionError(

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.base.arguments import checked, count, writable
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import RUN, Run
@@ -73,7 +74,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0) -> Path:
     """
     starts = int(np.prod(run.q.shape[1:-1], dtype=int))
     if not 0 <= start < starts:
-        raise ArgumentError(f"start={start} does not exist: the run has starts 0 to {starts - 1}.")
+        raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts - 1}.")
     q, q_ref, tau, asked = (
         np.array(x.reshape(len(run.t), starts, run.nv)[:, start]) for x in (run.q, run.q_ref, run.tau, run.tau_command)
     )

@@ -202,7 +202,8 @@ def load_robot(
     Args:
         name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), or the path of a file.
         gravity: Downward acceleration [m/s²] or a vector in the base frame. None takes the catalogue's, else 9.81.
-        lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. None takes the catalogue's list.
+        lock: Joints to fix at zero, or a dict of where to fix them [rad, m], besides those that the catalogue fixes;
+            an empty list fixes none.
         zero_limits: "refuse" joints that state no limits, an effort or velocity that is not > 0, or an empty range at
             zero, or read these as "unlimited". None takes the catalogue's, else "refuse".
         limits: Limits in place of the file's, by joint ("*" for all) and by "lower", "upper" [rad, m], "effort"
@@ -235,6 +236,8 @@ def load_robot(
         "package_dirs": package_dirs,
     }
     options = read_options(told)
+    if options.lock:  # an empty list frees what the catalogue locks
+        options = replace(options, lock=dict.fromkeys(entry.lock, 0.0) | dict(options.lock))
     urdf = read_urdf(entry.path, options)
     vector = _gravity_vector(entry.gravity if gravity is None else gravity)
     model = _build_model(urdf)
