@@ -245,7 +245,7 @@ def test_a_controller_of_another_arm_is_refused_in_a_sentence(folder, tmp_path, 
         ("--effort-limit 5 --no-effort-limit", "choose one"),
         ("--bandwidth 200", "at most 100 rad/s"),
         ("--resume", "training.ckpt"),
-        ("--controller computed-torque --fixed-gains", "nothing is left to train"),
+        ("--controller computed-torque --fixed-gains", "nothing to train besides its gains"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_in_a_sentence(tmp_path, capsys, options, words):

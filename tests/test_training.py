@@ -210,7 +210,7 @@ def test_gains_stay_above_their_share_and_can_be_left_alone():
     fixed = quick(controller, gains=False).controller
     np.testing.assert_array_equal(fixed.rate.numpy(), controller.rate.numpy())
     np.testing.assert_array_equal(fixed.potential.stiffness.numpy(), controller.potential.stiffness.numpy())
-    with pytest.raises(ArgumentError, match="nothing is left to train"):
+    with pytest.raises(ArgumentError, match="nothing to train besides its gains"):
         quick(untrained("pid"), gains=False)
 
 

@@ -177,7 +177,8 @@ def parse_disturbance(text: str) -> DisturbanceText:
             return DisturbanceText(text, kind, tuple(sizes), frequency)  # type: ignore[arg-type]
     raise OptionError(
         f"--disturbance is '{text}'; give none, constant:5, square:5@8, sine:5@8 or noise:0.5 "
-        "(N·m, one for all joints or one per joint, separated by commas; @ frequency above 0 rad/s)."
+        "(N·m, or N where it slides, one for all joints or one per joint, separated by commas; "
+        "@ frequency above 0 rad/s)."
     )
 
 

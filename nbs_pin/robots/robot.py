@@ -19,6 +19,7 @@ from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors
 from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError, RobotError
 from nbs_pin.base.storable import storable
+from nbs_pin.base.units import several, units
 from nbs_pin.robots.catalogue import find
 from nbs_pin.robots.mass_matrix import weak_joints
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
@@ -157,7 +158,8 @@ class Robot:
         effort = floats("effort limit", limit)
         if effort.shape not in ((), (self.nv,)) or not (effort >= SMALLEST).all():
             raise ArgumentError(
-                f"effort limit is {told(limit)}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means none."
+                f"effort limit is {told(limit)}, expected one number > 0 or {self.nv} of them "
+                f"[{several(units('torque', self.prismatic))}]; np.inf means none."
             )
         by_name = dict(zip(self.joint_names, np.full(self.nv, effort).tolist(), strict=True))
         joints = tuple(replace(joint, effort=by_name[joint.name]) for joint in self.urdf.joints)
