@@ -10,11 +10,11 @@ from typing import Any, Literal, TypeAlias
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from nbs_pin.base.checks import LARGEST
 from nbs_pin.base.exceptions import NbsPinError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INTEGER = re.compile(r"[0-9]+")
+_LARGEST = 1e30  # torque of a disturbance [N·m, N]
 SAVED = ".nbs"
 """File extension of saved controllers and models."""
 DisturbanceKind: TypeAlias = Literal["constant", "square", "sine", "noise"]
@@ -171,7 +171,7 @@ def parse_disturbance(text: str) -> DisturbanceText:
         sizes = [plain_number(size) for size in listed.split(",")]
         usable = frequency is not None and (frequency > 0.0 or not parts[5])
         usable = usable and all(
-            size is not None and abs(size) <= LARGEST and (size >= 0.0 or kind != "noise") for size in sizes
+            size is not None and abs(size) <= _LARGEST and (size >= 0.0 or kind != "noise") for size in sizes
         )
         if usable:
             return DisturbanceText(text, kind, tuple(sizes), frequency)  # type: ignore[arg-type]
