@@ -31,13 +31,17 @@ def _with_home(value: Any) -> Any:
 
 
 def flags(options: Any) -> dict[str, str]:
-    """How each option is typed, by its name: --data, or ROBOT for one that is given by its place."""
-    return dict(_named(options))
+    """How each option is typed, by its name: --data, or ROBOT for one that is given by its place.
+
+    Those of the arm are left out: a setting of the work may have the name of one.
+    """
+    own = {entry.name for entry in dataclasses.fields(options)}
+    return {name: flag for name, flag in _named(options) if name in own}
 
 
 def given(options: Any) -> dict[str, str]:
     """The option that each text or path was given to; a text that was given to several stands for the first."""
-    named, found = flags(options), dict[str, str]()
+    named, found = dict(_named(options)), dict[str, str]()
     for name, value in _values(options).items():
         for text in value if isinstance(value, tuple) else (value,):
             if isinstance(text, str | Path) and str(text) != ".":
