@@ -2,6 +2,8 @@
 
 import io
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -16,7 +18,9 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 import nbs_pin as nbs
+from nbs_pin import cli
 from nbs_pin.base.archives import read_archive, write_archive
+from nbs_pin.base.doors import at_the_shell
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError, RobotError, RobotNotFound
 from nbs_pin.base.files import ABANDONED, whole_file
 from nbs_pin.base.npz import LARGEST
@@ -216,9 +220,27 @@ def test_the_arm_is_loaded_as_it_was(tmp_path):
 )
 def test_another_arm_is_refused(path, own, other, law):
     nbs.save(law.for_robot(load_robot(own)), path)
-    words = f"is for the arm '{own}' .* and {other.name} .* has other links, joints, limits or gravity; give that arm"
+    typed = rf"load_robot\('{other.name}'{', gravity=.*' * ('gravity' in other.options)}\)"
+    words = (
+        rf"is for the arm '{own}', load_robot\('{own}'\) .* and {typed} .* has other links, joints, limits or gravity"
+    )
     with pytest.raises(ArgumentError, match=words):
         nbs.load(path, other)
+
+
+def test_an_arm_with_other_options_is_refused_with_those_to_give(path):
+    own = load_robot("panda", gravity=1.62, lock={"panda_joint7": 0.5})
+    saved(path, own)
+    locked = "'panda_finger_joint1': 0.0, 'panda_finger_joint2': 0.0, 'panda_joint7': 0.5"
+    given = re.escape(f"load_robot('panda', gravity=[0.0, 0.0, -1.62], lock={{{locked}}})")
+    with pytest.raises(ArgumentError, match=f"is for the arm 'panda', {given}"):
+        nbs.load(path, PANDA)
+    words = "panda --gravity 0.0,0.0,-1.62 --lock panda_finger_joint1,panda_finger_joint2,panda_joint7=0.5 "
+    with at_the_shell(), pytest.raises(ArgumentError, match=f"is for the arm 'panda', {words}"):
+        nbs.load(path, PANDA)
+    flags = shlex.split(words)
+    typed = cli.parse(["track", *flags])
+    assert load_robot(typed.robot, **typed.arm.given()).sha256 == own.sha256
 
 
 def test_a_pid_by_hand_is_for_its_number_of_joints(tmp_path):
@@ -238,7 +260,9 @@ def test_an_arm_whose_file_is_gone_is_asked_for(path, joints):
     robot = serial_chain(joints)
     controller = scrambled(NeuralBackstepping.for_robot(robot))
     nbs.save(controller, path)
-    words = rf"is for the arm 'chain_{joints}' of .*chain_{joints}.urdf, which is not there; give it"
+    words = (
+        rf"is of the arm load_robot\('.*chain_{joints}.urdf'\), which is not there; put it back, or give it as robot="
+    )
     with pytest.raises(RobotNotFound, match=words):
         nbs.load(path)
     np.testing.assert_array_equal(torques(nbs.load(path, robot)), torques(controller))

@@ -117,7 +117,7 @@ def test_another_model_is_not_replaced(path, network, capsys):
         ("data.npz", "--model forest", "forest"),
         ("data.npz", "--held-out 1", "--held-out is '1'"),
         ("data.npz", "--iterations 0", "--iterations is '0'"),
-        ("data.npz", "--model identified --loss acceleration", "no setting loss"),
+        ("data.npz", "--model identified --loss acceleration", "takes no --loss acceleration"),
         ("data.npz", "--robot three_link", "three_link"),
         ("data.npz", "--robot nowhere", "nowhere"),
         ("panda.npz", "--robot xarm7", "the data are of panda, not of xarm7; give the arm they were recorded on"),

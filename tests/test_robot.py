@@ -176,8 +176,11 @@ def test_the_papers_arm_has_the_papers_mass_matrix():
 
 
 def test_locking():
-    panda = load_robot("panda", lock=["panda_finger_joint1", "panda_finger_joint2", "panda_joint7"])
-    assert panda.nv == 6
+    panda = load_robot("panda", lock=["panda_joint7"])
+    assert panda.joint_names == tuple(f"panda_joint{i}" for i in range(1, 7))  # nor the catalogue's fingers
+    wide = load_robot("panda", lock={"panda_finger_joint1": 0.02})
+    assert wide.joint_names == load_robot("panda").joint_names
+    assert wide.sha256 != load_robot("panda").sha256
     assert load_robot("ur5", lock="wrist_3_joint").nv == 5
     with pytest.warns(UserWarning, match=r"mimic another are locked: 'panda_finger_joint2' \(of 'panda_finger_joint1'"):
         assert load_robot("panda", lock=[]).nv == 8

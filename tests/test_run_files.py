@@ -93,6 +93,30 @@ def test_a_file_that_is_no_run_is_refused_by_key(path, arrays, reason):
         Run.load(replaced(path, **arrays))
 
 
+@pytest.mark.parametrize("name", ["q", "tau", "a_ref"])
+@pytest.mark.parametrize("number", [np.nan, -np.inf])
+def test_what_cannot_be_loaded_is_not_saved_and_the_rows_before_it_are(path, name, number):
+    """A run that diverged, on an arm or in another simulator."""
+    before, run = path.read_bytes(), make_run((3,))
+    getattr(run, name)[3, 1, 0] = number
+    with pytest.raises(ArgumentError, match=rf"Run.save: {name} has numbers that are not finite in row 3; .*head\(3\)"):
+        run.save(path)
+    assert path.read_bytes() == before
+    run.head(3).save(path)
+    np.testing.assert_array_equal(getattr(Run.load(path), name), getattr(make_run((3,)), name)[:3])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"t": 0.01 * np.arange(5)[::-1]}, {"effort_limit": np.array([0.0, 1.0])}, {"q": np.full((5, 2), np.nan)}]
+)
+def test_both_ends_of_a_file_refuse_the_same(path, wrong):
+    (name,) = wrong
+    with pytest.raises(ArgumentError, match=f"Run.save: {name} has .*; correct it"):
+        dataclasses.replace(make_run(), **wrong).save(path)
+    with pytest.raises(FileFormatError, match=f"'{name}' has"):
+        Run.load(replaced(path, **wrong))
+
+
 def test_damage_is_refused_wherever_it_is(path):
     whole = path.read_bytes()
     for cut in (0, 10, len(whole) // 2, len(whole) - 1):

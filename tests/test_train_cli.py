@@ -199,10 +199,25 @@ def test_results_of_another_training_are_kept_unless_forced(tmp_path, capsys):
     assert summary(tmp_path)["settings"]["seed"] == 2
 
 
-@pytest.mark.parametrize("change", ["--seed=1", "--bandwidth=7", "--starts=8", "--effort-limit=50", "--epochs=7"])
-def test_a_resume_of_another_training_is_refused(folder, capsys, change):
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("--seed=1", "it has --seed 0, and here is --seed 1"),
+        ("--epochs=7", "it has --epochs 6, and here is --epochs 7"),
+        ("--duration=0.4", "it has --duration 0.3, and here is --duration 0.4"),
+        ("--bandwidth=7", "it differs in the law that it begins with, --controller or --bandwidth"),
+        ("--starts=8", "it differs in --starts"),
+        ("--start-error=0.2", "it differs in --start-error"),
+        ("--frequencies=1,3", "it differs in --frequencies"),
+        ("--effort-limit=50", "it differs in the effort limits"),
+        ("--cost=squared-error", "it differs in --cost"),
+        ("--fixed-gains", "it differs in --fixed-gains"),
+    ],
+)
+def test_a_resume_of_another_training_is_refused_with_what_differs(folder, capsys, change, words):
     before = contents(folder)
-    assert "not a checkpoint of this training" in refusal(train(folder, "--resume", change), capsys)
+    line = refusal(train(folder, "--resume", change), capsys)
+    assert f"not a checkpoint of this training, as {words}; give its original settings" in line
     assert contents(folder) == before
 
 
@@ -230,7 +245,7 @@ def test_a_controller_of_another_arm_is_refused_in_a_sentence(folder, tmp_path, 
         ("--effort-limit 5 --no-effort-limit", "choose one"),
         ("--bandwidth 200", "at most 100 rad/s"),
         ("--resume", "training.ckpt"),
-        ("--controller computed-torque --fixed-gains", "nothing is left to train"),
+        ("--controller computed-torque --fixed-gains", "nothing to train besides its gains"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_in_a_sentence(tmp_path, capsys, options, words):

@@ -210,7 +210,7 @@ def test_gains_stay_above_their_share_and_can_be_left_alone():
     fixed = quick(controller, gains=False).controller
     np.testing.assert_array_equal(fixed.rate.numpy(), controller.rate.numpy())
     np.testing.assert_array_equal(fixed.potential.stiffness.numpy(), controller.potential.stiffness.numpy())
-    with pytest.raises(ArgumentError, match="nothing is left to train"):
+    with pytest.raises(ArgumentError, match="nothing to train besides its gains"):
         quick(untrained("pid"), gains=False)
 
 
@@ -265,17 +265,16 @@ def test_a_checkpoint_of_another_training_or_arm_is_refused(tmp_path):
     controller, path = untrained(), tmp_path / "a.ckpt"
     quick(controller, checkpoint=path, epochs=2)
     changes = (
-        {"epochs": 3},
-        {"starts": 5},
-        {"seed": 1},
-        {"learning_rate": 0.5},
-        {"cost": squared_error},
-        {"cost": TorqueAware(torch.tensor(ROBOT.effort_limit), effort=1e-3)},
-        {"regulariser": lambda law: sum((p**2).sum() for p in law.parameters())},
+        ({"epochs": 3}, "it has epochs=2, and here is epochs=3"),
+        ({"starts": 5}, "it differs in the number of starts"),
+        ({"seed": 1, "learning_rate": 0.5}, "it has learning_rate=.*, seed=0, and here is learning_rate=0.5, seed=1"),
+        ({"cost": squared_error}, "it differs in cost"),
+        ({"cost": TorqueAware(torch.tensor(ROBOT.effort_limit), effort=1e-3)}, "it differs in cost"),
+        ({"regulariser": lambda law: sum((p**2).sum() for p in law.parameters())}, "it differs in cost, regulariser"),
     )
     same = {"checkpoint": path, "epochs": 2, "resume": True}
-    for law, change in (*((controller, change) for change in changes), (untrained(bandwidth=7.0), {})):
-        with pytest.raises(ArgumentError, match="not a checkpoint of this training"):
+    for law, change, words in (*((controller, *x) for x in changes), (untrained(bandwidth=7.0), {}, "the controller")):
+        with pytest.raises(ArgumentError, match=f"not a checkpoint of this training, as .*{words}"):
             quick(law, **same | change)
     assert about(path)["info"] == {"seed": 0}
     other = arm("three_link")

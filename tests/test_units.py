@@ -103,3 +103,12 @@ def test_the_weakest_motor_is_told_in_its_units():
     assert _cells(describe("gantry", robot))[2] == "400 N, 10 to 60"
     with pytest.warns(UserWarning, match=r"joint 'rail' of gantry needs .* from an error of 0\.3 m"):
         nbs.NeuralBackstepping.for_robot(robot.with_effort_limit([0.1, 1e6, 1e6]))
+
+
+@pytest.mark.parametrize(("name", "unit"), [(GANTRY, "N·m, N"), ("two_link", "N·m")])
+def test_limits_and_bounds_are_asked_for_in_the_units_of_the_joints(name, unit):
+    robot = nbs.load_robot(name)
+    with pytest.raises(nbs.ArgumentError, match=rf"expected one number > 0 or {robot.nv} of them \[{unit}\]"):
+        robot.with_effort_limit(-1.0)
+    with pytest.raises(nbs.ArgumentError, match=r"one on each \|τ_d,i\| \[N·m, N where it slides\]"):
+        Admissible.of([1.0] * 9, robot.nv)

@@ -48,9 +48,9 @@ def checked(**checks: Check) -> Callable[[_Function], _Function]:
             given = list(args)
             for name, at, check in places:
                 if at < len(given):
-                    given[at] = check(argument(where, name), given[at])
+                    given[at] = check(argument(where, name, given[at]), given[at])
                 elif name in kwargs:
-                    kwargs[name] = check(argument(where, name), kwargs[name])
+                    kwargs[name] = check(argument(where, name, kwargs[name]), kwargs[name])
             return function(*given, **kwargs)
 
         return door  # type: ignore[return-value]
@@ -145,12 +145,13 @@ def choice(*known: str) -> Check:
 
 
 def path(name: str, value: Any) -> Any:
-    """The path of a file: a text or a `Path`, without a null character."""
+    """The path of a file: a text or a `Path`, without a null character; `~` at its beginning is the home folder."""
     if not isinstance(value, str | os.PathLike) or not isinstance(os.fspath(value), str):
         raise ArgumentError(f"{name} is {told(value)}; give the path of a file.")
     if "\0" in os.fspath(value):
         raise ArgumentError(f"{name} is {os.fspath(value)!r:.80}; give the path of a file, without a null character.")
-    return value
+    home = os.path.expanduser(value)
+    return value if home == os.fspath(value) else home
 
 
 def readable(name: str, value: Any) -> Any:
@@ -168,7 +169,7 @@ def readable(name: str, value: Any) -> Any:
         fault = getattr(error, "strerror", None) or str(error)
     if fault:
         raise ArgumentError(f"{name}: cannot read {os.fspath(given)!r:.200}: {fault}; give the path of a file.")
-    return value
+    return given
 
 
 def writable(name: str, value: Any) -> Any:
@@ -188,7 +189,7 @@ def writable(name: str, value: Any) -> Any:
         fault = getattr(error, "strerror", None) or str(error)
     if fault:
         raise ArgumentError(f"{name}: cannot write {os.fspath(given)!r:.200}: {fault}; give the path of a file.")
-    return value
+    return given
 
 
 def a(kind: type | tuple[type, ...], remedy: str) -> Check:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nbs_pin.base.archives import parse_json
-from nbs_pin.base.arguments import PERIOD, a, check_fields, checked, mapping, readable, text, writable
+from nbs_pin.base.arguments import PERIOD, a, check_fields, checked, count, mapping, readable, text, writable
 from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
@@ -136,12 +137,21 @@ class Run:
         """Write the run to an npz file atomically; missing folders are created.
 
         Raises:
-            ArgumentError: If `info` or `robot_options` cannot be stored as JSON.
+            ArgumentError: If `load` would refuse the file: a number is not finite, times do not increase, a limit is
+                not > 0, or `info` or `robot_options` cannot be stored as JSON. `head` gives the rows before a number.
         """
+        for name, (fault, row) in _number_faults(vars(self)).items():
+            kept = f"save the rows before it, head({row})" if row else "correct it"
+            raise ArgumentError(f"Run.save: {name} has {fault}{f' in row {row}' if row else ''}; {kept}.")
         values = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         values = {name: value for name, value in values.items() if value is not None}
         texts = {name: _dumped(name, values[name]) for name in _JSON} | {"format": RUN_FORMAT}
         write_npz(path, {name: np.asarray(value) for name, value in (values | texts).items()})
+
+    @checked(rows=count(1, of="rows"))
+    def head(self, rows: int) -> "Run":
+        """The first rows of the run, all of them if it has fewer."""
+        return dataclasses.replace(self, **{name: getattr(self, name)[:rows] for name in ("t", *ROW_ARRAYS)})
 
     @classmethod
     @checked(path=readable)
@@ -159,7 +169,8 @@ class Run:
         if str(data["format"]) != RUN_FORMAT:
             raise FileFormatError(f"{path}: format '{data['format']}', expected '{RUN_FORMAT}'; record the run again.")
         _check_shapes(path, data)
-        _check_numbers(path, data)
+        for name, (fault, _) in _number_faults(data).items():
+            raise FileFormatError(f"{path}: '{name}' has {fault}; record the run again.")
         return cls(
             **{name: data[name] for name in ("t", *ROW_ARRAYS, "effort_limit", "continuous")},
             joint_names=tuple(str(name) for name in data["joint_names"]),
@@ -188,16 +199,20 @@ def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
             )
 
 
-def _check_numbers(path: str | Path, data: dict[str, np.ndarray]) -> None:
-    faults = {name: "numbers that are not finite" for name in ("t", *ROW_ARRAYS) if not np.isfinite(data[name]).all()}
-    if not (data["effort_limit"] > 0.0).all():
-        faults["effort_limit"] = "limits that are not > 0"
-    if not 0.0 < data["period"] < np.inf:
-        faults["period"] = "a value that is not finite and > 0"
-    if not (np.diff(data["t"]) > 0.0).all():
-        faults.setdefault("t", "times that do not increase")
-    for name, fault in faults.items():
-        raise FileFormatError(f"{path}: '{name}' has {fault}; record the run again.")
+def _number_faults(arrays: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
+    """What no file of a run may have, by array, with the first row that has it, or 0."""
+    faults = {}
+    for name in ("t", *ROW_ARRAYS):
+        finite = np.isfinite(arrays[name]).reshape(len(arrays["t"]), -1).all(axis=1)
+        if not finite.all():
+            faults[name] = "numbers that are not finite", int(np.argmin(finite))
+    if not (arrays["effort_limit"] > 0.0).all():
+        faults["effort_limit"] = "limits that are not > 0", 0
+    if not 0.0 < arrays["period"] < np.inf:
+        faults["period"] = "a value that is not finite and > 0", 0
+    if not (np.diff(arrays["t"]) > 0.0).all():
+        faults.setdefault("t", ("times that do not increase", 0))
+    return faults
 
 
 def _dumped(name: str, value: dict[str, Any]) -> str:

@@ -43,8 +43,8 @@ class Admissible:
         usable = (given == 0.0) | ((given >= _LEAST) & (given <= _GREATEST))  # its square is a number > 0
         if given.ndim != (self.radius is None) or given.size == 0 or not usable.all():
             raise ArgumentError(
-                f"disturbance has the box {told(self.box)} and the radius {told(self.radius)} N·m, expected one of the"
-                f" two, each bound 0 or from {_LEAST:g} to {_GREATEST:g}; correct it."
+                f"disturbance has the box {told(self.box)} and the radius {told(self.radius)}, in N·m, or N where it "
+                f"slides, expected one of the two, each bound 0 or from {_LEAST:g} to {_GREATEST:g}; correct it."
             )
         object.__setattr__(self, *(("radius", float(given)) if self.box is None else ("box", given)))
         check_fields(self, claims=many(a(Claim, "a Claim")))
@@ -66,7 +66,8 @@ class Admissible:
         given = floats("disturbance", disturbance)
         if given.shape not in ((), (nv,)):
             raise ArgumentError(
-                f"disturbance is {told(disturbance)}, expected one bound on ‖τ_d‖ or {nv}, one on each |τ_d,i| [N·m]."
+                f"disturbance is {told(disturbance)}, expected one bound on ‖τ_d‖ or {nv}, one on each |τ_d,i| "
+                "[N·m, N where it slides]."
             )
         return cls(radius=float(given)) if given.ndim == 0 else cls(box=given)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from nbs_pin.base.claims import refuse
+from nbs_pin.base.doors import where_printed
 from nbs_pin.certificates.body_bounds import BodyBounds
 from nbs_pin.certificates.body_error import BodyError, Terms, body_error
 from nbs_pin.certificates.body_motion import AlongReference
@@ -43,7 +44,8 @@ def bounds_for_all(
     if not isinstance(dynamics, PinocchioDynamics) or type(dynamics) not in (PinocchioDynamics, IdentifiedDynamics):
         refuse(
             f"uncertain bodies need a law whose model has bodies, and this one has {type(dynamics).__name__}",
-            "take the arm's own model or an identified one, or give mismatch=compare(…).mismatch",
+            "take the arm's own model or an identified one, or "
+            + where_printed(python="give mismatch=compare(…).mismatch", shell="omit --inertia-within"),
         )
     robot, model = dynamics.robot, dynamics.model
     packed = dynamics.packed_tree()

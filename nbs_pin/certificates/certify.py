@@ -48,7 +48,7 @@ from nbs_pin.motions.references import MOTION, DesiredMotion, at_times
 from nbs_pin.robots.robot import ARM, Robot
 
 _NO_ERROR = ModelError(0.0, 0.0, 0.0, (), ())
-_UNBOUNDED = "taken as 0, but nothing bounds it: give mismatch=compare(…).mismatch, or --against ARM"
+_UNBOUNDED = "taken as 0, but nothing bounds it: give mismatch=compare(…).mismatch"
 _UNKNOWN = Claim("error of the model", math.inf, "N·m", Label.EMPIRICAL, _UNBOUNDED, Group.MODEL_ERROR)
 _UNKNOWN_ERROR = ModelError(0.0, 0.0, 0.0, (_UNKNOWN,), ())
 
@@ -331,7 +331,7 @@ def _why_not(k: ComparisonSystem, has_mismatch: bool, has_friction: bool) -> str
         )
     return (
         f"no bound follows from ρ = {k.rho:.3g}, ω = {k.omega:.3g} and κ = {k.kappa:.3g} 1/s: D must dominate M, "
-        "which an inertial rate ω > 0 ensures for every arm; take damping='inertial'."
+        "which an inertial rate ω > 0 ensures for every arm; take the damping 'inertial', as that of nbs is."
     )
 
 

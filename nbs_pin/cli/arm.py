@@ -134,9 +134,10 @@ class ArmOptions:
 
     lock: Annotated[
         tyro.conf.UseAppendAction[tuple[Annotated[str, text("J1,J2=POSITION,…", _checked(_read_lock))], ...]],
-        default("the catalogue's"),
+        default("none"),
     ] = ()
-    """Joints to fix at 0, or at a position [rad, m]: --lock finger_left,finger_right=0.02; may be repeated."""
+    """Joints to fix besides those that the catalogue fixes, at 0 or at a position [rad, m]:
+    --lock finger_left,finger_right=0.02; may be repeated."""
     zero_limits: Literal["refuse", "unlimited"] | None = None
     """Limits that are left out, not above 0, or an empty range at 0: refuse them, or read them as no limit."""
     limits: Annotated[

@@ -32,7 +32,7 @@ def torque_bounds() -> PrimitiveConstructorSpec[str]:
         if values is None or not all(0.0 <= value <= 1e6 for value in values):
             raise OptionError(
                 f"--disturbance is '{words[0]}'; give the largest torque, one for all joints or one per joint, "
-                "separated by commas, from 0 to 1e6 N·m: --disturbance 5,5,3."
+                "separated by commas, from 0 to 1e6 N·m, or N where it slides: --disturbance 5,5,3."
             )
         return words[0]
 
@@ -48,7 +48,7 @@ def friction_text() -> PrimitiveConstructorSpec[str]:
         if not usable:
             raise OptionError(
                 f"--friction is '{words[0]}'; give the viscous and the Coulomb coefficient of all joints, N·m·s/rad "
-                "and N·m: --friction 0.5,1."
+                "and N·m, or N·s/m and N where it slides: --friction 0.5,1."
             )
         return words[0]
 

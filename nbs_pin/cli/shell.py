@@ -30,6 +30,7 @@ from nbs_pin.cli.reproduce import Reproduce
 from nbs_pin.cli.robots import Robots
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.train import Train
+from nbs_pin.cli.typed import flags, given, with_home
 from nbs_pin.cli.values import OptionError
 from nbs_pin.cli.verify import Verify
 
@@ -112,7 +113,8 @@ def _run(arguments: list[str], notes: Console, stops: list[int], begin: Callable
         begin()
         if stops:  # a library that is being imported may swallow the interrupt
             raise KeyboardInterrupt
-        return body.run(command, console, notes) or 0
+        with at_the_shell(flags(command), given(command)):
+            return body.run(command, console, notes) or 0
     return 0
 
 
@@ -150,11 +152,11 @@ def parse(arguments: list[str]) -> Any:
         raise OptionError(f"{_first_paragraph(complaint.getvalue())}; see nbs-pin --help.") from None
     if unknown:
         options = {**vars(command), **vars(getattr(command, "arm", command))}
-        flags = [f"--{name.replace('_', '-')}" for name in options]
+        known = [f"--{name.replace('_', '-')}" for name in options]
         what = "has no option" if unknown[0].startswith("-") else "takes no argument"
-        remedy = f"{_near(unknown[0], flags)}see nbs-pin {arguments[0]} --help."
+        remedy = f"{_near(unknown[0], known)}see nbs-pin {arguments[0]} --help."
         raise OptionError(f"nbs-pin {arguments[0]} {what} '{unknown[0]}'; {remedy}")
-    return command
+    return with_home(command)
 
 
 def _subcommand(name: str) -> Any:

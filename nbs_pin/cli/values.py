@@ -14,6 +14,7 @@ from nbs_pin.base.exceptions import NbsPinError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INTEGER = re.compile(r"[0-9]+")
+_LARGEST = 1e30  # torque of a disturbance [N·m, N]
 SAVED = ".nbs"
 """File extension of saved controllers and models."""
 DisturbanceKind: TypeAlias = Literal["constant", "square", "sine", "noise"]
@@ -169,12 +170,15 @@ def parse_disturbance(text: str) -> DisturbanceText:
         kind, listed, frequency = parts[1] or parts[3], parts[2] or parts[4], plain_number(parts[5] or "0")
         sizes = [plain_number(size) for size in listed.split(",")]
         usable = frequency is not None and (frequency > 0.0 or not parts[5])
-        usable = usable and all(size is not None and (size >= 0.0 or kind != "noise") for size in sizes)
+        usable = usable and all(
+            size is not None and abs(size) <= _LARGEST and (size >= 0.0 or kind != "noise") for size in sizes
+        )
         if usable:
             return DisturbanceText(text, kind, tuple(sizes), frequency)  # type: ignore[arg-type]
     raise OptionError(
         f"--disturbance is '{text}'; give none, constant:5, square:5@8, sine:5@8 or noise:0.5 "
-        "(N·m, one for all joints or one per joint, separated by commas; @ frequency above 0 rad/s)."
+        "(N·m, or N where it slides, one for all joints or one per joint, separated by commas; "
+        "@ frequency above 0 rad/s)."
     )
 
 

@@ -28,7 +28,7 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.motions.by_name import motion_of
 from nbs_pin.reports.certificate_charts import plot_certificate, plot_monitor
 from nbs_pin.robots.robot import Robot, load_robot
-from nbs_pin.storage.checkpoints import load, save
+from nbs_pin.storage.checkpoints import load, load_with, save
 
 FILES = ("certificate.png", "run.npz", SUMMARY)
 """Files of `write_results`; run.npz only if a worst motion was found."""
@@ -41,8 +41,9 @@ def run(options: Certify, console: Console, notes: Console) -> int:
     if options.wanted is not None and options.controller.endswith(SAVED):
         raise OptionError(f"--wanted designs a controller, and '{options.controller}' is one; give an arm.")
     with notes.status(f"loading {options.controller}"):
-        controller = _controller(options)
-        task = _task(options, controller)
+        truth = None if options.against is None else load_robot(options.against, **options.arm.given())
+        controller = _controller(options, truth)
+        task = _task(options, controller, truth)
         robot = arm_of(controller, task)
         watched = None if options.monitor is None else Run.load(options.monitor)
     results = Results.of(options, robot.name, robot, against=robot.source)
@@ -62,7 +63,7 @@ def run(options: Certify, console: Console, notes: Console) -> int:
     return NO_PROMISE if result.certificate.void else 0
 
 
-def _controller(options: Certify) -> LyapunovLaw:
+def _controller(options: Certify, truth: Robot | None) -> LyapunovLaw:
     """The controller in a .nbs file, or the law built for an arm.
 
     Raises CertificateRefused if it has no Lyapunov function.
@@ -72,9 +73,9 @@ def _controller(options: Certify) -> LyapunovLaw:
     if name.endswith(SAVED) and options.feed_friction:
         raise OptionError(f"--feed-friction is for a law built here, and '{name}' holds one; omit it.")
     if name.endswith(SAVED):
-        if options.against is None:
+        if truth is None:
             options.arm.refuse_without_arm(f"'{name}' names its arm; omit it")
-        law: Any = load(name)
+        law: Any = load(name) if truth is None else load_with(name, truth)
     else:
         robot = load_robot(name, **options.arm.given())
         stated = _friction(options.friction, robot) or JointFriction.of(robot)
@@ -91,11 +92,10 @@ def _controller(options: Certify) -> LyapunovLaw:
     return law
 
 
-def _task(options: Certify, controller: LyapunovLaw) -> Task:
+def _task(options: Certify, controller: LyapunovLaw, truth: Robot | None) -> Task:
     """The task that the options describe; raises OptionError if they do not fit each other."""
     _check_options(options)
     period = options.period or 0.001
-    truth = None if options.against is None else load_robot(options.against, **options.arm.given())
     blank = Task(reference=_no_motion, truth=truth)
     robot = arm_of(controller, blank)
     if options.trajectories is not None and is_exact(controller.dynamics, robot):

@@ -31,7 +31,7 @@ from nbs_pin.reports.error_charts import plot_model_errors
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
-from nbs_pin.storage.checkpoints import load
+from nbs_pin.storage.checkpoints import load, load_with
 
 FILES = ("errors.png", "errors.csv", SUMMARY)
 """Files of `write_results`."""
@@ -46,8 +46,9 @@ def run(options: Compare, console: Console, notes: Console) -> None:
     with notes.status(f"loading {options.model}"):
         if options.model.endswith(SAVED) and options.against is None:
             options.arm.refuse_without_arm(f"'{options.model}' names its arm; give it with --against")
-        model = model_of(options.model, **options.arm.given())
-        robot = _arm(options, model)
+        truth = None if options.against is None else load_robot(options.against, **options.arm.given())
+        model = model_of(options.model, truth, **options.arm.given())
+        robot = _arm(options, model) if truth is None else truth
         region = _region(options, robot)
         recorded = None if options.along is None else Run.load(options.along)
     results = Results.of(options, robot.name, robot, against=robot.source)
@@ -72,8 +73,10 @@ class Comparison(NamedTuple):
     """Why there is no closed loop, empty if there is one."""
 
 
-def model_of(text: str, **load_options: Any) -> DynamicsProvider:
+def model_of(text: str, truth: Robot | None = None, **load_options: Any) -> DynamicsProvider:
     """The model in a .nbs file, the model of a controller in a .nbs file, or Pinocchio's model of an arm.
+
+    truth: the true arm, which the model in a file gets if the file is for it.
 
     Raises:
         ArgumentError: If the controller has no model or the file has another extension; errors of loading otherwise.
@@ -85,7 +88,7 @@ def model_of(text: str, **load_options: Any) -> DynamicsProvider:
         )
     if not text.endswith(".nbs"):
         return PinocchioDynamics(load_robot(text, **load_options))
-    stored: Any = load(text)
+    stored: Any = load(text) if truth is None else load_with(text, truth)
     if isinstance(stored, DynamicsProvider):
         return stored
     if isinstance(stored, ModelLaw):
@@ -261,9 +264,7 @@ def _rows(found: dict[str, Any], robot: Robot) -> Iterator[tuple[str, str, Any]]
 
 
 def _arm(options: Compare, model: DynamicsProvider) -> Robot:
-    """The true arm; raises OptionError if neither the file nor the options name one."""
-    if options.against is not None:
-        return load_robot(options.against, **options.arm.given())
+    """The arm that the file names as the true one; raises OptionError if it names none."""
     if model.robot is None or not options.model.endswith(SAVED):
         raise OptionError(f"'{options.model}' does not name its true arm; give --against ROBOT.")
     return model.robot

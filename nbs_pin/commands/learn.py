@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from nbs_pin.base.doors import own_arm
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
 from nbs_pin.base.units import by_quantity, column, several, units
@@ -85,10 +86,10 @@ def arm_of(data: Dataset) -> Robot | None:
     if not isinstance(said, dict) or not said.get("source"):
         return None
     options = said.get("options", {})
-    robot = load_named(repr(data), str(said["source"]), options if isinstance(options, dict) else {"options": options})
+    robot = load_named("the data", str(said["source"]), options if isinstance(options, dict) else {"options": options})
     if robot.sha256 != said.get("sha256", robot.sha256):
         raise ArgumentError(
-            f"{data!r}: the description {said['source']} has changed since; give the arm as it was then."
+            f"the data: the description {said['source']} has changed since; give the arm of then as {own_arm()}."
         )
     return robot
 

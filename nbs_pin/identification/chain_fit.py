@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
 
 from nbs_pin.base.checks import positive
+from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.chain import Chain, random_tree
@@ -115,7 +116,9 @@ def fit_chain(
     if not (isinstance(starts, int) and starts >= 1):
         raise ArgumentError(f"starts is {starts}, expected a whole number ≥ 1 of random trees; 64 is usual.")
     if not data.tau.any():
-        raise ArgumentError(f"{data!r} has no torque: arms of every scale move alike; record one with motors on.")
+        raise ArgumentError(
+            f"{in_words(data, 'the data')} has no torque: arms of every scale move alike; record one with motors on."
+        )
     network = Chain(data.parents.tolist(), data.prismatic.tolist(), epsilon)
     scalars = Scalars(friction, rotor_inertia, transition)
     measured, layout = _measured(data, scalars), _layout(data.parents, data.prismatic)

@@ -22,7 +22,7 @@ def arm_fault(data: Dataset, robot: Robot) -> str:
     if not (np.array_equal(data.parents, parents) and np.array_equal(data.prismatic, prismatic)):
         return (
             f"the joints of the data are {_joints(data.parents, data.prismatic)} and those of {robot.name} "
-            f"{_joints(parents, prismatic)}; give the arm they were recorded on, also to load_log"
+            f"{_joints(parents, prismatic)}; give the arm they were recorded on, also when the log is read"
         )
     said, given = _Arm.of_data(data), _Arm(robot.name, robot.source, robot.sha256)
     if said.in_catalogue and given.in_catalogue and said.differs(given):

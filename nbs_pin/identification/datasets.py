@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from nbs_pin.base.archives import parse_json
 from nbs_pin.base.arguments import SEED, a, check_fields, checked, mapping, number, readable, text, writable
 from nbs_pin.base.checks import LARGEST, floats, is_usual, told
+from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 
@@ -108,7 +109,9 @@ class Dataset:
         """
         ids = np.unique(self.trajectory)
         if ids.size < 2:
-            raise ArgumentError(f"{self!r} cannot be split: it has only one trajectory; collect several.")
+            raise ArgumentError(
+                f"{in_words(self, 'the data')} cannot be split: it has only one trajectory; collect several."
+            )
         count = int(np.clip(round(share * ids.size), 1, ids.size - 1))
         held_out = np.isin(self.trajectory, np.random.default_rng(seed).permutation(ids)[:count])
         return self.take(~held_out), self.take(held_out)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nbs_pin.base.doors import BLANK, option
+from nbs_pin.base.doors import BLANK, names_of, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
@@ -44,8 +44,8 @@ class FitTask:
         """The settings; raises ArgumentError if one is not among the names."""
         for name, value in self.settings.items():
             if name not in names:
-                known = f"takes {', '.join(names)}" if names else "takes none"
-                raise ArgumentError(f"model '{self.model}' has no setting {name} = {value!r:.80}; it {known}.")
+                known = f"takes {', '.join(names_of(names)) or 'none'}"
+                raise ArgumentError(f"model '{self.model}' takes no {option(name, value):.80}; it {known}.")
         return dict(self.settings)
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arguments import checked, flag, maybe, number
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
@@ -126,7 +127,7 @@ def identify(
     scalars = Scalars(friction, rotor_inertia, transition)
     fault = sign_fault(data, robot)
     if fault:
-        raise ArgumentError(f"{data!r}: {fault}.")
+        raise ArgumentError(f"{in_words(data, 'the data')}: {fault}.")
     bodies = explain(RobotGeometry(robot), data, scalars, regularisation)
     parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
     rotors = bodies.scalars[-1] if rotor_inertia else None
@@ -228,7 +229,7 @@ def _check_arm(data: Dataset, robot: Robot) -> None:
     if fault:
         raise ArgumentError(f"{fault}.")
     if not data.tau.any():
-        raise ArgumentError(f"{data!r} has no torque: inertias of every scale explain such a motion; record torques.")
+        raise ArgumentError(f"{in_words(data, 'the data')} without torque fit inertias of every scale; record torques.")
 
 
 def _base_directions(

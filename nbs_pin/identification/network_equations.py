@@ -12,6 +12,7 @@ from torch import nn
 from torch.func import functional_call, jacrev, vmap
 
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
@@ -36,7 +37,9 @@ class Equation(nn.Module):
     ) -> None:
         super().__init__()
         if loss == "acceleration" and isinstance(network, ResidualNetwork):
-            raise ArgumentError("loss 'acceleration' needs derivatives that a nominal model lacks; use loss='torque'.")
+            raise ArgumentError(
+                f"loss 'acceleration' needs derivatives that a nominal model lacks; use {option('loss', 'torque')}."
+            )
         self.network, self.loss, self.transition = network, loss, transition
         self.roots = None if friction is None else nn.Parameter(friction.sqrt())
 

@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias, cast, get_args
 import torch
 from jaxtyping import Int
 
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.friction import JointFriction
@@ -131,7 +132,9 @@ def fit_network(
     if loss not in get_args(Loss):
         raise ArgumentError(f"loss '{loss}' is unknown; choose one of {', '.join(get_args(Loss))}.")
     if loss == "torque" and not data.tau.any():
-        raise ArgumentError("the data have no torque, which M̂ = 0 explains; record some, or use loss='acceleration'.")
+        raise ArgumentError(
+            f"the data have no torque, which M̂ = 0 explains; record some, or use {option('loss', 'acceleration')}."
+        )
 
     def begin(start: int) -> _Search:
         begun = first_friction(data) if friction else None

@@ -15,6 +15,7 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, PARAMETERS_OF_COORDINATES, coordinates
 from nbs_pin.identification.consistent_fit import in_factors
@@ -141,7 +142,9 @@ def expectation(
     balls = coordinates(factors @ factors.swapaxes(1, 2)).ravel()
     torque = np.linalg.norm(triangles[:, :, : 10 * n] @ balls, axis=1) / np.sqrt(len(data))
     if not torque.any():
-        raise ArgumentError(f"the arm of {data!r} neither moves nor carries weight; record motions.")
+        raise ArgumentError(
+            f"the arm of {in_words(data, 'the data')} neither moves nor carries weight; record motions."
+        )
     scale = np.sqrt(n / np.square(torque / size).sum())
     speed = np.sqrt(np.square(scalars.factors(data.v, data.a)).mean(axis=1))
     least = _STILL * speed.max(axis=-1, keepdims=True, initial=1e-9)

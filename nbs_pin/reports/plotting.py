@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.base.arguments import checked, count, maybe, writable
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import RUN, Run
@@ -76,7 +77,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
     """
     starts = int(np.prod(run.q.shape[1:-1], dtype=int))
     if not 0 <= start < starts:
-        raise ArgumentError(f"start={start} does not exist: the run has starts 0 to {starts - 1}.")
+        raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts - 1}.")
     if robot is not None and robot.nv != run.nv:
         raise ArgumentError(f"the run has {run.nv} joints and {robot!r} {robot.nv}; give the robot of the run.")
     q, v, q_ref, tau, asked = (

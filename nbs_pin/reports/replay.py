@@ -23,6 +23,7 @@ from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry
 from meshcat.path import Path as ScenePath
 
 from nbs_pin.base.arguments import checked, count, maybe, paths, writable
+from nbs_pin.base.doors import option, own_arm
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import RUN, Run
@@ -115,12 +116,12 @@ def body_poses(robot: Robot, q: Float[np.ndarray, "rows n"]) -> Float[np.ndarray
 def _robot_of(run: Run) -> Robot:
     """The robot that the run names; raises ArgumentError unless it is still the one that ran."""
     if not run.robot:
-        raise ArgumentError("the run names no robot: give it as replay(run, path, robot=load_robot(…)).")
+        raise ArgumentError(f"the run names no robot: give it as {own_arm()}.")
     robot = load_named("the run", run.robot, run.robot_options)
     if robot.sha256 != run.robot_sha256:
         raise ArgumentError(
             f"'{run.robot}' is not the arm that ran (description or gravity differ: {robot.sha256[:12]} now, "
-            f"{run.robot_sha256[:12] or 'nothing'} in the run): give the robot that ran as robot=…."
+            f"{run.robot_sha256[:12] or 'nothing'} in the run): give the one that ran as {own_arm()}."
         )
     return robot
 
@@ -128,7 +129,7 @@ def _robot_of(run: Run) -> Robot:
 def _one_start(array: Float[np.ndarray, "rows *batch n"], start: int) -> Float[np.ndarray, "rows n"]:
     starts = array.reshape(array.shape[0], -1, array.shape[-1])
     if not 0 <= start < starts.shape[1]:
-        raise ArgumentError(f"start={start} does not exist: the run has starts 0 to {starts.shape[1] - 1}.")
+        raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts.shape[1] - 1}.")
     return starts[:, start]
 
 

@@ -4,7 +4,8 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
-from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.doors import as_loaded, own_arm
+from nbs_pin.base.exceptions import ArgumentError, RobotNotFound
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.robots.xacro_source import refusing
 
@@ -22,11 +23,17 @@ def load_named(where: str, source: str, options: Mapping[str, Any]) -> Robot:
     if unknown:
         raise ArgumentError(
             f"{where} loads the arm '{source:.200}' with options that this version does not know "
-            f"({', '.join(sorted(unknown)):.200}); give it as robot=load_robot(…)."
+            f"({', '.join(sorted(unknown)):.200}); give it as {own_arm()}."
         )
     because = (
         f"{where} is of the arm '{source:.200}', a xacro file, which can read the environment and other files when it "
-        "is expanded; give it yourself if you trust it, as robot=load_robot(…) or --robot."
+        f"is expanded; give it yourself if you trust it, as {own_arm()}."
     )
-    with refusing(because):
-        return load_robot(source, **options)
+    try:
+        with refusing(because):
+            return load_robot(source, **options)
+    except RobotNotFound as error:
+        raise RobotNotFound(
+            f"{where} is of the arm {as_loaded(source, options)}, which is not there; put it back, or give it as "
+            f"{own_arm()}."
+        ) from error

@@ -18,6 +18,7 @@ from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors
 from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.storable import storable
+from nbs_pin.base.units import several, units
 from nbs_pin.robots.catalogue import Entry, find
 from nbs_pin.robots.pinocchio_model import build_model, check_inertia, with_limits
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
@@ -163,7 +164,8 @@ class Robot:
         effort = floats("effort limit", limit)
         if effort.shape not in ((), (self.nv,)) or not (effort >= SMALLEST).all():
             raise ArgumentError(
-                f"effort limit is {told(limit)}, expected one number > 0 or {self.nv} of them [N·m]; np.inf means none."
+                f"effort limit is {told(limit)}, expected one number > 0 or {self.nv} of them "
+                f"[{several(units('torque', self.prismatic))}]; np.inf means none."
             )
         by_name = dict(zip(self.joint_names, np.full(self.nv, effort).tolist(), strict=True))
         joints = tuple(replace(joint, effort=by_name[joint.name]) for joint in self.urdf.joints)
@@ -300,7 +302,8 @@ def load_robot(
             "robot_descriptions:NAME" for a description of that package, such as robot_descriptions:fr3_mj_description.
         gravity: Downward acceleration [m/s²] or a vector in the world frame. None takes the catalogue's or
             that of an MJCF file, else 9.81.
-        lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. None takes the catalogue's list.
+        lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. besides those that the catalogue fixes;
+            an empty list fixes none.
         zero_limits: "refuse" joints that state no limits, an effort or velocity that is not > 0, or an empty range at
             zero, or read these as "unlimited". None takes the catalogue's, else "refuse".
         limits: Limits in place of the file's, by joint ("*" for all) and by "lower", "upper" [rad, m], "effort"
@@ -345,6 +348,9 @@ def _load(entry: Entry, given: dict[str, Any]) -> Robot:
     told = {**entry.options, **given}
     gravity = _gravity_vector(told.pop("gravity", 9.81))
     options = read_options(told)
+    if options.lock:  # an empty list frees what the catalogue locks
+        own = read_options({"lock": entry.options.get("lock", ())}).lock
+        options = replace(options, lock={**own, **options.lock})
     urdf = read_urdf(entry.path, options)
     is_stated = urdf.gravity is not None and "gravity" not in {**entry.options, **given}
     vector = np.array(urdf.gravity) if is_stated else gravity

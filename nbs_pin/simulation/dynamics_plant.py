@@ -7,7 +7,7 @@ import numpy as np
 from nbs_pin.base.arguments import DURATION, checked, choice, maybe
 from nbs_pin.base.arrays import Array, Vectors, as_vectors, is_torch_array
 from nbs_pin.base.checks import all_finite
-from nbs_pin.base.doors import option
+from nbs_pin.base.doors import in_words, option
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged, TooLarge
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -98,7 +98,7 @@ class DynamicsPlant(Plant):
             return dynamics.forward_dynamics(q, v, net)
 
         far = (
-            f"{self!r} diverged to a state that is not finite in a step of {duration:g} s; "
+            f"{in_words(self, 'the plant')} diverged to a state that is not finite in a step of {duration:g} s; "
             "take a shorter plant step, or check the controller."
         )
         try:

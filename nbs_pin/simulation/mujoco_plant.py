@@ -12,6 +12,7 @@ import numpy as np
 from nbs_pin.base.arguments import DURATION, checked, choice, either, maybe
 from nbs_pin.base.arrays import Matrices, Vectors, as_vectors, finite_result
 from nbs_pin.base.checks import all_finite
+from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
 from nbs_pin.dynamics.friction import FRICTION, JointFriction, friction_of_size
 from nbs_pin.robots.robot import ARM, Robot
@@ -185,7 +186,8 @@ class MujocoPlant(Plant):
         row = self._qpos[self._at_q].copy(), self._qvel[self._at_v].copy()
         if not (all_finite(row[0]) and all_finite(row[1])):
             raise SimulationDiverged(
-                f"{self!r} diverged to a state that is not finite; take a shorter plant step, or check the controller."
+                f"{in_words(self, 'the plant')} diverged to a state that is not finite; "
+                "take a shorter plant step, or check the controller."
             )
         return row
 
@@ -193,7 +195,8 @@ class MujocoPlant(Plant):
         # MuJoCo silently treats a NaN torque as zero, so it must never receive one.
         if not (all_finite(q) and all_finite(v) and all_finite(tau)):
             raise SimulationDiverged(
-                f"{self!r} was given q = {q}, v = {v}, torque = {tau}, expected finite numbers; find where they arise."
+                f"{in_words(self, 'the plant')} was given q = {q}, v = {v}, torque = {tau}, expected finite numbers; "
+                "find where they arise."
             )
         self._qpos[self._at_q] = q
         self._qvel[self._at_v] = v
@@ -204,7 +207,9 @@ class MujocoPlant(Plant):
             kind = int(np.flatnonzero(self._warnings)[0])
             cause = mujoco.mju_warningText(kind, int(self._data.warning.lastinfo[kind]))
             mujoco.mj_resetData(self.model, self._data)
-            raise SimulationDiverged(f"{self!r}: {cause} Take a shorter plant step, or check the controller.")
+            raise SimulationDiverged(
+                f"{in_words(self, 'the plant')}: {cause} Take a shorter plant step, or check the controller."
+            )
 
 
 _DURATION = partial(DURATION, "duration")

@@ -19,7 +19,8 @@ from safetensors import SafetensorError
 
 from nbs_pin.base.archives import parse_json, read_archive, write_archive
 from nbs_pin.base.arguments import a, checked, mapping, maybe, readable, writable
-from nbs_pin.base.exceptions import ArgumentError, FileFormatError, RobotError, RobotNotFound
+from nbs_pin.base.doors import as_loaded, own_arm
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError, RobotError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
 from nbs_pin.controllers.controller import Controller
@@ -94,6 +95,15 @@ def load(path: str | Path, robot: Robot | None = None) -> Any:
         RobotError: If the description of the arm has changed or, as RobotNotFound, no longer exists.
     """
     return read_checkpoint(path, robot).controller
+
+
+@checked(path=readable, robot=ARM)
+def load_with(path: str | Path, robot: Robot) -> Any:
+    """`load` for an arm that need not be that of the file: another is left out, and the file's own is loaded."""
+    with _refusing(path):
+        stored = described_robot(_document(path, read_archive(path, FORMAT))["controller"])
+    own = stored is not None and stored["sha256"] == robot.sha256
+    return read_checkpoint(path, robot if own else None).controller
 
 
 @checked(path=readable)
@@ -196,11 +206,12 @@ def _arm(path: str | Path, stored: Settings, given: Robot | None) -> Robot:
     robot = _loaded(path, stored) if given is None else given
     if robot.sha256 != stored["sha256"]:
         message = (
-            f"{path} is for the arm '{stored['name']}' ({stored['source']}, {stored['sha256']:.12}), and {robot.name} "
-            f"({robot.source}, {robot.sha256:.12}) has other links, joints, limits or gravity; "
+            f"{path} is for the arm '{stored['name']}', {as_loaded(stored['source'], stored['options'])} "
+            f"({stored['sha256']:.12}), and {as_loaded(robot.source, robot.options)} ({robot.sha256:.12}) has other "
+            "links, joints, limits or gravity; "
         )
         if given is None:
-            raise RobotError(f"{message}that file was changed: give the original arm as robot=….")
+            raise RobotError(f"{message}that file was changed: give the original arm as {own_arm()}.")
         raise ArgumentError(f"{message}give that arm, or build a controller for this one.")
     limits = [math.inf if limit is None else limit for limit in stored["effort_limit"]]
     if given is not None or robot.effort_limit.tolist() == limits:
@@ -210,14 +221,8 @@ def _arm(path: str | Path, stored: Settings, given: Robot | None) -> Robot:
 
 
 def _loaded(path: str | Path, stored: Settings) -> Robot:
-    try:
-        with _refusing(path):
-            return load_named(str(path), stored["source"], stored["options"])
-    except RobotNotFound as error:
-        raise RobotNotFound(
-            f"{path} is for the arm '{stored['name']}' of {stored['source']}, which is not there; give it as "
-            "robot=nbs.load_robot(…)."
-        ) from error
+    with _refusing(path):
+        return load_named(str(path), stored["source"], stored["options"])
 
 
 @contextmanager

@@ -1,8 +1,6 @@
 """The epochs of a training: optimiser steps, backtracking, checkpoints and the best controller so far."""
 
 import copy
-import hashlib
-import json
 import math
 import time
 from collections.abc import Callable
@@ -23,8 +21,8 @@ from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.simulation.costs import StageCost
 from nbs_pin.simulation.rollout import Batch, Engine, motions, running_cost
 from nbs_pin.storage.checkpoints import TrainingState, read_checkpoint, write_checkpoint
-from nbs_pin.storage.descriptions import describe
 from nbs_pin.training.optimisers import RISE, optimiser, packed_state, scheduled_rate, unpacked_state
+from nbs_pin.training.same_training import difference, statement
 
 Regulariser: TypeAlias = Callable[[Any], torch.Tensor]
 """Cost of the controller itself, added to the mean cost of the motions: controller -> scalar tensor."""
@@ -94,27 +92,14 @@ class Task:
             first = self.training.beginning()
             motions(self.controller, first, self.engine).command.sum().backward()  # type: ignore[no-untyped-call]
 
-    def fingerprint(self) -> str:
-        """Hash of what a resumed training must share with the one that wrote the checkpoint.
-
-        Cost, regulariser, model and plant may be any callables; they are identified by the initial costs.
-        Raises ArgumentError if the controller cannot be stored.
-        """
-        digest = hashlib.sha256()
-        for batch in (self.training, self.held_out):
-            for array in () if batch is None else (batch.aims, batch.desired, batch.q0, batch.v0, batch.tau_d):
-                digest.update(np.ascontiguousarray(array).tobytes())
-        settings, tensors = describe(self.controller)
-        for tensor in tensors.values():
-            digest.update(tensor.detach().cpu().numpy().tobytes())
-        digest.update(self.training.loop.limit.tobytes())
+    def statement(self) -> dict[str, Any]:
+        """What a resumed training must share with the one that wrote the checkpoint (`same_training.py`)."""
         with torch.no_grad():
-            checked = [] if self.held_out is None else [self.value(self.held_out)]
-            first = [f"{float(value):.9g}" for value in (self.loss(), *checked)]
-        loop = self.training.loop
-        stated = (loop.period, loop.substeps, repr(loop.plant), self.gains, self.epochs, self.optimiser, self.engine)
-        digest.update(repr((json.dumps(settings, sort_keys=True), *stated, self.learning_rate, first)).encode())
-        return digest.hexdigest()
+            costs = [float(self.loss()), *([] if self.held_out is None else [float(self.value(self.held_out))])]
+        names = ("epochs", "optimiser", "learning_rate", "gains", "engine", "seed")
+        settings = {name: getattr(self, name) for name in names}
+        stated: dict[str, Any] = statement(self.controller, self.training, self.held_out, costs, **settings)
+        return stated
 
 
 @dataclass(eq=False)
@@ -140,13 +125,15 @@ class Trainer:
         fixed = set() if task.gains else {id(m.change) for m in modules if isinstance(m, Gain)}
         self.parameters = [p for p in task.controller.parameters() if p.requires_grad and id(p) not in fixed]
         if not self.parameters:
-            raise ArgumentError("nothing is left to train without the gains; give gains=True.")
+            raise ArgumentError(
+                f"a {type(task.controller).__name__} has nothing to train besides its gains; train them too."
+            )
         self.optimiser = self._fresh()
         self.first: float | None = None
         with waiting("compiling, once on a machine", progress):
             task.warm_up()
         # Before training, so that a controller that cannot be stored raises now and not at the first save.
-        self.fingerprint = "" if task.checkpoint is None else task.fingerprint()
+        self.statement = {} if task.checkpoint is None else task.statement()
         if resume:
             self._restore()
 
@@ -281,7 +268,7 @@ class Trainer:
         tensors = {f"best.{name}": x for name, x in self.at.best.items()}
         facts = {k: v for k, v in vars(self.at).items() if k != "best"}
         facts["optimiser"] = packed_state(self.optimiser.state_dict(), tensors)
-        facts["fingerprint"] = self.fingerprint
+        facts["statement"] = self.statement
         state, info = TrainingState(tensors, facts), {"seed": self.task.seed}
         write_checkpoint(self.task.checkpoint, self.task.controller, state, info=info)
 
@@ -291,14 +278,16 @@ class Trainer:
             raise ArgumentError("resume was given without a checkpoint; give the file of the training to resume.")
         law = self.task.controller
         saved, state = read_checkpoint(path, law.dynamics.robot if isinstance(law, ModelLaw) else None)
-        if state is None or state.facts["fingerprint"] != self.fingerprint:
+        other = "it holds none" if state is None else difference(state.facts.get("statement"), self.statement)
+        if state is None or other:
             raise ArgumentError(
-                f"{path} is not a checkpoint of this training; give its original settings, or start a new training."
+                f"{path} is not a checkpoint of this training, as {other}; give its original settings, or start a new "
+                "training."
             )
         self.task.controller.load_state_dict(saved.state_dict())
         facts = dict(state.facts)
         self.optimiser.load_state_dict(unpacked_state(facts.pop("optimiser"), state.tensors))
-        del facts["fingerprint"]
+        del facts["statement"]
         best = {k.removeprefix("best."): x for k, x in state.tensors.items() if k.startswith("best.")}
         self.at = _Progress(**facts, best=best)
 
