@@ -20,6 +20,7 @@ from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError, RobotError
 from nbs_pin.base.storable import storable
 from nbs_pin.robots.catalogue import find
+from nbs_pin.robots.kinematics import Kinematics
 from nbs_pin.robots.mass_matrix import weak_joints
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
 from nbs_pin.robots.urdf_checks import lock_too
@@ -28,7 +29,7 @@ from nbs_pin.robots.urdf_options import UrdfOptions, read_options
 
 @storable(("name", "source", "options", "sha256", "effort_limit"))
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot:
+class Robot(Kinematics):
     """A fixed-base arm with nq = nv = n joints, as returned by `load_robot`.
 
     A `continuous` joint is an unbounded revolute joint whose tracking error is wrapped (`difference`); locked joints
