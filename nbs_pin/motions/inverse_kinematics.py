@@ -19,6 +19,7 @@ import pinocchio as pin
 from jaxtyping import Bool, Float
 
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.robots.robot import Robot
 
@@ -96,7 +97,9 @@ class InverseKinematics:
         joints = int(self.moving.sum())
         if joints < max(rank, 1):
             what = "position and orientation" if self.hold else "position"
-            remedy = "let the orientation free (orientation='free')" if self.hold else "give another frame"
+            remedy = (
+                f"let the orientation free ({option('orientation', 'free')})" if self.hold else "give another frame"
+            )
             raise ArgumentError(
                 f"{joints} joints of {self.robot.name} move '{self.frame}', whose {what} varies in {max(rank, 1)} "
                 f"directions, so that it cannot follow a path; {remedy}."

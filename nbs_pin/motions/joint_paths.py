@@ -50,17 +50,17 @@ class JointPath:
         return np.asarray(np.abs(self.spline.derivative(order).c).max(axis=0))
 
 
-def joint_path(inverse: InverseKinematics, path: ToolPath, start: JointArray) -> JointPath:
-    """The joints along the path, from the configuration nearest to `start` that begins it.
+def joint_path(inverse: InverseKinematics, path: ToolPath) -> JointPath:
+    """The joints along the path, from the configuration nearest to the posture that begins it.
 
-    The orientation of the frame at `start` is kept where the path states none.
+    The orientation of the frame in the posture is kept where the path states none.
 
     Raises:
         ArgumentError: At the first point that is out of reach, singular, beyond a joint limit or not smooth.
     """
-    orientation = inverse.robot.pose(start, inverse.frame)[:3, :3]
+    orientation = inverse.robot.pose(inverse.posture, inverse.frame)[:3, :3]
     s = np.linspace(0.0, 1.0, _FIRST + 1)
-    q = _first_nodes(inverse, path, orientation, s, start)
+    q = _first_nodes(inverse, path, orientation, s)
     while True:
         _check_nodes(inverse, path, orientation, s, q)
         spline = make_interp_spline(s, q, k=5, axis=0)
@@ -84,14 +84,10 @@ def joint_path(inverse: InverseKinematics, path: ToolPath, start: JointArray) ->
 
 
 def _first_nodes(
-    inverse: InverseKinematics,
-    path: ToolPath,
-    orientation: Float[np.ndarray, "3 3"],
-    s: Float[np.ndarray, " nodes"],
-    start: JointArray,
+    inverse: InverseKinematics, path: ToolPath, orientation: Float[np.ndarray, "3 3"], s: Float[np.ndarray, " nodes"]
 ) -> Float[np.ndarray, "nodes n"]:
     """Configurations along the path, each from those before it."""
-    nodes = [_met(inverse, path, orientation, s[0], start)]
+    nodes = [_met(inverse, path, orientation, s[0], inverse.posture)]
     for k in range(1, len(s)):
         guess = nodes[-1] if k == 1 else 2.0 * nodes[-1] - nodes[-2]
         found = inverse.solve(guess, path.poses(s[k], orientation))

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -16,21 +16,6 @@ class Along(NamedTuple):
     """ṡ [1/s]."""
     dds: Float[np.ndarray, "*batch"]
     """s̈ [1/s²]."""
-
-
-class Timing(Protocol):
-    """s(t) of a path."""
-
-    @property
-    def duration(self) -> float:
-        """Time at which s reaches 1 [s]."""
-
-    @property
-    def largest(self) -> tuple[float, float, float]:
-        """Bounds of |ṡ|, |s̈| and |s⃛|, inf where s̈ jumps."""
-
-    def __call__(self, t: Float[np.ndarray, "*batch"]) -> Along:
-        """Where the path is at t [s]."""
 
 
 @dataclass(frozen=True)
@@ -112,3 +97,7 @@ class Stepped:
         s = np.clip(self.grid[k] + late * (start + 0.5 * bend * late), self.grid[k], self.grid[k + 1])
         ds = np.maximum(start + bend * late, 0.0)
         return Along(np.where(t >= self.duration, 1.0, s), np.where(inside, ds, 0.0), np.where(inside, bend, 0.0))
+
+
+Timing: TypeAlias = Smooth | Even | Stepped
+"""s(t) of a path, with its duration [s] and bounds of |ṡ|, |s̈| and |s⃛| (`largest`)."""

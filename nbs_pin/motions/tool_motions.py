@@ -9,7 +9,7 @@ from jaxtyping import Float
 from nbs_pin.base.arguments import DURATION, a, checked, flag, joints, maybe, text
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, vector_of
-from nbs_pin.base.doors import option
+from nbs_pin.base.doors import argument, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.units import units
@@ -39,7 +39,7 @@ class ToolMotion:
     joints: JointPath
     timing: Timing
     orientation: Float[np.ndarray, "3 3"]
-    """Orientation of the frame where it begins."""
+    """Orientation where the path states none: that of the posture."""
     held: bool
     """Whether the orientation is that of the path, or of the beginning; otherwise it is free."""
 
@@ -49,6 +49,11 @@ class ToolMotion:
         return float(self.timing.duration)
 
     @property
+    def rests(self) -> bool:
+        """Whether it ends at rest; one with the times of its path may not."""
+        return not isinstance(self.timing, Even)
+
+    @property
     def largest_jerk(self) -> JointArray:
         """Bound of |ȧ_d| of each joint [rad/s³], inf where a jumps: |q'''||ṡ|³ + 3|q''||ṡ||s̈| + |q'||s⃛|."""
         speed, bend, jerk = self.timing.largest
@@ -56,8 +61,8 @@ class ToolMotion:
         return np.asarray(third * speed**3 + 3.0 * second * speed * bend + first * jerk)
 
     @property
-    def info(self) -> dict[str, Any]:
-        """What a run of it notes: the frame and whether its orientation counts."""
+    def notes(self) -> dict[str, Any]:
+        """What a run of it keeps in `info`: the frame, whether its orientation counts, and the path by name."""
         return {"tool": {"frame": self.frame, "orientation": "hold" if self.held else "free", "path": self.path.name}}
 
     def pose(self, t: Any) -> Float[np.ndarray, "*batch 4 4"]:
@@ -87,7 +92,7 @@ def tool_motion(
     path: ToolPath,
     frame: str | None = None,
     *,
-    start: Any = None,
+    posture: Any = None,
     orientation: str | None = None,
     duration: float | None = None,
     fastest: bool = False,
@@ -102,9 +107,9 @@ def tool_motion(
         robot: The arm.
         path: The path, as `ToolPath.circle`, `line`, `through` or `load_tool_path` make it.
         frame: A link or joint (`Robot.frames`); None takes the link at the end of the arm.
-        start: Configuration (n,) [rad] near which the path begins and that a redundant arm keeps to; None takes
+        posture: Configuration (n,) [rad] near which the path begins and that a redundant arm keeps to; None takes
             `tool_posture`. Its orientation is held if the path states none.
-        orientation: "hold" for the orientation of the path, or of the start, throughout; "free" for positions alone.
+        orientation: "hold" for the orientation of the path, or of the posture, throughout; "free" for positions alone.
             None holds it if six joints or more move the frame.
         duration: Time from rest to rest [s]. None takes the times of the path, or 5 s if it has none.
         fastest: Take the least time that the velocity and effort limits of the arm allow instead.
@@ -118,19 +123,19 @@ def tool_motion(
     Example:
         >>> import nbs_pin as nbs
         >>> robot = nbs.load_robot("panda")
-        >>> start = nbs.tool_posture(robot, "panda_hand")
-        >>> circle = nbs.ToolPath.circle(robot.pose(start, "panda_hand")[:3, 3], radius=0.1)
-        >>> motion = nbs.tool_motion(robot, circle, "panda_hand", start=start, duration=5.0)
+        >>> posture = nbs.tool_posture(robot, "panda_hand")
+        >>> circle = nbs.ToolPath.circle(robot.pose(posture, "panda_hand")[:3, 3], radius=0.1)
+        >>> motion = nbs.tool_motion(robot, circle, "panda_hand", posture=posture, duration=5.0)
         >>> bool(abs(robot.pose(motion(2.5).q, "panda_hand") - motion.pose(2.5)).max() < 1e-7)
         True
     """
     frame = last_frame(robot) if frame is None else frame
     held = is_held(robot, frame, orientation)
-    if start is None:
-        start = tool_posture(robot, frame, orientation="hold" if held else "free")
-    start = vector_of("tool_motion: start", start, robot.nv, "rad")
+    if posture is None:
+        posture = tool_posture(robot, frame, orientation="hold" if held else "free")
+    posture = vector_of(argument("tool_motion", "posture"), posture, robot.nv, "rad")
     limited = robot if margins is None else margins.of(robot)
-    along = joint_path(InverseKinematics(limited, frame, start, held), path, start)
+    along = joint_path(InverseKinematics(limited, frame, posture, held), path)
     if fastest:
         from nbs_pin.motions.least_time import least_time
 
@@ -139,7 +144,7 @@ def tool_motion(
         timing = Even(path.duration)
     else:
         timing = Smooth(DURATION_OF_PATH if duration is None else duration)
-    motion = ToolMotion(frame, path, along, timing, robot.pose(start, frame)[:3, :3], held)
+    motion = ToolMotion(frame, path, along, timing, robot.pose(posture, frame)[:3, :3], held)
     if not fastest:
         _check_speed(limited, motion)
         check_reference(motion, limited, motion.duration)

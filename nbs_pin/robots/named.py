@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Run
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.robots.xacro_source import refusing
 
@@ -30,3 +31,16 @@ def load_named(where: str, source: str, options: Mapping[str, Any]) -> Robot:
     )
     with refusing(because):
         return load_robot(source, **options)
+
+
+def robot_of(run: Run) -> Robot:
+    """The robot that the run names; raises ArgumentError unless it is still the one that ran."""
+    if not run.robot:
+        raise ArgumentError("the run names no robot: give it as replay(run, path, robot=load_robot(…)).")
+    robot = load_named("the run", run.robot, run.robot_options)
+    if robot.sha256 != run.robot_sha256:
+        raise ArgumentError(
+            f"'{run.robot}' is not the arm that ran (description or gravity differ: {robot.sha256[:12]} now, "
+            f"{run.robot_sha256[:12] or 'nothing'} in the run): give the robot that ran as robot=…."
+        )
+    return robot
