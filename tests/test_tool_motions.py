@@ -130,9 +130,8 @@ def test_a_position_alone_leaves_the_orientation_free():
 @pytest.mark.parametrize("name", ["panda", "xarm7"])
 def test_a_redundant_arm_takes_the_configuration_nearest_to_its_posture(name):
     """No move within the null space of the frame comes nearer, by the function that the module states."""
-    robot, posture, _ = begun(name, None)
-    frame = nbs.tool_motion(robot, nbs.ToolPath.line(robot.pose(posture, robot.frames[-1])[:3, 3], [0, 0.01, 0]),
-                            robot.frames[-1], posture=posture).frame  # fmt: skip
+    frame = last_frame(nbs.load_robot(name))
+    robot, posture, _ = begun(name, frame)
     inverse = InverseKinematics(robot, frame, posture, True)
     pose = robot.pose(posture, frame)
     pose[:3, 3] += [-0.1, 0.1, 0.05]
@@ -232,7 +231,7 @@ def test_the_stated_jerk_bounds_the_jerk():
     _, motion = circle("ur5", "tool0", duration=3.0)
     t = np.linspace(0.0, 3.0, 20001)
     jerk = np.abs(np.diff(motion(t).a, axis=0)).max(axis=0) / (t[1] - t[0])
-    assert (jerk <= motion.largest_jerk * (1 + 1e-6)).all()
+    assert (jerk <= motion.largest_jerk + 1e-6).all()  # differences of a are rounded
     assert (motion.largest_jerk < 10.0 * jerk.max()).all()
 
 

@@ -15,7 +15,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.units import units
-from nbs_pin.motions.inverse_kinematics import InverseKinematics, Solution, pose_error
+from nbs_pin.motions.inverse_kinematics import InverseKinematics, pose_error
 from nbs_pin.motions.tool_paths import ToolPath
 
 FINE = 1e-8
@@ -101,10 +101,9 @@ def _met(
     inverse: InverseKinematics, path: ToolPath, orientation: Float[np.ndarray, "3 3"], s: float, guess: JointArray
 ) -> JointArray:
     """The configuration at s; raises ArgumentError if there is none near the guess."""
-    pose = path.poses(np.array(s), orientation)
-    found = inverse.solve(guess, pose)
+    found = inverse.solve(guess, path.poses(np.array(s), orientation))
     if not found.exact:
-        _refuse(inverse, path, pose, float(s), inverse.solution(inverse.approach(guess, pose), pose))
+        _refuse(inverse, path, orientation, (float(s), float(s)), guess)
     return found.q
 
 
@@ -121,26 +120,27 @@ def _refuse_first(
         middle = 0.5 * (met + lost)
         found = inverse.refine(q, path.poses(np.array(middle), orientation))
         met, lost, q = (middle, lost, found.q) if found.exact else (met, middle, q)
-    pose = path.poses(np.array(span[1]), orientation)
-    _refuse(inverse, path, pose, lost, inverse.solution(inverse.approach(q, pose), pose), span[1])
+    _refuse(inverse, path, orientation, (lost, span[1]), q)
 
 
 def _refuse(
     inverse: InverseKinematics,
     path: ToolPath,
-    pose: Float[np.ndarray, "4 4"],
-    s: float,
-    nearest: Solution,
-    seen: float | None = None,
+    orientation: Float[np.ndarray, "3 3"],
+    span: tuple[float, float],
+    q: JointArray,
 ) -> NoReturn:
-    """Raise ArgumentError at s, with what is missed there, or at the point `seen` a little later."""
+    """Raise ArgumentError at the beginning of the span, with what the frame misses at its end."""
+    first, then = span
+    pose = path.poses(np.array(then), orientation)
+    nearest = inverse.solution(inverse.approach(q, pose), pose)
+    there = "there" if first == then else f"at {path.travelled(then):.4g} m"
     turned = f" and {nearest.turned:.3g} rad" if inverse.hold else ""
-    later = "there" if seen is None else f"at {path.travelled(seen):.4g} m"
     free = f", or let the orientation free ({option('orientation', 'free')})" if inverse.hold else ""
     raise ArgumentError(
-        f"{_place(path, s, pose)} is out of reach of '{inverse.frame}', which misses it {later} by "
-        f"{1e3 * nearest.missed:.3g} mm{turned} (smallest singular value {inverse.steadiness(nearest.q):.2g}); "
-        f"make the path smaller, begin elsewhere{free}."
+        f"{_place(path, first, path.poses(np.array(first), orientation))} is out of reach of '{inverse.frame}', which "
+        f"misses it {there} by {1e3 * nearest.missed:.3g} mm{turned} (smallest singular value "
+        f"{inverse.steadiness(nearest.q):.2g}); make the path smaller, begin elsewhere{free}."
     )
 
 

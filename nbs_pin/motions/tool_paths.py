@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from nbs_pin.base.arguments import checked, either, maybe, number, numbers
 from nbs_pin.base.checks import told
+from nbs_pin.base.doors import argument
 from nbs_pin.base.exceptions import ArgumentError
 
 _PLANES = {"xy": (0.0, 0.0, 1.0), "xz": (0.0, -1.0, 0.0), "yz": (1.0, 0.0, 0.0)}
@@ -29,7 +30,7 @@ def _plane(name: str, value: Any) -> np.ndarray:
     """The normal of a plane, which is named or given by it."""
     if isinstance(value, str):
         if value not in _PLANES:
-            raise ArgumentError(f"{name} '{value:.40}' is unknown; give one of {', '.join(_PLANES)}, or a normal.")
+            raise ArgumentError(f"{name} '{value:.40}' is unknown; give one of {', '.join(_PLANES)}, or its normal.")
         return np.array(_PLANES[value])
     normal = numbers(3)(name, value)
     if not np.linalg.norm(normal) > _RIGHT_ANGLE:
@@ -75,7 +76,7 @@ class ToolPath:
         return poses
 
     @classmethod
-    @checked(start=_POINT, radius=number(above=0.0, most=1e3, unit="m"), plane=_plane)
+    @checked(start=_POINT, radius=number(above=0.0, most=1e3, unit="m"))
     def circle(cls, start: Any, radius: float, plane: Any = "xy") -> "ToolPath":
         """A full circle of that radius [m] that begins and ends at the point `start` (3,) [m], counterclockwise.
 
@@ -87,12 +88,13 @@ class ToolPath:
             >>> nbs.ToolPath.circle([0.5, 0.0, 0.4], 0.1).curve(0.5).round(12)
             array([0.3, 0. , 0.4])
         """
-        outward = start - (start @ plane) * plane
+        normal = _plane(argument("ToolPath.circle", "plane"), plane)
+        outward = start - (start @ normal) * normal
         if np.linalg.norm(outward) < _RIGHT_ANGLE:  # on the axis through the base: any direction will do
-            outward = np.eye(3)[np.argmin(np.abs(plane))]
-            outward = outward - (outward @ plane) * plane
+            outward = np.eye(3)[np.argmin(np.abs(normal))]
+            outward = outward - (outward @ normal) * normal
         first = radius * outward / np.linalg.norm(outward)
-        second, centre = np.cross(plane, first), start - first
+        second, centre = np.cross(normal, first), start - first
 
         def curve(s: np.ndarray) -> np.ndarray:
             angle = 2.0 * np.pi * np.asarray(s)[..., None]
