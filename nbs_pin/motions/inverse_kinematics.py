@@ -4,9 +4,9 @@ Of the configurations that put the frame where it is wanted, the one is taken th
 
     minimise  h(q) = Σ_i ½x_i² + c(y_i) − c(y_i⁰) − c'(y_i⁰)(y_i − y_i⁰)   with   pose(q) = pose wanted,
 
-where x = (q − q₀)/w and y = (q − middle)/w for joints of half range w, and c(y) = 12·y¹², so that a redundant arm keeps
-away from its stops. h is 0 at q₀ alone. The solution depends on the pose, not on the way to it: a closed path closes in
-the joints too, and a smooth path gives smooth joints.
+where x = (q − q₀)/min(w, π) and y = (q − middle)/w for joints of half range w, and c(y) = y¹², or 0 for a joint without
+limits, so that a redundant arm keeps away from its stops. h is 0 at q₀ alone. The solution depends on the pose, not on
+the way to it: a closed path closes in the joints too, and a smooth path gives smooth joints.
 """
 
 import warnings
@@ -23,7 +23,8 @@ from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.robots.robot import Robot
 
-_STEEP, _POWER = 12.0, 12
+_POWER = 12
+"""Of the function that keeps a redundant arm from its stops."""
 _POSTURE_COST = 1e-3
 """Weight of the posture for pink, where the frame's has 1 per metre and radian."""
 _PINK_STEPS, _NEWTON_STEPS = 60, 30
@@ -194,9 +195,10 @@ class InverseKinematics:
         """Gradient of h and the diagonal of its Hessian."""
         lower, upper = self.robot.sampling_range
         middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-        y, start = (q - middle) / half, (self.posture - middle) / half
-        slope = _STEEP * (y ** (_POWER - 1) - start ** (_POWER - 1)) / half
-        bend = _STEEP * (_POWER - 1) * y ** (_POWER - 2) / half**2
+        limited = np.isfinite(self.robot.upper - self.robot.lower)
+        y, start = (np.where(limited, (x - middle) / half, 0.0) for x in (q, self.posture))
+        slope = _POWER * (y ** (_POWER - 1) - start ** (_POWER - 1)) / half
+        bend = _POWER * (_POWER - 1) * y ** (_POWER - 2) / half**2
         return (q - self.posture) / self._half**2 + slope, 1.0 / self._half**2 + bend
 
     def _curvature(

@@ -74,7 +74,7 @@ def joint_path(inverse: InverseKinematics, path: ToolPath) -> JointPath:
         if len(s) > _MOST:
             at = float(between[np.argmax(worst)])
             raise ArgumentError(
-                f"{_place(path, at, path.poses(np.array(at), orientation))}: the joints cannot follow the bend there "
+                f"{_place(path, at, path.poses(np.array(at), orientation))} bends more sharply than the joints follow "
                 f"(a spline through {len(s)} points misses it by {worst.max():.2g} m or rad); smooth the path."
             )
         middle = 0.5 * (s[1:] + s[:-1])

@@ -9,13 +9,14 @@ from jaxtyping import Float
 from nbs_pin.base.arguments import DURATION, a, checked, flag, joints, maybe, text
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, vector_of
-from nbs_pin.base.doors import argument, option
+from nbs_pin.base.doors import BLANK, argument, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.units import units
 from nbs_pin.motions.inverse_kinematics import InverseKinematics
 from nbs_pin.motions.joint_paths import JointPath, joint_path
 from nbs_pin.motions.limits import Margins
+from nbs_pin.motions.reference_files import PLAUSIBLE_JUMP
 from nbs_pin.motions.references import check_reference, instants
 from nbs_pin.motions.timings import Even, Smooth, Timing
 from nbs_pin.motions.tool_paths import ToolPath
@@ -147,6 +148,7 @@ def tool_motion(
     motion = ToolMotion(frame, path, along, timing, robot.pose(posture, frame)[:3, :3], held)
     if not fastest:
         _check_speed(limited, motion)
+        _check_ends(limited, motion)
         check_reference(motion, limited, motion.duration)
     return motion
 
@@ -166,3 +168,16 @@ def _check_speed(robot: Robot, motion: ToolMotion) -> None:
         f"{t[k]:.4g} s, {share[k, i] - 1.0:.0%} above its limit {robot.velocity_limit[i]:.4g} {unit}; give at least "
         f"{option('duration', slower)} s."
     )
+
+
+def _check_ends(robot: Robot, motion: ToolMotion) -> None:
+    """Raise ArgumentError if a path with times begins or ends in motion, as the arm rests before and after."""
+    for t, what in ((0.0, "begins"), (motion.duration, "ends")):
+        v = np.abs(motion(t).v)
+        i = int(np.argmax(v))
+        if v[i] > PLAUSIBLE_JUMP:
+            unit = units("velocity", robot.prismatic)[i]
+            raise ArgumentError(
+                f"the {motion.path.name} {what} with the velocity {v[i]:.3g} {unit} of joint '{robot.joint_names[i]}', "
+                f"where the arm rests; add points at rest there, or give {option('duration', BLANK)}."
+            )
