@@ -21,7 +21,7 @@ from nbs_pin.commands import certify as certifying
 from nbs_pin.reproduction import certificate_poses, certificate_study
 from nbs_pin.robots.catalogue import find
 
-LOADS = ("--payload", "0.5", "--friction", "0.1,0.2", "--gravity-error", "0.2")
+LOADS = ("--unknown-payload", "0.5", "--friction", "0.1,0.2", "--gravity-error", "0.2")
 GANTRY = Path(__file__).parent / "data" / "gantry.urdf"
 PNG = b"\x89PNG"
 
@@ -269,17 +269,17 @@ def test_results_of_another_certificate_are_kept(certified, capsys):
         ("two_link --disturbance -1", "--disturbance is '-1'"),
         ("two_link --disturbance 1,2,3", "3 torques were given for 2 joints"),
         ("two_link --disturbance 1,2 --norm", "a norm is one number"),
-        ("two_link --norm --payload 1", "--norm needs --disturbance"),
-        ("two_link --disturbance 5 --link tip", "--link needs --payload"),
-        ("two_link --disturbance 5 --margin 2", "--margin needs one of --payload, --gravity"),
+        ("two_link --norm --unknown-payload 1", "--norm needs --disturbance"),
+        ("two_link --disturbance 5 --link tip", "--link needs --unknown-payload"),
+        ("two_link --disturbance 5 --margin 2", "--margin needs one of --unknown-payload, --gravity"),
         ("two_link --disturbance 5 --trajectories 9", "--trajectories applies to a model that is not exact"),
-        ("two_link --payload 0", "--payload is '0'"),
+        ("two_link --unknown-payload 0", "--unknown-payload is '0'"),
         ("two_link --inertia-within 5", "give a percentage above 0 % and below 100 %"),
         ("two_link --inertia-within 5% --wanted 0.1", "--inertia-within is for the law's own model"),
         ("two_link --delay 0.001 --wanted 0.1", "--delay and --encoder-bits are no part of a design"),
         ("two_link --disturbance 5 --delay 0.002", "delay is 0.002 s, expected 0 to the period of 0.001 s"),
         ("two_link --encoder-bits 0", "give a whole number from 1 to 64"),
-        ("two_link --payload 1 --link moon", "no moving link 'moon'"),
+        ("two_link --unknown-payload 1 --link moon", "no moving link 'moon'"),
         ("two_link --friction urdf", "--friction is 'urdf'"),
         ("two_link --friction 1", "--friction is '1'"),
         ("two_link --friction 0.1,0.2", "no disturbance was given; give --disturbance"),

@@ -122,7 +122,7 @@ def test_the_dynamics_are_those_of_the_file(robot):
     Locked joints are removed by Pinocchio's own reduction; a continuous joint is (cos q, sin q) there.
     """
     model = pin.buildModelFromUrdf(str(robot.urdf.path))
-    locked = [model.getJointId(name) for name in find(robot.source).lock]
+    locked = [model.getJointId(name) for name in find(robot.source).options.get("lock", ())]
     if locked:
         model = pin.buildReducedModel(model, locked, pin.neutral(model))
     model.gravity.linear = robot.gravity_vector

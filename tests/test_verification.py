@@ -563,10 +563,10 @@ def test_the_robot_that_is_given_must_be_the_one_that_was_certified(panda, tmp_p
     assert found.confirmed
     (held,) = [check for check in found.checks if check.name == "joints held at zero"]
     assert held.status == TAKEN
-    assert all(name in held.because for name in find("panda").lock)
+    assert all(name in held.because for name in find("panda").options["lock"])
     for robot, words in (
         (
-            nbs.load_robot("panda", lock=(*find("panda").lock, "panda_joint7")),
+            nbs.load_robot("panda", lock=(*find("panda").options["lock"], "panda_joint7")),
             r"that move are .* same joints locked\.$",
         ),
         (nbs.load_robot("panda", gravity=[0.0, 0.0, 9.81]), r"with the sha256 .*, with its gravity\.$"),

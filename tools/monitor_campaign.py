@@ -13,13 +13,11 @@ begins at `BEGINS`; what is named, and after how long, is printed. With any fals
 import argparse
 import collections
 import sys
-import tempfile
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +28,6 @@ from nbs_pin.certificates.attack import random_disturbances
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.online_monitor import Watched
 from nbs_pin.identification.measurement import quantised
-from nbs_pin.robots.catalogue import find
 
 ARMS = ("two_link", "ur5", "panda", "kinova")
 PERIOD, BEGINS, SOON = 0.001, 0.5, 0.2
@@ -38,9 +35,6 @@ PERIOD, BEGINS, SOON = 0.001, 0.5, 0.2
 BOX, QUIET = {"two_link": 0.5, "ur5": 0.5, "panda": 0.5, "kinova": 0.1}, 0.2
 """Bound of the disturbance of every joint [N·m], below what 0.2 kg weighs on the arm, and the share of it that acts
 beside a fault: a disturbance that fills its box can hide a fault of up to twice the bound."""
-LOAD = """<robot><link name="nbs_load"><inertial><mass value="{mass}"/><inertia ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0"
- ixz="0" iyz="0"/></inertial></link><joint name="nbs_load_joint" type="fixed"><parent link="{tip}"/>
- <child link="nbs_load"/><origin xyz="0 0 0.05"/></joint></robot>"""
 
 
 @dataclass
@@ -125,14 +119,9 @@ def plant(name: str) -> nbs.Plant:
 @cache
 def loaded(name: str, mass: float) -> nbs.Plant:
     """The arm with a mass [kg] at its last link that its model does not have."""
-    entry, robot = find(name), arm(name)
-    tree = ET.parse(entry.path)
-    tip = tree.getroot().find(f"joint[@name='{robot.joint_names[-1]}']/child").get("link")
-    tree.getroot().extend(ET.fromstring(LOAD.format(mass=mass, tip=tip)))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{name}.urdf"
-        tree.write(path)
-        return nbs.MujocoPlant(nbs.load_robot(path, lock=entry.lock, gravity=robot.gravity_vector))
+    tree, last = ET.fromstring(arm(name).urdf.xml), arm(name).joint_names[-1]
+    tip = tree.find(f"joint[@name='{last}']/child").get("link")
+    return nbs.MujocoPlant(arm(name).with_payload(tip, mass, (0.0, 0.0, 0.05), 1e-5))
 
 
 @cache

@@ -174,7 +174,7 @@ def disturbance_of(robot: Robot, task: Task) -> Admissible:
     if not (given or loads) and task.uncertainty is not None:
         return Admissible.of(np.zeros(robot.nv), robot.nv)
     if not (given or loads):
-        raise ArgumentError("no disturbance was given; give --disturbance, --payload or --gravity-error.")
+        raise ArgumentError("no disturbance was given; give --disturbance, --unknown-payload or --gravity-error.")
     return total(*given, *loads)
 
 

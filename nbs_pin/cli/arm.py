@@ -61,12 +61,71 @@ def _read_gravity(words: str) -> float | list[float]:
     return values if len(values) == 3 else values[0]
 
 
+def _read_by_joint(flag: str) -> Callable[[str], dict[str, float]]:
+    """A reader of one number for every joint, or of numbers by joint."""
+
+    def read(words: str) -> dict[str, float]:
+        found: dict[str, float] = {}
+        for word in words.split(","):
+            joint, stated, number = word.rpartition("=")
+            value = plain_number(number)
+            if value is None or value < 0.0 or bool(joint) != bool(stated) or (not joint and "," in words):
+                raise OptionError(
+                    f"{flag} is '{words}'; give one number at least 0 for every joint, or JOINT=NUMBER for some: "
+                    f"{flag} shoulder=0.2,elbow=0.1."
+                )
+            found[joint or "*"] = value
+        return found
+
+    return read
+
+
+def _read_payload(words: str) -> tuple[str, dict[str, Any]]:
+    """The link and the load of MASS, MASS@LINK or MASS@LINK:X,Y,Z."""
+    mass, _, where = words.partition("@")
+    link, _, at = where.partition(":")
+    kilograms, com = plain_number(mass), plain_numbers(at) if at else [0.0, 0.0, 0.0]
+    if kilograms is None or kilograms <= 0.0 or com is None or len(com) != 3:
+        raise OptionError(
+            f"--payload is '{words}'; give MASS [kg], MASS@LINK, or with its centre of mass in the frame of the link "
+            "[m]: --payload 2@flange:0,0,0.05."
+        )
+    return link, {"mass": kilograms, "com": com}
+
+
+def _read_tool(words: str) -> dict[str, Any]:
+    """The file and the link of FILE or FILE@LINK."""
+    file, _, link = words.rpartition("@") if "@" in words else (words, "", "")
+    if not file:
+        raise OptionError(f"--tool is '{words}'; give FILE or FILE@LINK: --tool gripper.urdf@flange.")
+    return {"file": file, "frame": link}
+
+
+def _read_three(flag: str) -> Callable[[str], list[float]]:
+    def read(words: str) -> list[float]:
+        values = plain_numbers(words)
+        if values is None or len(values) != 3:
+            raise OptionError(f"{flag} is '{words}'; give three numbers: {flag}=3.1416,0,0.")
+        return values
+
+    return read
+
+
+_FLAGS_BY_JOINT = ("armature", "rotor-inertia", "viscous-friction", "coulomb-friction")
+_READ_BY_JOINT = {flag: _read_by_joint(f"--{flag}") for flag in _FLAGS_BY_JOINT}
+_READ_RPY, _READ_XYZ = _read_three("--base-rpy"), _read_three("--base-xyz")
+
+
 def _checked(read: Callable[[str], Any]) -> Callable[[list[str]], str]:
     def parse(words: list[str]) -> str:
         read(words[0])
         return words[0]
 
     return parse
+
+
+def _by_joint(flag: str) -> Any:
+    return text("X or J1=X,…", _checked(_READ_BY_JOINT[flag]))
 
 
 @dataclass(frozen=True)
@@ -97,7 +156,27 @@ class ArmOptions:
     gravity: Annotated[str | None, text("G or X,Y,Z", _checked(_read_gravity)), default("9.81, or the arm's own")] = (
         None
     )
-    """Gravity [m/s²], downward or as a vector in the base frame: --gravity=0,0,9.81 for an arm on the ceiling."""
+    """Gravity [m/s²], downward or as a vector in the frame of the world: --gravity 1.62 on the moon."""
+
+    armature: Annotated[str | None, _by_joint("armature"), default("the file's")] = None
+    """Rotor inertia as the joints feel it [kg·m², kg]: --armature 0.1, or --armature shoulder=0.2,elbow=0.1."""
+    rotor_inertia: Annotated[str | None, _by_joint("rotor-inertia"), default("the file's")] = None
+    """Inertia of the rotors themselves [kg·m²]; joints feel it times the squared reduction of their transmission."""
+    viscous_friction: Annotated[str | None, _by_joint("viscous-friction"), default("the file's")] = None
+    """Viscous joint friction [N·m·s/rad, N·s/m], of every joint or by joint."""
+    coulomb_friction: Annotated[str | None, _by_joint("coulomb-friction"), default("the file's")] = None
+    """Coulomb joint friction [N·m, N], of every joint or by joint."""
+    payload: tyro.conf.UseAppendAction[
+        tuple[Annotated[str, text("MASS@LINK:X,Y,Z", _checked(_read_payload))], ...]
+    ] = ()
+    """Load [kg] at a link, with its centre of mass in the link's frame [m]: --payload 2@flange:0,0,0.05; no link is the
+    last one, no centre its origin; may be given several times."""
+    tool: Annotated[str | None, text("FILE@LINK", _checked(_read_tool))] = None
+    """Description of a tool to fix to a link, to the last one where none is named: --tool gripper.urdf@flange."""
+    base_rpy: Annotated[str | None, text("R,P,Y", _checked(_READ_RPY))] = None
+    """Roll, pitch and yaw of the base in the world [rad]: --base-rpy=3.1416,0,0 hangs the arm from the ceiling."""
+    base_xyz: Annotated[str | None, text("X,Y,Z", _checked(_READ_XYZ))] = None
+    """Position of the base in the world [m]."""
 
     def refuse_without_arm(self, remedy: str) -> None:
         """Raise OptionError if any of them was given to a command that loads no arm."""
@@ -116,7 +195,14 @@ class ArmOptions:
             "xacro_args": dict(map(_read_argument, self.arg)) or None,
             "package_dirs": list(self.package_dir) or None,
             "gravity": None if self.gravity is None else _read_gravity(self.gravity),
+            "payload": dict(map(_read_payload, self.payload)) or None,
+            "tool": None if self.tool is None else _read_tool(self.tool),
+            "base_rpy": None if self.base_rpy is None else _READ_RPY(self.base_rpy),
+            "base_xyz": None if self.base_xyz is None else _READ_XYZ(self.base_xyz),
         }
+        for flag, read in _READ_BY_JOINT.items():
+            words = getattr(self, flag.replace("-", "_"))
+            given[flag.replace("-", "_")] = None if words is None else read(words)
         return {name: value for name, value in given.items() if value is not None}
 
 

@@ -76,8 +76,10 @@ class Certify(FileUnits):
     """Largest |τ_d,i| [N·m]: one number for all joints, or one per joint, separated by commas."""
     norm: bool = False
     """Take the number of --disturbance as the largest ‖τ_d‖ [N·m]."""
-    payload: Annotated[float | None, number("--payload", above=0.0, most=1e4, unit="kg"), default("none")] = None
-    """Mass that the model does not include [kg], as a disturbance along the reference."""
+    unknown_payload: Annotated[
+        float | None, number("--unknown-payload", above=0.0, most=1e4, unit="kg"), default("none")
+    ] = None
+    """Mass that the model does not include, unlike --payload [kg], as a disturbance along the reference."""
     link: Annotated[str | None, tyro.conf.arg(metavar="LINK"), default("the arm's end")] = None
     """Link that carries the payload."""
     inertia_within: Annotated[float | None, percentage("--inertia-within", below=100.0), default("the model's own")] = (

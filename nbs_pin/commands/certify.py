@@ -112,7 +112,7 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
         duration=duration,
         period=period,
         disturbance=None if numbers is None else box_or_ball(numbers, robot.nv, norm=options.norm),
-        payload=options.payload,
+        payload=options.unknown_payload,
         link=options.link,
         friction=_friction(options.friction, robot),
         gravity_error=options.gravity_error,
@@ -128,15 +128,15 @@ def _task(options: Certify, controller: LyapunovLaw) -> Task:
 
 def _check_options(options: Certify) -> None:
     """Raises OptionError for options that need others which were not given."""
-    loads = {"--payload": options.payload, "--gravity-error": options.gravity_error}
+    loads = {"--unknown-payload": options.unknown_payload, "--gravity-error": options.gravity_error}
     if options.inertia_within is not None and (options.wanted is not None or options.against is not None):
         raise OptionError("--inertia-within is for the law's own model; omit --wanted and --against.")
     if (options.delay or options.encoder_bits is not None) and options.wanted is not None:
         raise OptionError("--delay and --encoder-bits are no part of a design; omit --wanted.")
     if options.norm and options.disturbance is None:
         raise OptionError("--norm needs --disturbance; give both.")
-    if options.link is not None and options.payload is None:
-        raise OptionError("--link needs --payload; give both.")
+    if options.link is not None and options.unknown_payload is None:
+        raise OptionError("--link needs --unknown-payload; give both.")
     if options.margin is not None and all(load is None for load in loads.values()):
         raise OptionError(f"--margin needs one of {', '.join(loads)}; give one too.")
 

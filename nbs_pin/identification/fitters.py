@@ -90,6 +90,7 @@ def fit_rigid_tree(task: FitTask) -> Fitted:
     """Fit a rigid tree of which only the joint tree of the data is known."""
     settings = task.known("rotor_inertia", "transition", "regularisation", "starts", "epsilon", "right_angles")
     names = () if task.robot is None else task.robot.joint_names
+    settings.setdefault("rotor_inertia", task.robot is not None and bool(task.robot.armature.any()))
     found = fit_chain(task.data, task.seed, friction=task.friction, progress=task.progress, **settings)
     network, bodies = found.network, found.bodies
     return Fitted(

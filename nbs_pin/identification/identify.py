@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arguments import checked, flag, number
+from nbs_pin.base.arguments import checked, flag, maybe, number
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.friction import JointFriction
@@ -80,7 +80,7 @@ class IdentificationReport:
     data=DATA,
     robot=ARM,
     friction=flag,
-    rotor_inertia=flag,
+    rotor_inertia=maybe(flag),
     transition=number(above=0.0, unit="rad/s"),
     regularisation=number(least=1e-30, most=1e30, unit="measurements"),
 )
@@ -89,7 +89,7 @@ def identify(
     robot: Robot,
     *,
     friction: bool = False,
-    rotor_inertia: bool = False,
+    rotor_inertia: bool | None = None,
     transition: float = 0.01,
     regularisation: float = 0.3,
 ) -> IdentifiedDynamics:
@@ -104,7 +104,7 @@ def identify(
         data: Samples with torque, at least two equations per base parameter.
         robot: The arm of the data.
         friction: Also find viscous and Coulomb coefficients ≥ 0 of every joint (`IdentifiedDynamics.friction`).
-        rotor_inertia: Also find rotor inertias ≥ 0, which a URDF does not state.
+        rotor_inertia: Also find rotor inertias ≥ 0; None does if the robot has any (`Robot.armature`).
         transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
         regularisation: γ, the number of measurements that the prior is worth: homogeneous balls along the links,
             lighter towards the tip, with masses that give torques of the recorded size; it matters if data are scarce.
@@ -122,6 +122,7 @@ def identify(
         (6, 6, ())
     """
     _check_arm(data, robot)
+    rotor_inertia = bool(robot.armature.any()) if rotor_inertia is None else rotor_inertia
     scalars = Scalars(friction, rotor_inertia, transition)
     fault = sign_fault(data, robot)
     if fault:
@@ -187,7 +188,8 @@ def sign_fault(data: Dataset, robot: Robot) -> str:
     at fault if a tenth or less remains.
     """
     some = data.take(np.sort(np.random.default_rng(0).permutation(len(data))[:_SOME]))
-    geometry, scalars = RobotGeometry(robot), Scalars(friction=True, rotor_inertia=False, transition=0.01)
+    geometry, rotors = RobotGeometry(robot), bool(robot.armature.any())
+    scalars = Scalars(friction=True, rotor_inertia=rotors, transition=0.01)
     triangles = joint_triangles(geometry, some, scalars)
     equations = expectation(geometry, some, scalars, triangles).in_units(triangles)
     size, n = torque_size(equations, len(some)), data.nv

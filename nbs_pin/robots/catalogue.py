@@ -2,11 +2,13 @@
 
 import difflib
 import importlib.metadata
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from nbs_pin.base.exceptions import RobotError, RobotNotFound
-from nbs_pin.robots.urdf_options import ZeroLimits
+from nbs_pin.robots.arm_file import read_arm_file
 
 
 @dataclass(frozen=True)
@@ -14,28 +16,31 @@ class Entry:
     """The file of an arm and the settings to load it with."""
 
     name: str
+    """The catalogue's name, empty for a file."""
     path: Path
-    lock: tuple[str, ...] = ()
-    gravity: float = 9.81
-    zero_limits: ZeroLimits = "refuse"
+    """The description."""
+    source: Path
+    """The file that was given: the description, or the `.toml` file that names it."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of `load_robot` where none are given."""
 
 
 _BUNDLED = {"two_link": 9.8, "three_link": 9.81}
 _FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
-_EXAMPLES: dict[str, tuple[str, tuple[str, ...], ZeroLimits]] = {
-    "panda": ("panda_description/urdf/panda.urdf", _FINGERS, "refuse"),
-    "ur3": ("ur_description/urdf/ur3_robot.urdf", (), "refuse"),
-    "ur5": ("ur_description/urdf/ur5_robot.urdf", (), "refuse"),
-    "ur10": ("ur_description/urdf/ur10_robot.urdf", (), "refuse"),
-    "xarm7": ("xarm_description/urdf/xarm7.urdf", (), "refuse"),
-    "z1": ("z1_description/urdf/z1.urdf", (), "refuse"),
-    "kinova": ("kinova_description/robots/kinova.urdf", (), "refuse"),
-    "so100": ("so_arm_description/urdf/so100.urdf", (), "refuse"),
-    "so101": ("so_arm_description/urdf/so101.urdf", (), "refuse"),
-    "talos_left_arm": ("talos_data/robots/talos_left_arm.urdf", (), "refuse"),
-    "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", (), "unlimited"),
+_EXAMPLES: dict[str, tuple[str, Mapping[str, Any]]] = {
+    "panda": ("panda_description/urdf/panda.urdf", {"lock": _FINGERS}),
+    "ur3": ("ur_description/urdf/ur3_robot.urdf", {}),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", {}),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", {}),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", {}),
+    "z1": ("z1_description/urdf/z1.urdf", {}),
+    "kinova": ("kinova_description/robots/kinova.urdf", {}),
+    "so100": ("so_arm_description/urdf/so100.urdf", {}),
+    "so101": ("so_arm_description/urdf/so101.urdf", {}),
+    "talos_left_arm": ("talos_data/robots/talos_left_arm.urdf", {}),
+    "double_pendulum": ("double_pendulum_description/urdf/double_pendulum.urdf", {"zero_limits": "unlimited"}),
 }
-_SUFFIXES = (".urdf", ".xacro")
+_SUFFIXES = (".urdf", ".xacro", ".toml")
 ROBOT_NAMES: tuple[str, ...] = (*_BUNDLED, *_EXAMPLES)
 """Names of all arms that `load_robot` knows."""
 
@@ -54,11 +59,12 @@ def find(name_or_path: str) -> Entry:
     if name_or_path in _BUNDLED:
         folder = Path(__file__).parent.parent / "_urdf"
         folder = folder if folder.is_dir() else Path(__file__).parent.parent.parent / "urdf"
-        return Entry(name_or_path, folder / f"{name_or_path}.urdf", gravity=_BUNDLED[name_or_path])
+        path = folder / f"{name_or_path}.urdf"
+        return Entry(name_or_path, path, path, {"gravity": _BUNDLED[name_or_path]})
     if name_or_path in _EXAMPLES:
-        path, lock, zero_limits = _EXAMPLES[name_or_path]
-        robots = example_robot_share() / "example-robot-data" / "robots"
-        return Entry(name_or_path, robots / path, lock, zero_limits=zero_limits)
+        within, options = _EXAMPLES[name_or_path]
+        path = example_robot_share() / "example-robot-data" / "robots" / within
+        return Entry(name_or_path, path, path, options)
     try:
         file = Path(name_or_path).expanduser()
     except RuntimeError as error:  # a user who is not there
@@ -74,7 +80,8 @@ def find(name_or_path: str) -> Entry:
 def _entry_of_file(path: Path) -> Entry:
     """An entry with default settings for a file; raises RobotNotFound with suggestions if there is none."""
     if path.is_file():
-        return Entry("", path.resolve())
+        path = path.resolve()
+        return _entry_of_toml(path) if path.suffix == ".toml" else Entry("", path, path)
     names = ", ".join(ROBOT_NAMES)
     if path.is_dir():
         inside = ", ".join(sorted(file.name for file in path.iterdir() if file.suffix in _SUFFIXES)[:10])
@@ -84,3 +91,12 @@ def _entry_of_file(path: Path) -> Entry:
     near = difflib.get_close_matches(path.name, ROBOT_NAMES)
     hint = f" did you mean {' or '.join(near)}?" if near else ""
     raise RobotNotFound(f"no robot '{path}':{hint} give a file or one of {names}.")
+
+
+def _entry_of_toml(path: Path) -> Entry:
+    """The entry of the description that a `.toml` file names, with the file's options over the catalogue's."""
+    description, options = read_arm_file(path)
+    if Path(description).suffix == ".toml":
+        raise RobotError(f"{path}: its description '{description:.200}' is a .toml file too; name a URDF or an arm.")
+    entry = find(description)
+    return Entry("", entry.path, path, {**entry.options, **options})

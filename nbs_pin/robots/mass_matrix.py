@@ -81,7 +81,8 @@ def _still_joints(model: pin.Model) -> tuple[list[str], str]:
         for joint in range(1, model.njoints):
             axis = np.asarray(data.joints[joint].S).ravel()[3:]
             inertia = data.Ycrb[joint].matrix()[3:, 3:]
-            moments[joint - 1].append(float(axis @ inertia @ axis) if axis.any() else np.inf)
+            rotor = float(model.armature[joint - 1])
+            moments[joint - 1].append(float(axis @ inertia @ axis) + rotor if axis.any() else np.inf)
             totals[joint - 1].append(float(np.trace(inertia)))
     about = {
         name: max(moment)

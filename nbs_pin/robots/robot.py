@@ -1,7 +1,6 @@
 """A robot arm: its checked URDF and the Pinocchio model built from it."""
 
 import hashlib
-import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,17 +13,16 @@ import pinocchio as pin
 from array_api_compat import device
 from jaxtyping import Bool, Float, Int
 
-from nbs_pin.base.arguments import a, checked, mapping, maybe, path
+from nbs_pin.base.arguments import a, checked, mapping, maybe, number, path, text
 from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors
 from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
-from nbs_pin.base.exceptions import ArgumentError, RobotError
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.storable import storable
-from nbs_pin.robots.catalogue import find
+from nbs_pin.robots.catalogue import Entry, find
 from nbs_pin.robots.kinematics import Kinematics
-from nbs_pin.robots.mass_matrix import weak_joints
+from nbs_pin.robots.pinocchio_model import build_model, check_inertia, with_limits
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
-from nbs_pin.robots.urdf_checks import lock_too
-from nbs_pin.robots.urdf_options import UrdfOptions, read_options
+from nbs_pin.robots.urdf_options import read_options
 
 
 @storable(("name", "source", "options", "sha256", "effort_limit"))
@@ -48,7 +46,7 @@ class Robot(Kinematics):
     urdf: Urdf
     model: pin.Model
     gravity_vector: Float[np.ndarray, "3"]
-    """Gravitational acceleration in the base frame [m/s²]."""
+    """Gravitational acceleration in the frame of the root link [m/s²]."""
     options: dict[str, Any] = field(default_factory=dict)
     """Further arguments of `load_robot`, storable as JSON: load_robot(source, **options) gives this arm."""
 
@@ -107,13 +105,21 @@ class Robot(Kinematics):
 
     @property
     def damping(self) -> JointArray:
-        """Viscous joint friction of the URDF [N·m·s/rad]."""
+        """Viscous joint friction [N·m·s/rad, N·s/m], zero where none is stated."""
         return np.array([joint.damping for joint in self.joints])
 
     @property
     def friction(self) -> JointArray:
-        """Coulomb joint friction of the URDF [N·m]."""
+        """Coulomb joint friction [N·m, N], zero where none is stated."""
         return np.array([joint.friction for joint in self.joints])
+
+    @property
+    def armature(self) -> JointArray:
+        """Rotor inertia as each joint feels it, I_r·N² for a rotor behind a gear of ratio N [kg·m², kg].
+
+        M(q) contains it: M = M_bodies(q) + diag(armature) (docs/theory.md §1).
+        """
+        return np.array([joint.armature for joint in self.joints])
 
     @property
     def continuous(self) -> Bool[np.ndarray, " n"]:
@@ -137,7 +143,7 @@ class Robot(Kinematics):
 
     def as_described(self) -> "Robot":
         """The arm with `model` built from the URDF again: an edit of `model` does not show in `sha256`."""
-        model = _build_model(self.urdf)
+        model = build_model(self.urdf)
         model.gravity.linear = self.gravity_vector
         return replace(self, model=model)
 
@@ -163,7 +169,88 @@ class Robot(Kinematics):
         by_name = dict(zip(self.joint_names, np.full(self.nv, effort).tolist(), strict=True))
         joints = tuple(replace(joint, effort=by_name[joint.name]) for joint in self.urdf.joints)
         urdf = replace(self.urdf, joints=joints)
-        return replace(self, urdf=urdf, model=_with_limits(self.model.copy(), urdf))
+        return replace(self, urdf=urdf, model=with_limits(self.model.copy(), urdf))
+
+    def with_armature(self, armature: PerJoint | Mapping[str, float]) -> "Robot":
+        """The same arm with this rotor inertia, as the joints feel it [kg·m², kg].
+
+        Args:
+            armature: One number ≥ 0, one per joint, or a dict by joint for some of them.
+
+        Raises:
+            ArgumentError: If a number is negative or not finite, or the number of numbers is wrong.
+
+        Example:
+            >>> import nbs_pin as nbs
+            >>> nbs.load_robot("two_link").with_armature([0.2, 0.1]).armature
+            array([0.2, 0.1])
+        """
+        return self._again(armature=self._by_name("armature", armature))
+
+    def with_friction(
+        self,
+        coulomb: PerJoint | Mapping[str, float] | None = None,
+        viscous: PerJoint | Mapping[str, float] | None = None,
+    ) -> "Robot":
+        """The same arm with this joint friction in place of its own: Coulomb [N·m, N], viscous [N·m·s/rad, N·s/m].
+
+        Each is one number ≥ 0, one per joint, or a dict by joint; None keeps what the arm has. A plant applies it with
+        joint_friction="keep". Raises ArgumentError like `with_armature`.
+        """
+        given = {"coulomb_friction": coulomb, "viscous_friction": viscous}
+        return self._again(**{name: self._by_name(name, x) for name, x in given.items() if x is not None})
+
+    @checked(frame=text, mass=number(above=0.0, unit="kg"))
+    def with_payload(
+        self, frame: str, mass: float, com: Iterable[float] = (0.0, 0.0, 0.0), inertia: Any = 0.0
+    ) -> "Robot":
+        """The same arm with a load fixed to the link `frame`, in place of one that it already carries there.
+
+        Args:
+            frame: A link; "" is the last one.
+            mass: Mass [kg], > 0.
+            com: Centre of mass in the frame of the link [m].
+            inertia: About the centre of mass, in the directions of the link's frame [kg·m²]: a 3×3 matrix, three
+                principal moments, or 0 for a point mass.
+
+        Raises:
+            ArgumentError: If a number is out of range.
+            RobotError: If there is no such link, or no body has this inertia.
+        """
+        rows = inertia.tolist() if isinstance(inertia, np.ndarray) else inertia
+        load = {"mass": mass, "com": com, "inertia": rows}
+        return self._again(payload={**self.options.get("payload", {}), frame: load})
+
+    @checked(file=path, frame=text)
+    def with_tool(
+        self,
+        file: str | Path,
+        frame: str = "",
+        xyz: Iterable[float] = (0.0, 0.0, 0.0),
+        rpy: Iterable[float] = (0.0, 0.0, 0.0),
+    ) -> "Robot":
+        """The same arm with the tool of a `.urdf` or `.xacro` file, its base fixed to the link `frame` ("": the last).
+
+        xyz [m] and rpy [rad] place the tool's base in that link. Its joints are locked where they are nearest to zero,
+        or where `lock` says. Raises RobotError if the tool cannot be read or there is no such link.
+        """
+        return self._again(tool={"file": str(file), "frame": frame, "xyz": xyz, "rpy": rpy})
+
+    def _by_name(self, what: str, values: PerJoint | Mapping[str, float]) -> dict[str, float]:
+        """One number or one per joint by the names of the joints; some joints of a mapping, the others' kept."""
+        if isinstance(values, Mapping):
+            own = {"coulomb_friction": self.friction, "viscous_friction": self.damping}.get(what, self.armature)
+            return dict(zip(self.joint_names, own.tolist(), strict=True)) | dict(values)
+        numbers = floats(what, values)
+        if numbers.shape not in ((), (self.nv,)):
+            raise ArgumentError(f"{what} is {told(values)}, expected one number or {self.nv}, one per joint.")
+        return dict(zip(self.joint_names, np.full(self.nv, numbers).tolist(), strict=True))
+
+    def _again(self, **options: Any) -> "Robot":
+        """The arm loaded again with other arguments of `load_robot`, with the effort limits of this one."""
+        again = load_robot(self.source, **{**self.options, **options})
+        same = np.array_equal(again.effort_limit, self.effort_limit)
+        return again if same else again.with_effort_limit(self.effort_limit)
 
 
 ARM = a(Robot, "an arm, as load_robot returns it")
@@ -195,14 +282,23 @@ def load_robot(
     inertia_from: str | None = None,
     xacro_args: Mapping[str, Any] | None = None,
     package_dirs: Iterable[str | Path] | None = None,
+    armature: float | Mapping[str, float] | None = None,
+    rotor_inertia: float | Mapping[str, float] | None = None,
+    viscous_friction: float | Mapping[str, float] | None = None,
+    coulomb_friction: float | Mapping[str, float] | None = None,
+    payload: float | Mapping[str, Any] | None = None,
+    tool: str | Path | Mapping[str, Any] | None = None,
+    base_rpy: Iterable[float] | None = None,
+    base_xyz: Iterable[float] | None = None,
 ) -> Robot:
-    """Load an arm by name or from a `.urdf` or `.xacro` file.
+    """Load an arm by name, from a `.urdf` or `.xacro` file, or from a `.toml` file that adds to one.
 
-    Joints that mimic another are locked where the other is at zero, and named in a warning.
+    Joints that mimic another are locked where the other is at zero, and named in a warning. A `.toml` file has the
+    `description` (name or path) and any of the arguments below.
 
     Args:
         name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), or the path of a file.
-        gravity: Downward acceleration [m/s²] or a vector in the base frame. None takes the catalogue's, else 9.81.
+        gravity: Downward acceleration [m/s²] or a vector in the world frame. None takes the catalogue's, else 9.81.
         lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. None takes the catalogue's list.
         zero_limits: "refuse" joints that state no limits, an effort or velocity that is not > 0, or an empty range at
             zero, or read these as "unlimited". None takes the catalogue's, else "refuse".
@@ -213,6 +309,14 @@ def load_robot(
         xacro_args: Values of the arguments of a `.xacro` file.
         package_dirs: Folders with ROS packages, for `$(find …)` and package:// in the file. Also searched are packages
             around and beside the file, ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.
+        armature: Rotor inertia that the joint feels [kg·m², kg], a number or a dict by joint, in place of the file's.
+        rotor_inertia: Inertia of the rotor itself [kg·m²], likewise; the joint feels it times N² of its transmission.
+        viscous_friction: Viscous joint friction [N·m·s/rad, N·s/m], likewise, in place of the file's.
+        coulomb_friction: Coulomb joint friction [N·m, N], likewise, in place of the file's.
+        payload: A mass [kg] at the last link, or a dict from links to a mass or to a dict of mass, com [m], inertia.
+        tool: A description whose base is fixed to the last link, or a dict of file, frame, xyz [m], rpy [rad].
+        base_rpy: Roll, pitch, yaw of the base in the world [rad]: (π, 0, 0) hangs the arm from the ceiling.
+        base_xyz: Position of the base in the world [m].
 
     Raises:
         RobotNotFound: If no such name or file exists.
@@ -225,26 +329,27 @@ def load_robot(
         >>> nbs.load_robot("panda")
         Robot('panda', 7 joints)
     """
-    entry = find(str(name_or_path))
-    told = {
-        "lock": entry.lock if lock is None else lock,
-        "zero_limits": entry.zero_limits if zero_limits is None else zero_limits,
-        "limits": limits,
-        "repair": repair,
-        "inertia_from": inertia_from,
-        "xacro_args": xacro_args,
-        "package_dirs": package_dirs,
-    }
+    given = dict(
+        gravity=gravity, lock=lock, zero_limits=zero_limits, limits=limits, repair=repair, inertia_from=inertia_from,
+        xacro_args=xacro_args, package_dirs=package_dirs, armature=armature, rotor_inertia=rotor_inertia,
+        viscous_friction=viscous_friction, coulomb_friction=coulomb_friction, payload=payload, tool=tool,
+        base_rpy=base_rpy, base_xyz=base_xyz,
+    )  # fmt: skip
+    return _load(find(str(name_or_path)), {name: value for name, value in given.items() if value is not None})
+
+
+def _load(entry: Entry, given: dict[str, Any]) -> Robot:
+    """The arm of a catalogue's entry or a file, with the arguments of `load_robot` that were given."""
+    told = {"gravity": 9.81, **entry.options, **given}
+    vector = _gravity_vector(told.pop("gravity"))
     options = read_options(told)
     urdf = read_urdf(entry.path, options)
-    vector = _gravity_vector(entry.gravity if gravity is None else gravity)
-    model = _build_model(urdf)
+    model = build_model(urdf)
     model.gravity.linear = vector
-    given = {"gravity": gravity, **told, "lock": lock, "zero_limits": zero_limits}
     stored = {"gravity": vector.tolist(), **options.stored()}
-    said = {key: stored[key] for key, value in given.items() if value is not None}
-    robot = Robot(entry.name or urdf.name, entry.name or str(entry.path), urdf, model, vector, said)
-    _check_inertia(robot, options)
+    said = {name: stored[name] for name in given}
+    robot = Robot(entry.name or urdf.name, entry.name or str(entry.source), urdf, model, vector, said)
+    check_inertia(urdf, model, options)
     return robot
 
 
@@ -258,39 +363,3 @@ def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
             f"gravity is {told(gravity)}, expected one finite number (downward) or three; give e.g. 9.81."
         )
     return np.array([0.0, 0.0, -float(vector)]) if vector.ndim == 0 else vector
-
-
-def _build_model(urdf: Urdf) -> pin.Model:
-    """The Pinocchio model with the limits of `urdf.joints`; raises RobotError if it cannot be built."""
-    try:
-        model = pin.buildModelFromXML(urdf.without_geometry().decode())
-    except (ValueError, RuntimeError) as error:
-        raise RobotError(f"{urdf.path}: Pinocchio cannot build it ({error}); simplify the file.") from error
-    return _with_limits(model, urdf)
-
-
-def _with_limits(model: pin.Model, urdf: Urdf) -> pin.Model:
-    """The model, its limits set to those of `urdf.joints`."""
-    by_name = {joint.name: joint for joint in urdf.joints}
-    joints = [by_name[name] for name in model.names[1:]]
-    effort, velocity = (np.array([getattr(joint, key) for joint in joints]) for key in ("effort", "velocity"))
-    model.lowerPositionLimit = np.array([joint.lower for joint in joints])
-    model.upperPositionLimit = np.array([joint.upper for joint in joints])
-    model.lowerEffortLimit, model.upperEffortLimit = -effort, effort
-    model.lowerVelocityLimit, model.upperVelocityLimit = -velocity, velocity
-    return model
-
-
-def _check_inertia(robot: Robot, options: UrdfOptions) -> None:
-    """Raise RobotError unless M(q) ≻ 0 in every pose within the limits."""
-    names, problem = weak_joints(robot.model, robot.lower, robot.upper)
-    if not names:
-        return
-    joints = ET.fromstring(robot.urdf.xml).findall("joint")
-    own = next((joint for joint in joints if joint.get("name") == names[0]), None)
-    unsaid = own is not None and own.find("axis") is None
-    problem += "; it states no <axis>, which URDF reads as 1 0 0" if unsaid else ""
-    remedy = f"{'add <axis xyz=…>, ' if unsaid else ''}give the links behind it inertia about its axis"
-    raise RobotError(
-        f"{robot.urdf.path}: joint '{names[0]}': {problem}; {remedy}, or lock it ({lock_too(options, names)})."
-    )

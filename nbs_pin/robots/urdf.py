@@ -5,10 +5,12 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
+from nbs_pin.robots.attachments import attach
 from nbs_pin.robots.bodies import check_bodies
+from nbs_pin.robots.joint_drive import Drive, read_drives
 from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.urdf_checks import Joint, check_axis, check_tree
-from nbs_pin.robots.urdf_limits import Limits, read_friction, read_limits
+from nbs_pin.robots.urdf_limits import Limits, read_limits
 from nbs_pin.robots.urdf_options import LIMITS, UrdfOptions
 from nbs_pin.robots.urdf_source import read_source
 
@@ -30,6 +32,7 @@ class JointData:
     velocity: float
     damping: float
     friction: float
+    armature: float
 
 
 @dataclass(frozen=True)
@@ -70,21 +73,21 @@ def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
     packages = Packages(path, options.package_dirs)
     robot = read_source(path, options.xacro_args, packages)
     robot.element.set("name", robot.element.get("name", path.stem))
+    options = attach(robot, options, packages)
     joints = check_tree(robot, options)
     check_bodies(robot, joints, options, packages)
-    limits = read_limits(joints, options)
-    moving = tuple(_settle(joint, limits[joint.name], options) for joint in joints if joint.moves)
+    limits, drives = read_limits(joints, options), read_drives(robot, joints, options)
+    moving = tuple(_settle(joint, limits[joint.name], drives[joint.name], options) for joint in joints if joint.moves)
     return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving)
 
 
-def _settle(joint: Joint, limits: Limits, options: UrdfOptions) -> JointData:
+def _settle(joint: Joint, limits: Limits, drive: Drive, options: UrdfOptions) -> JointData:
     """The data of a moving joint; its element becomes a revolute or prismatic joint that states all limits.
 
     An effort or velocity limit given in place of the file's is not written into it: the description, and with it
     `Robot.sha256`, stays that of the file.
     """
     check_axis(joint)
-    damping, friction = read_friction(joint)
     element = joint.node.element
     stated = element.find("limit")
     stated = ET.SubElement(element, "limit") if stated is None else stated
@@ -94,7 +97,7 @@ def _settle(joint: Joint, limits: Limits, options: UrdfOptions) -> JointData:
             stated.set(key, repr(value if math.isfinite(value) else math.copysign(_UNLIMITED, value)))
     element.set("type", "prismatic" if joint.kind == "prismatic" else "revolute")
     wrapped = joint.kind == "continuous" and math.isinf(limits.lower) and math.isinf(limits.upper)
-    return JointData(joint.name, wrapped, joint.kind == "prismatic", *limits, damping, friction)
+    return JointData(joint.name, wrapped, joint.kind == "prismatic", *limits, *drive)
 
 
 def _bare(element: ET.Element) -> ET.Element:

@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from nbs_pin.base.doors import BLANK, option
-from nbs_pin.robots.urdf_options import ALL, UrdfOptions
+from nbs_pin.robots.urdf_options import ALL, DRIVE, UrdfOptions
 from nbs_pin.robots.urdf_source import Node, shorten
 
 MAX_JOINTS = 64
@@ -60,8 +60,10 @@ def check_tree(robot: Node, options: UrdfOptions) -> list[Joint]:
     _check_name(robot, robot.text("name"))
     links = _unique(robot, "link")
     nodes = _unique(robot, "joint")
-    for argument, names in (("lock", list(options.lock)), ("limits", list(options.limits))):
-        unknown = [name for name in names if name not in nodes and (argument, name) != ("limits", ALL)]
+    for argument in ("lock", "limits", *DRIVE):
+        unknown = [
+            name for name in getattr(options, argument) if name not in nodes and (argument == "lock" or name != ALL)
+        ]
         if unknown:
             raise robot.refuse(f"no joint '{unknown[0]}' for {argument}", f"the joints are {', '.join(nodes)}")
     if len(links) > MAX_LINKS:

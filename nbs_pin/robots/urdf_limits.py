@@ -1,4 +1,4 @@
-"""Limits and friction of joints: what the file states, what is given in its place, and all that is still wanted."""
+"""Limits of joints: what the file states, what is given in its place, and all that is still wanted."""
 
 import math
 import warnings
@@ -66,14 +66,6 @@ def read_limits(joints: list[Joint], options: UrdfOptions) -> dict[str, Limits]:
     if len(wanted.zeros) == wanted.faults:
         remedies.append(f"{option('zero_limits', 'unlimited')} if {wanted.zeros[0]}")
     raise wanted.first.refuse(wanted.problem, ", or ".join(remedies))
-
-
-def read_friction(joint: Joint) -> tuple[float, float]:
-    """Viscous damping [N·m·s/rad] and Coulomb friction [N·m] of the joint, zero where not stated."""
-    dynamics = joint.node.child("dynamics")
-    if dynamics is None:
-        return 0.0, 0.0
-    return dynamics.number("damping", 0.0, least=0.0), dynamics.number("friction", 0.0, least=0.0)
 
 
 def _limits(joint: Joint, options: UrdfOptions, wanted: _Wanted) -> Limits:

@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
@@ -16,9 +17,35 @@ ZERO_LIMITS: tuple[ZeroLimits, ...] = get_args(ZeroLimits)
 InertiaFrom: TypeAlias = Literal["file", "shapes"]
 """Whether bodies without mass are refused, or filled with material."""
 INERTIA_FROM: tuple[InertiaFrom, ...] = get_args(InertiaFrom)
+DRIVE = ("armature", "rotor_inertia", "viscous_friction", "coulomb_friction")
+"""Arguments with a number ≥ 0 by joint."""
 LIMITS = ("lower", "upper", "effort", "velocity")
 ALL = "*"
-"""Stands for every joint in `limits`."""
+"""Stands for every joint in `limits` and in what `DRIVE` names."""
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A load fixed to a link."""
+
+    mass: float
+    """Mass [kg]."""
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre of mass in the frame of the link [m]."""
+    inertia: tuple[float, ...] = (0.0,) * 6
+    """Ixx, Ixy, Ixz, Iyy, Iyz, Izz about the centre of mass in the directions of the link's frame [kg·m²]."""
+
+
+@dataclass(frozen=True)
+class Tool:
+    """The description of a tool, and where its base is fixed."""
+
+    file: Path
+    frame: str = ""
+    """The link that carries it, the arm's only last link if empty."""
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Placement of the tool's base in that link's frame [m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +61,21 @@ class UrdfOptions:
     inertia_from: InertiaFrom = "file"
     xacro_args: Mapping[str, str] = field(default_factory=dict)
     package_dirs: tuple[Path, ...] = ()
+    armature: Mapping[str, float] = field(default_factory=dict)
+    rotor_inertia: Mapping[str, float] = field(default_factory=dict)
+    viscous_friction: Mapping[str, float] = field(default_factory=dict)
+    coulomb_friction: Mapping[str, float] = field(default_factory=dict)
+    payload: Mapping[str, Payload] = field(default_factory=dict)
+    """Loads by the link that carries them."""
+    tool: Tool | None = None
+    base_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    base_xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How the base is mounted in the world [rad, m]."""
+
+    def drive(self, joint: str, key: str) -> float | None:
+        """What one of `DRIVE` gives for a joint; None if it gives nothing."""
+        given: Mapping[str, float] = getattr(self, key)
+        return given.get(joint, given.get(ALL))
 
     def limit(self, joint: str, key: str) -> float | None:
         """The limit that was given for a joint, inf for none; None if none was given."""
@@ -56,6 +98,11 @@ class UrdfOptions:
             "inertia_from": self.inertia_from,
             "xacro_args": dict(self.xacro_args),
             "package_dirs": [str(folder) for folder in self.package_dirs],
+            **{key: dict(getattr(self, key)) for key in DRIVE},
+            "payload": {frame: _plain(payload) for frame, payload in self.payload.items()},
+            "tool": None if self.tool is None else _plain(self.tool),
+            "base_rpy": list(self.base_rpy),
+            "base_xyz": list(self.base_xyz),
         }
 
 
@@ -74,6 +121,7 @@ def read_options(told: Mapping[str, Any]) -> UrdfOptions:
     for name, convert in _CONVERT.items():
         if name in given:
             given[name] = convert(given[name])
+    given |= {name: _by_joint(name, given[name]) for name in DRIVE if name in given}
     return UrdfOptions(**given)
 
 
@@ -102,6 +150,86 @@ def _limits(value: Any) -> dict[str, dict[str, float | None]]:
             f"and velocity > 0, None for no limit; give for instance limits={{'{ALL}': {{'effort': 50.0}}}}."
         )
     return {joint: {key: _stored(x) for key, x in limits.items()} for joint, limits in value.items()}
+
+
+def _by_joint(name: str, value: Any) -> dict[str, float]:
+    numbers = dict(value) if isinstance(value, Mapping) else {ALL: value}
+    if not all(isinstance(joint, str) and _finite(x) and x >= 0.0 for joint, x in numbers.items()):
+        raise ArgumentError(
+            f"{name} is {value!r}, expected a finite number ≥ 0, or a dict from joints (or '{ALL}') to such numbers; "
+            f"give for instance {name}={{'elbow': 0.2}}."
+        )
+    return {joint: float(x) for joint, x in numbers.items()}
+
+
+def _payloads(value: Any) -> dict[str, Payload]:
+    loads = dict(value) if isinstance(value, Mapping) else {"": value}
+    found = {}
+    for frame, load in loads.items():
+        given = dict(load) if isinstance(load, Mapping) else {"mass": load}
+        inertia, com = _six(given.get("inertia", 0.0)), _numbers(given.get("com", (0.0, 0.0, 0.0)), 3)
+        known = given.keys() <= {"mass", "com", "inertia"} and isinstance(frame, str)
+        if not (known and com and inertia and _finite(given.get("mass")) and given["mass"] > 0.0):
+            raise ArgumentError(
+                f"payload is {value!r}, expected a mass [kg], or a dict from links to masses or to dicts of mass > 0, "
+                "com (3 numbers [m]) and inertia (3 moments or a 3×3 matrix about the centre of mass [kg·m²]); give "
+                "for instance payload={'flange': {'mass': 2.0, 'com': [0, 0, 0.05]}}."
+            )
+        found[frame] = Payload(float(given["mass"]), (com[0], com[1], com[2]), inertia)
+    return found
+
+
+def _tool(value: Any) -> Tool:
+    given = dict(value) if isinstance(value, Mapping) else {"file": value}
+    file, frame = given.get("file"), given.get("frame", "")
+    xyz, rpy = (_numbers(given.get(key, (0.0, 0.0, 0.0)), 3) for key in ("xyz", "rpy"))
+    known = given.keys() <= {"file", "frame", "xyz", "rpy"} and isinstance(file, str | Path) and isinstance(frame, str)
+    if not (known and xyz and rpy):
+        raise ArgumentError(
+            f"tool is {value!r}, expected the path of a description, or a dict of file, frame (the carrying link), "
+            "xyz [m] and rpy [rad]; give for instance tool={'file': 'gripper.urdf', 'frame': 'flange'}."
+        )
+    return Tool(Path(str(file)).expanduser().resolve(), frame, (xyz[0], xyz[1], xyz[2]), (rpy[0], rpy[1], rpy[2]))
+
+
+def _three(name: str) -> Callable[[Any], tuple[float, ...]]:
+    def convert(value: Any) -> tuple[float, ...]:
+        numbers = _numbers(value, 3)
+        if not numbers:
+            raise ArgumentError(
+                f"{name} is {value!r}, expected three finite numbers; give for instance [3.1416, 0, 0]."
+            )
+        return numbers
+
+    return convert
+
+
+def _numbers(value: Any, count: int) -> tuple[float, ...]:
+    """`count` finite numbers as a tuple, or the empty tuple."""
+    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
+        return ()
+    numbers = tuple(islice(value, count + 1))
+    return tuple(map(float, numbers)) if len(numbers) == count and all(map(_finite, numbers)) else ()
+
+
+def _six(value: Any) -> tuple[float, ...]:
+    """Ixx, Ixy, Ixz, Iyy, Iyz, Izz of one number, three moments, six numbers or a symmetric matrix; else empty."""
+    if _finite(value):
+        return (float(value), 0.0, 0.0, float(value), 0.0, float(value))
+    if len(three := _numbers(value, 3)) == 3:
+        return (three[0], 0.0, 0.0, three[1], 0.0, three[2])
+    if six := _numbers(value, 6):
+        return six
+    rows = [_numbers(row, 3) for row in islice(value, 4)] if isinstance(value, Iterable) else []
+    if len(rows) != 3 or not all(rows) or any(rows[i][j] != rows[j][i] for i in range(3) for j in range(i)):
+        return ()
+    return (*rows[0], *rows[1][1:], rows[2][2])
+
+
+def _plain(value: Payload | Tool) -> dict[str, Any]:
+    return {
+        key: str(x) if isinstance(x, Path) else list(x) if isinstance(x, tuple) else x for key, x in vars(value).items()
+    }
 
 
 def _arguments(value: Any) -> dict[str, str]:
@@ -146,4 +274,8 @@ _CONVERT: dict[str, Callable[[Any], Any]] = {
     "limits": _limits,
     "xacro_args": _arguments,
     "package_dirs": _folders,
+    "payload": _payloads,
+    "tool": _tool,
+    "base_rpy": _three("base_rpy"),
+    "base_xyz": _three("base_xyz"),
 }

@@ -40,7 +40,7 @@ class Place(NamedTuple):
 class Node:
     """An XML element with its place in the file for messages, and strict access to children and numbers."""
 
-    places: Mapping[ET.Element, Place]
+    places: dict[ET.Element, Place]
     element: ET.Element
     owner: str
     """Name of the element in messages, such as "link 'l1'"."""
@@ -84,6 +84,12 @@ class Node:
             raise self.refuse(f"<{self.element.tag}> has no <{tag}>", f"add <{tag} …/>")
         return child
 
+    def new(self, tag: str, attributes: Mapping[str, str] | None = None, name: str = "") -> "Node":
+        """A new child <tag> with these attributes; messages place it at this element, under a name if it has one."""
+        element = ET.SubElement(self.element, tag, dict(attributes or {}) | ({"name": name} if name else {}))
+        self.places[element] = self.place
+        return self.at(element, f"{tag} '{name}'" if name else None)
+
     def text(self, key: str) -> str:
         """The attribute `key`; raises RobotError if it is missing."""
         value = self.element.get(key)
@@ -112,6 +118,14 @@ class Node:
             raise self._bad_number(key, "a finite number" if count == 1 else f"{count} finite numbers")
         self.element.set(key, " ".join(repr(value) for value in values))
         return values
+
+    def content(self) -> float:
+        """The text within the element as one finite number; raises RobotError if it is none."""
+        words = (self.element.text or "").split()
+        if len(words) != 1 or not _NUMBER.fullmatch(words[0]) or not math.isfinite(float(words[0])):
+            tag = self.element.tag
+            raise self.refuse(f"<{tag}> contains '{shorten(' '.join(words))}'", "write one finite number in it")
+        return float(words[0])
 
     def _bad_number(self, key: str, expected: str) -> RobotError:
         tag, value = self.element.tag, self.text(key)

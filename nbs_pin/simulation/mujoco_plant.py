@@ -207,9 +207,11 @@ def build_model(robot: Robot, integrator: MujocoIntegrator, joint_friction: Join
     if isinstance(joint_friction, JointFriction):
         pairs = zip(joint_friction.viscous.tolist(), joint_friction.coulomb.tolist(), strict=True)
         other = dict(zip(robot.joint_names, pairs, strict=True))
+    armature = dict(zip(robot.joint_names, robot.model.armature.tolist(), strict=True))
     try:
         spec = mujoco.MjSpec.from_string(robot.urdf.without_geometry().decode())
         for joint in spec.joints:
+            joint.armature = armature[joint.name]
             if joint_friction != "keep":
                 viscous, dry = other.get(joint.name, (0.0, 0.0))
                 joint.damping, joint.frictionloss = np.array([viscous, 0.0, 0.0]), dry

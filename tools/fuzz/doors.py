@@ -106,6 +106,7 @@ def stock() -> Stock:
     return Stock()
 
 
+_TOOL = str(Path(nbs.load_robot("three_link").urdf.path))
 Z, Q, V = np.zeros(2), np.array([0.3, -0.2]), np.array([0.1, 0.4])
 
 
@@ -187,7 +188,11 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "load_dataset": {"path": s.path("data.npz", s.data.save)},
         "load_log": {"path": s.path("data.npz", s.data.save)},
         "load_reference": {"path": s.path("run.npz", s.run.save), "joint_names": s.robot.joint_names},
-        "load_robot": {"name_or_path": "two_link", "gravity": 9.81},
+        "load_robot": {"name_or_path": "two_link", "gravity": 9.81, "payload": 1.0, "base_rpy": [0.1, 0.2, 0.3]},
+        "Robot.with_armature": {"armature": [0.1, 0.2]},
+        "Robot.with_friction": {"coulomb": 0.5, "viscous": [0.1, 0.2]},
+        "Robot.with_payload": {"frame": "tip", "mass": 1.0, "com": [0.0, 0.0, 0.1], "inertia": 0.0},
+        "Robot.with_tool": {"file": _TOOL, "frame": "tip", "xyz": [0.0, 0.0, 0.1], "rpy": [0.0, 0.0, 0.1]},
         "monitor": {"start": 0},
         "paper_controller": {"m": 0.001},
         "plot_tracking": {"path": s.folder / "plot.png"},
