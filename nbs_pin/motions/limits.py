@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from nbs_pin.base.arguments import check_fields, joints
+from nbs_pin.base.arguments import check_fields, checked, joints
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.units import units
-from nbs_pin.robots.robot import Robot
+from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.robots.urdf import JointData
 
 
@@ -36,6 +36,7 @@ class Margins:
     def __post_init__(self) -> None:
         check_fields(self, **dict.fromkeys(("position", "velocity", "effort"), joints(least=0.0)))
 
+    @checked(robot=ARM)
     def of(self, robot: Robot) -> Robot:
         """The arm with the limits that are left; its dynamics stay.
 

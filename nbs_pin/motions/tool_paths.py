@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from nbs_pin.base.arguments import checked, either, maybe, number, numbers
+from nbs_pin.base.arguments import checked, either, maybe, number, numbers, numbers_or_one
 from nbs_pin.base.checks import told
 from nbs_pin.base.doors import argument
 from nbs_pin.base.exceptions import ArgumentError
@@ -60,11 +60,13 @@ class ToolPath:
         points = self.curve(np.linspace(0.0, 1.0, _SAMPLES))
         return float(np.linalg.norm(np.diff(points, axis=0), axis=-1).sum())
 
+    @checked(s=number(least=0.0, most=1.0))
     def travelled(self, s: float) -> float:
         """Length of the curve from its beginning to s [m]."""
         points = self.curve(np.linspace(0.0, s, _SAMPLES))
         return float(np.linalg.norm(np.diff(points, axis=0), axis=-1).sum())
 
+    @checked(s=numbers_or_one(), orientation=numbers(3, 3))
     def poses(
         self, s: Float[np.ndarray, "*batch"], orientation: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "*batch 4 4"]:
