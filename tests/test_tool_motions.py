@@ -182,7 +182,7 @@ def test_a_singular_point_is_refused_where_the_jacobian_says():
     target = posture + np.array([0.0, 0.0, 0.0, 0.0, 0.8, 0.0])
     poses = np.array([robot.pose(q, "tool0") for q in np.linspace(posture, target, 9)])
     path = nbs.ToolPath.through(poses[:, :3, 3], poses[:, :3, :3])
-    with pytest.raises(nbs.ArgumentError, match=r"singular|cannot follow|out of reach") as refused:
+    with pytest.raises(nbs.ArgumentError, match=r"singular|can follow|out of reach") as refused:
         nbs.tool_motion(robot, path, "tool0", posture=posture)
     assert "% of it" in str(refused.value)
     assert InverseKinematics(robot, "tool0", posture, True).steadiness(np.zeros(6)) < SINGULAR

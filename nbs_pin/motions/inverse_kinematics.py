@@ -34,6 +34,8 @@ _EXACT = 1e-12
 """Error of a pose and size of a step that is left, both relative to the reach and the ranges of joints."""
 _GOOD = 1e-10
 """What counts as exact where rounding leaves no more."""
+_CONVEX = 0.05
+"""Least curvature along spare joints, as a share of that of h, with which a step is taken."""
 _TRIES = 200
 """Configurations of which the directions are taken in which a frame can move."""
 _RANK = 1e-6
@@ -176,7 +178,7 @@ class InverseKinematics:
                 slope, bend = self._attraction(q)
                 multipliers = np.linalg.lstsq(J.T, -slope, rcond=None)[0]
                 system = np.zeros((n + k, n + k))
-                system[:n, :n] = np.diag(bend) + self._curvature(q, J, multipliers)
+                system[:n, :n] = self._hessian(bend, self._curvature(q, J, multipliers), J)
                 system[:n, n:], system[n:, :n] = J.T, J
                 step = np.linalg.lstsq(system, -np.concatenate([slope, left]), rcond=None)[0][:n]
             size = float(np.abs(step / self._half).max())
@@ -184,6 +186,14 @@ class InverseKinematics:
             if size <= _EXACT:
                 break
         return self.solution(q, pose)
+
+    def _hessian(
+        self, bend: JointArray, curvature: Float[np.ndarray, "n n"], J: Float[np.ndarray, "k n"]
+    ) -> Float[np.ndarray, "n n"]:
+        """Hessian of h + λᵀ pose; that of h alone where spare joints would be led to a maximum or a saddle."""
+        full, null = np.diag(bend) + curvature, np.linalg.svd(J)[2][len(J) :]
+        convex = not len(null) or np.linalg.eigvalsh(null @ full @ null.T)[0] > _CONVEX * bend.min()
+        return full if convex else np.diag(bend)
 
     @cached_property
     def _half(self) -> JointArray:

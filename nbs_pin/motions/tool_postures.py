@@ -14,7 +14,7 @@ _SAMPLES = 3000
 _INNER = 0.35
 """Share of each joint's range, on either side of its middle, in which configurations are tried."""
 _UPRIGHT = 0.999
-_TURNED = 4
+_TURNED = 8
 """Best configurations whose frame is turned downwards exactly."""
 ORIENTATIONS = ("hold", "free")
 ORIENTATION = choice(*ORIENTATIONS)
