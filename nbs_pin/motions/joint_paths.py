@@ -73,9 +73,10 @@ def joint_path(inverse: InverseKinematics, path: ToolPath) -> JointPath:
             return JointPath(spline, float(missed.max()), float(turned.max()))
         if len(s) > _MOST:
             at = float(between[np.argmax(worst)])
+            place = _place(path, at, path.poses(np.array(at), orientation))
             raise ArgumentError(
-                f"{_place(path, at, path.poses(np.array(at), orientation))} bends more sharply than the joints can follow, or makes them jump "
-                f"(a spline through {len(s)} points misses it by {worst.max():.2g} m or rad); smooth the path, or begin in another posture."
+                f"{place} bends more sharply than the joints can follow, or makes them jump (a spline through {len(s)} "
+                f"points misses it by {worst.max():.2g} m or rad); smooth the path, or begin in another posture."
             )
         middle = 0.5 * (s[1:] + s[:-1])
         added = [_met(inverse, path, orientation, x, guess) for x, guess in zip(middle, spline(middle), strict=True)]
