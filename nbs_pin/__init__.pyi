@@ -65,6 +65,7 @@ from .motions.disturbances import (
     SquareWave as SquareWave,
     TorqueNoise as TorqueNoise,
 )
+from .motions.limits import Margins as Margins
 from .motions.reference_files import Sampled as Sampled, load_reference as load_reference
 from .motions.references import (
     Hold as Hold,
@@ -73,6 +74,10 @@ from .motions.references import (
     check_reference as check_reference,
     paper_reference as paper_reference,
 )
+from .motions.tool_files import load_tool_path as load_tool_path
+from .motions.tool_motions import ToolMotion as ToolMotion, tool_motion as tool_motion
+from .motions.tool_paths import ToolPath as ToolPath
+from .motions.tool_postures import tool_posture as tool_posture
 from .reports.plotting import plot_tracking as plot_tracking
 from .reports.replay import replay as replay
 from .robots.catalogue import ROBOT_NAMES as ROBOT_NAMES
@@ -83,6 +88,7 @@ from .simulation.dynamics_plant import DynamicsPlant as DynamicsPlant
 from .simulation.mujoco_plant import MujocoPlant as MujocoPlant
 from .simulation.plant import Plant as Plant
 from .simulation.simulate import simulate as simulate, stream as stream
+from .simulation.tool_errors import ToolErrors as ToolErrors, tool_errors as tool_errors
 from .storage.checkpoints import about as about, load as load, save as save
 from .training.train import Training as Training, train as train
 from .verification.verify import Verification as Verification, verify as verify

@@ -41,6 +41,8 @@ HOMES = {
     "meshcat": {"reports.replay"},
     "yourdfpy": {"robots.visuals"},
     "trimesh": {"robots.meshes", "robots.shape_inertia", "robots.visuals", "reports.replay"},
+    "pink": {"motions.inverse_kinematics"},
+    "toppra": {"motions.least_time"},
     "scipy": {"motions", "robots.mass_matrix", "inertia", "accuracy", "identification", "certificates"},
     "clarabel": {"inertia.multipliers"},
     "flint": {"verification.balls"},
@@ -148,6 +150,8 @@ def test_importing_the_package_is_light():
         "clarabel",
         "flint",
         "jsonschema",
+        "pink",
+        "toppra",
     }
     assert not heavy & set(loaded)
 

@@ -22,8 +22,8 @@ ROS_NAMES = {"q": "position", "v": "velocity", "a": "acceleration", "tau": "effo
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 
 
-def read_csv(path: Path) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
-    """The header and the numbers of a CSV file with a column `t`.
+def read_csv(path: Path, wanted: Sequence[str] = ("t",)) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
+    """The header and the numbers of a CSV file with the columns in `wanted`.
 
     Raises:
         FileFormatError: If the file is not such a table; names the column and the row, counted from 1.
@@ -37,8 +37,8 @@ def read_csv(path: Path) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
         raise FileFormatError(f"{path}: not a UTF-8 CSV file ({error}); export it again.") from error
     header = [name.strip() for name in lines[0]] if lines else []
     header = header[:-1] if header[-1:] == [""] else header  # of a comma at the end of the line
-    if "t" not in header or len(set(header)) != len(header):
-        raise FileFormatError(f"{path}: {_header_fault(header)}.")
+    if not set(wanted) <= set(header) or len(set(header)) != len(header):
+        raise FileFormatError(f"{path}: {_header_fault(header, wanted)}.")
     if len(lines) < 2:
         raise FileFormatError(f"{path}: no rows of numbers below the header, expected at least 4; record more.")
     table = np.empty((len(lines) - 1, len(header)))
@@ -95,12 +95,17 @@ def joint_order(path: Path, found: Sequence[str], joint_names: Sequence[str] | N
     return [found.index(name) for name in names]
 
 
-def _header_fault(header: list[str]) -> str:
+def _header_fault(header: list[str], wanted: Sequence[str]) -> str:
     """What is wrong with the names of the columns and what to do."""
-    other = [name for mark, name in _SEPARATORS.items() if "t" not in header and any(mark in cell for cell in header)]
+    other = [
+        name
+        for mark, name in _SEPARATORS.items()
+        if not set(wanted) <= set(header) and any(mark in cell for cell in header)
+    ]
     if other:
         return f"the columns are separated by {other[0]}, expected commas, and points in numbers; export it like that"
-    return f"the header is '{', '.join(header)}', expected 't' and each name once; add or rename"
+    needed = ", ".join(f"'{name}'" for name in wanted)
+    return f"the header is '{', '.join(header)}', expected {needed} and each name once; add or rename"
 
 
 def _numbers(path: Path, row: int, cells: list[str], header: list[str]) -> list[float]:

@@ -10,6 +10,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import (
     OptionError,
     choice,
@@ -96,7 +97,8 @@ class Certify(FileUnits):
     margin: Annotated[float | None, number("--margin", least=1.0, most=100.0, unit=""), default("1.5")] = None
     """Factor on the torques of payload and gravity error along the reference."""
     reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
-    """Motion for loads and limits: sinusoid (fitted to the arm), paper, or a .csv or .npz file."""
+    """Motion for loads and limits: sinusoid (fitted to the arm), paper, a .csv or .npz file, or a path of the tool, as
+    in nbs-pin track."""
     frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0
     """Frequency of the sinusoid [rad/s]."""
     start_error: Annotated[float, number("--start-error", least=0.0, most=math.pi, unit="rad")] = 0.0
@@ -131,5 +133,7 @@ class Certify(FileUnits):
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another certificate in that folder."""
+    tool: OfTool = field(default_factory=ToolOptions)
+    """How a path of the tool is followed."""
     arm: OfArm = field(default_factory=ArmOptions)
     """How the arm is read."""

@@ -9,6 +9,7 @@ import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import SAVED, choice, configuration, default, disturbance_text, integer, number
 from nbs_pin.controllers.registry import LAWS
 from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
@@ -29,13 +30,16 @@ class Track(FileUnits):
     """A law by name, or a .nbs file with a controller and its gains.
     nbs-paper: the paper's controller on two_link, its networks with gains for the arm on any other."""
     reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
-    """Motion to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints."""
+    """Motion to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints.
+    Paths of the tool: circle:RADIUS[@PLANE], line:DX,DY,DZ [m], or a .csv or .npz file with x, y, z."""
     frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0
     """Frequency of the sinusoid [rad/s]."""
     duration: Annotated[
-        float | None, number("--duration", above=0.0, most=100_000.0, unit="s"), default("10, or the file's length")
+        float | None,
+        number("--duration", above=0.0, most=100_000.0, unit="s"),
+        default("10, 5 for a path of the tool, or the file's"),
     ] = None
-    """Simulated time, a whole number of periods [s]."""
+    """Simulated time, a whole number of periods [s]; a path of the tool takes all of it."""
     period: Annotated[float, number("--period", least=1e-5, most=0.1, unit="s")] = 0.001
     """Control period [s]."""
     bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
@@ -74,5 +78,7 @@ class Track(FileUnits):
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another run in that folder."""
+    tool: OfTool = field(default_factory=ToolOptions)
+    """How a path of the tool is followed."""
     arm: OfArm = field(default_factory=ArmOptions)
     """How the arm is read."""

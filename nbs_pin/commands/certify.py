@@ -103,9 +103,8 @@ def _task(options: Certify, controller: LyapunovLaw, truth: Robot | None) -> Tas
             f"--trajectories applies to a model that is not exact, and this one is exact for {robot.name}; "
             "omit it, or give the true arm with --against."
         )
-    motion, duration = motion_of(
-        options.reference, robot, frequency=options.frequency, period=period, **options.units()
-    )
+    settings = {**options.units(), **options.tool.given()}
+    motion, duration = motion_of(options.reference, robot, frequency=options.frequency, period=period, **settings)
     numbers = None if options.disturbance is None else plain_numbers(options.disturbance) or []
     return dataclasses.replace(
         blank,

@@ -33,6 +33,7 @@ from nbs_pin.simulation.loop import LONGEST_PLANT_STEP
 from nbs_pin.simulation.plant import Plant
 from nbs_pin.simulation.registry import build_plant
 from nbs_pin.simulation.simulate import simulate
+from nbs_pin.simulation.tool_errors import tool_errors, tool_of
 
 FILES = ("run.npz", "tracking.png", "replay.html", SUMMARY)
 """Files of `write_results`."""
@@ -46,9 +47,11 @@ def run(options: Track, console: Console, notes: Console) -> None:
         raise OptionError("--start and --start-error were both given; choose one.")
     with notes.status(f"loading {options.robot}"):
         robot = arm_of(options)
-    motion, length = motion_of(
-        options.reference, robot, frequency=options.frequency, period=options.period, **options.units()
-    )
+    settings = {**options.units(), **options.tool.given(), "duration": options.duration}
+    with notes.status(f"planning {options.reference}"):
+        motion, length = motion_of(
+            options.reference, robot, frequency=options.frequency, period=options.period, **settings
+        )
     duration = options.duration or length
     results = Results.of(options, robot.name, robot, robot=robot.source, duration=duration)
     results = results.check(FILES, options.force)
@@ -146,8 +149,9 @@ def track(
 def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     """`metrics.summary` of the run and the RMS error over its last 30 %, as JSON can store them.
 
-    With a robot, also how far each joint left its position range, as the plants have no joint stops. `units` says in
-    what the numbers of each joint are: those of one that slides are in m and N, whatever the key says.
+    With a robot, also how far each joint left its position range, as the plants have no joint stops, and how far the
+    tool was from its path, if it followed one. `units` says in what the numbers of each joint are: those of one that
+    slides are in m and N, whatever the key says.
     """
     values = metrics.summary(run)
     values["units"] = by_quantity(run.slides)
@@ -155,6 +159,9 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     if robot is not None:
         beyond = np.maximum(robot.lower - run.q, run.q - robot.upper).reshape(-1, run.nv)
         values["outside_position_range_rad"] = np.maximum(beyond.max(axis=0), 0.0).tolist()
+        tool = tool_of(run)
+        if tool is not None:
+            values["tool"] = tool | tool_errors(run, robot).figures()
     return values
 
 
@@ -241,12 +248,30 @@ def _converged(figures: dict[str, Any]) -> str:
     return "not within the run" if time is None else f"{time:.3f} s"
 
 
+def _tool_lines(figures: dict[str, Any]) -> list[str]:
+    """The errors of the tool along its path, if it followed one."""
+    if "tool" not in figures:
+        return []
+    tool = figures["tool"]
+    line = (
+        f"'{tool['frame']}' along the {tool['path']}: RMS error {1e3 * tool['rms_position_error_m']:.2g} mm, peak "
+        f"{1e3 * tool['peak_position_error_m']:.2g} mm"
+    )
+    if tool["orientation"] == "hold":
+        line += (
+            f"; orientation {tool['rms_orientation_error_rad']:.2g} rad, peak "
+            f"{tool['peak_orientation_error_rad']:.2g} rad"
+        )
+    return [line]
+
+
 def _lines(figures: dict[str, Any], compile_time: float, wall_time: float) -> list[str]:
     saturated, late = figures["saturated_fraction"], figures["saturated_fraction_late"]
     units = figures["units"]["position"]
     remedy = f": {option('joint_stops', 'keep')} stops it" if figures["joint_stops"] == "drop" else ""
     outside = zip(figures["joints"], figures["outside_position_range_rad"], units, strict=True)
     return [
+        *_tool_lines(figures),
         f"converged (‖error‖ < 0.1 {several(units)} to the end): {_converged(figures)}",
         f"some joint at its effort limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
         *(f"{joint} left its range by {excess:.3g} {unit}{remedy}"

@@ -21,7 +21,8 @@ from nbs_pin.robots.robot import ARM, Robot
 DesiredMotion: TypeAlias = Callable[[Any], Reference]
 """ref(t) -> Reference, for a time [s] (shapes (n,)) or an array of times (shapes (..., n)).
 
-Motions may state `duration` [s], how long they last, and `largest_jerk` (n,), a bound of |ȧ_d| while they do [rad/s³].
+Motions may state `duration` [s], how long they last, `largest_jerk` (n,), a bound of |ȧ_d| while they do [rad/s³], and
+`notes`, a dict for `Run.info`.
 """
 
 

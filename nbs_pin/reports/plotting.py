@@ -4,6 +4,7 @@ import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,12 @@ from nbs_pin.base.arguments import checked, count, maybe, writable
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
-from nbs_pin.base.records import RUN, Run
+from nbs_pin.base.records import ROW_ARRAYS, RUN, Run
+from nbs_pin.robots.named import robot_of
 from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 from nbs_pin.robots.urdf import JointData
 from nbs_pin.simulation.metrics import saturated_fraction
+from nbs_pin.simulation.tool_errors import tool_errors, tool_of
 
 ACTUAL, REFERENCE, ERROR = "#1f5fbf", "#ff8c1a", "#b3261e"
 TORQUE, LIMIT, SATURATED, FAST = "#22734d", "#8a8f98", "#f6c945", "#7b3fa0"
@@ -59,11 +62,13 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
 
     Each row shows actual and desired position, |error| on a logarithmic scale (wrapped on continuous joints), and the
     applied torque with the effort limits, saturated stretches shaded. `start` selects one start of a batched run. With
-    a `robot`, position limits are drawn where the joint comes near them, and stretches are shaded in which it is
-    outside them or faster than its velocity limit.
+    a `robot`, the arm that ran, position limits are drawn where the joint comes near them, and stretches are shaded in
+    which it is outside them or faster than its velocity limit. A run along a path of the tool has a last row: its
+    errors and the path, for which None loads the arm that the run names.
 
     Raises:
-        ArgumentError: If the start does not exist, or the robot has another number of joints.
+        ArgumentError: If the start does not exist, the robot has another number of joints, or the arm of a path of the
+            tool is missing or has changed.
 
     Example:
         >>> import tempfile
@@ -88,9 +93,12 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
     cut = np.abs(asked) > run.effort_limit
     tau[-1], cut[-1] = np.nan, False  # commanded, but never applied
     fraction = float(np.ravel(saturated_fraction(run))[start])
-    with picture(path, 13.0, 1.15 + 1.5 * run.nv) as figure:
-        grid = figure.subplots(run.nv, 3, sharex=True, squeeze=False)
-        for joint, (position_axes, error_axes, torque_axes) in enumerate(grid):
+    tool = tool_of(run)
+    rows = run.nv + (tool is not None)
+    with picture(path, 13.0, 1.15 + 1.5 * rows + (1.5 if tool else 0.0)) as figure:
+        heights = [1.0] * run.nv + [2.0] * (tool is not None)
+        grid = figure.subplots(rows, 3, sharex=True, squeeze=False, height_ratios=heights)
+        for joint, (position_axes, error_axes, torque_axes) in enumerate(grid[: run.nv]):
             _draw_position(position_axes, run.t, q[:, joint], q_ref[:, joint])
             if robot is not None:
                 _draw_stops(position_axes, run.t, q[:, joint], v[:, joint], robot.joints[joint])
@@ -103,7 +111,36 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
                     axes.annotate(f"[{unit}]", (0.0, 1.0), xycoords="axes fraction", va="bottom", fontsize=7,
                                   color="#5d6b7a")  # fmt: skip
         _dress(figure, grid, run, fraction)
+        if tool is not None:
+            moved = replace(run, **{name: getattr(run, name).reshape(len(run.t), starts, run.nv)[:, start]
+                                    for name in ROW_ARRAYS})  # fmt: skip
+            _draw_tool(figure, grid[-1], moved, robot_of(run) if robot is None else robot, tool)
     return Path(path)
+
+
+def _draw_tool(figure: Figure, row: np.ndarray, run: Run, robot: Robot, tool: dict[str, Any]) -> None:
+    """Errors of the tool's position and orientation, and its path, seen along the direction in which it is thinnest."""
+    errors = tool_errors(run, robot)
+    row[0].set_ylabel(_short(tool["frame"]), fontweight="bold", color="#1d2733")
+    titles = ["distance from the path [m]", "angle from its orientation [rad]"]
+    shown = [errors.position, errors.orientation]
+    for axes, title, error in zip(row, titles, shown if tool.get("orientation") == "hold" else shown[:1], strict=False):
+        _draw_error(axes, run.t, error)
+        axes.set_title(title, loc="left", fontsize=8.5, color="#1d2733")
+    if tool.get("orientation") != "hold":
+        row[1].set_axis_off()
+    place = row[2].get_subplotspec()
+    row[2].remove()
+    axes = figure.add_subplot(place)
+    asked, actual = (robot.pose(q, tool["frame"])[:, :3, 3] for q in (run.q_ref, run.q))
+    across, up = np.sort(np.argsort(np.ptp(asked, axis=0))[1:])
+    axes.plot(asked[:, across], asked[:, up], color=REFERENCE, linewidth=2.6, alpha=0.75)
+    axes.plot(actual[:, across], actual[:, up], color=ACTUAL)
+    axes.plot(*asked[0, [across, up]], "o", color=REFERENCE, markersize=4)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_title("path [m]", loc="left", fontsize=8.5, color="#1d2733")
+    axes.set_xlabel("xyz"[across])
+    axes.set_ylabel("xyz"[up])
 
 
 def _draw_position(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarray, " rows"],

@@ -23,18 +23,25 @@ from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry
 from meshcat.path import Path as ScenePath
 
 from nbs_pin.base.arguments import checked, count, maybe, paths, writable
-from nbs_pin.base.doors import option, own_arm
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import RUN, Run
-from nbs_pin.robots.named import load_named
+from nbs_pin.robots.named import robot_of
 from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 from nbs_pin.robots.visuals import Visual, link_visuals, tip
+from nbs_pin.simulation.tool_errors import tool_of
 
 FRAME_RATE = 50.0
 """Frames per second of run time [1/s]; the page interpolates between them."""
 FARTHEST = 1e6
 """Configurations beyond this are not drawn [rad, m]."""
+LEAST_FRAMES = 300
+"""Frames of a short run along a path of the tool, whose trace is not to have corners."""
+MAX_POINTS = 400
+"""Most points of such a path."""
+SHORTEST_PATH = 1e-6
+"""Shorter ones are not drawn [m]."""
 MAX_FRAMES = 12_000
 """Longer runs get fewer frames per second, so that the page stays small."""
 
@@ -67,13 +74,14 @@ def replay(
         ...     print(nbs.replay(run, f"{folder}/replay.html").name)
         replay.html
     """
-    robot = _robot_of(run) if robot is None else robot
+    robot = robot_of(run) if robot is None else robot
     if robot.joint_names != run.joint_names:
         raise ArgumentError(
             f"the run moves joints {', '.join(run.joint_names)} but {robot.name} has {', '.join(robot.joint_names)}: "
             "give the robot that ran."
         )
-    rows = _frame_rows(run.t)
+    tool = tool_of(run)
+    rows = _frame_rows(run.t, LEAST_FRAMES if tool else 0)
     q, q_ref = (_one_start(array, start)[rows] for array in (run.q, run.q_ref))
     if not (np.isfinite(q).all() and np.isfinite(q_ref).all()):
         raise ArgumentError("the run has configurations that are not finite: show the part before it diverged.")
@@ -81,7 +89,7 @@ def replay(
         raise ArgumentError(f"the run has configurations beyond ±{FARTHEST:g}: show the part before it diverged.")
     poses = np.stack([body_poses(robot, q), body_poses(robot, q_ref)], axis=1)
     visuals = link_visuals(robot, package_dirs)
-    joint, point = tip(robot)
+    joint, point = tip(robot) if tool is None else _place(robot, tool["frame"])
     data = {
         "name": robot.name,
         "notes": _notes(run),
@@ -93,6 +101,7 @@ def replay(
             if frame.type == pin.FrameType.BODY
         },
         "tip": {"body": joint, "point": point.tolist()},
+        "path": "" if tool is None else _encoded(_path(robot, _one_start(run.q_ref, start), tool["frame"]), np.float32),
         "view": _view(robot, visuals, poses),
         "commands": [base64.b64encode(umsgpack.packb(command)).decode() for command in _commands(robot, visuals)],
         "times": _encoded(run.t[rows], np.float64),
@@ -113,19 +122,6 @@ def body_poses(robot: Robot, q: Float[np.ndarray, "rows n"]) -> Float[np.ndarray
     return poses
 
 
-def _robot_of(run: Run) -> Robot:
-    """The robot that the run names; raises ArgumentError unless it is still the one that ran."""
-    if not run.robot:
-        raise ArgumentError(f"the run names no robot: give it as {own_arm()}.")
-    robot = load_named("the run", run.robot, run.robot_options)
-    if robot.sha256 != run.robot_sha256:
-        raise ArgumentError(
-            f"'{run.robot}' is not the arm that ran (description or gravity differ: {robot.sha256[:12]} now, "
-            f"{run.robot_sha256[:12] or 'nothing'} in the run): give the one that ran as {own_arm()}."
-        )
-    return robot
-
-
 def _one_start(array: Float[np.ndarray, "rows *batch n"], start: int) -> Float[np.ndarray, "rows n"]:
     starts = array.reshape(array.shape[0], -1, array.shape[-1])
     if not 0 <= start < starts.shape[1]:
@@ -133,9 +129,24 @@ def _one_start(array: Float[np.ndarray, "rows *batch n"], start: int) -> Float[n
     return starts[:, start]
 
 
-def _frame_rows(t: Float[np.ndarray, " rows"]) -> Int[np.ndarray, " frames"]:
+def _place(robot: Robot, frame: str) -> tuple[int, Float[np.ndarray, "3"]]:
+    """The joint that moves the frame, and the frame's origin in the frame of that joint [m]."""
+    found = robot.model.frames[robot.frame_id(frame)]
+    return int(found.parentJoint), np.array(found.placement.translation)
+
+
+def _path(robot: Robot, q_ref: Float[np.ndarray, "rows n"], frame: str) -> Float[np.ndarray, "points 3"]:
+    """The path that the tool was to follow [m], points at nearly even distances; none if it went nowhere."""
+    points = robot.pose(q_ref, frame)[:, :3, 3]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
+    if along[-1] < SHORTEST_PATH:
+        return points[:0]
+    return np.asarray(points[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], MAX_POINTS)))])
+
+
+def _frame_rows(t: Float[np.ndarray, " rows"], least: int = 0) -> Int[np.ndarray, " frames"]:
     """Rows to show, nearest to an even clock, the last included: every frame is a state the run recorded."""
-    count = min(int((t[-1] - t[0]) * FRAME_RATE) + 2, MAX_FRAMES)
+    count = min(max(int((t[-1] - t[0]) * FRAME_RATE) + 2, least), MAX_FRAMES)
     after = np.searchsorted(t, np.linspace(t[0], t[-1], count) - 1e-9 * (t[-1] - t[0]))
     return np.unique(np.minimum(after, len(t) - 1))
 

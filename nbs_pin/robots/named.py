@@ -6,6 +6,7 @@ from typing import Any
 
 from nbs_pin.base.doors import as_loaded, own_arm
 from nbs_pin.base.exceptions import ArgumentError, RobotNotFound
+from nbs_pin.base.records import Run
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.robots.xacro_source import refusing
 
@@ -37,3 +38,16 @@ def load_named(where: str, source: str, options: Mapping[str, Any]) -> Robot:
             f"{where} is of the arm {as_loaded(source, options)}, which is not there; put it back, or give it as "
             f"{own_arm()}."
         ) from error
+
+
+def robot_of(run: Run) -> Robot:
+    """The robot that the run names; raises ArgumentError unless it is still the one that ran."""
+    if not run.robot:
+        raise ArgumentError(f"the run names no robot: give it as {own_arm()}.")
+    robot = load_named("the run", run.robot, run.robot_options)
+    if robot.sha256 != run.robot_sha256:
+        raise ArgumentError(
+            f"'{run.robot}' is not the arm that ran (description or gravity differ: {robot.sha256[:12]} now, "
+            f"{run.robot_sha256[:12] or 'nothing'} in the run): give the one that ran as {own_arm()}."
+        )
+    return robot

@@ -20,6 +20,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.storable import storable
 from nbs_pin.base.units import several, units
 from nbs_pin.robots.catalogue import Entry, find
+from nbs_pin.robots.kinematics import Kinematics
 from nbs_pin.robots.pinocchio_model import build_model, check_inertia, with_limits
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
 from nbs_pin.robots.urdf_options import read_options
@@ -27,7 +28,7 @@ from nbs_pin.robots.urdf_options import read_options
 
 @storable(("name", "source", "options", "sha256", "effort_limit"))
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot:
+class Robot(Kinematics):
     """A fixed-base arm with nq = nv = n joints, as returned by `load_robot`.
 
     A `continuous` joint is an unbounded revolute joint whose tracking error is wrapped (`difference`); locked joints

@@ -247,6 +247,7 @@ def _block(
     times, ahead, desired, target = loop.schedule(reference, first, steps)
     leads = ahead.tolist()
     run = loop.blank_run(times, desired, *start, controller=loop.name)
+    run.info.update(getattr(reference, "notes", {}))
     memory = loop.law.initial_memory(run.q[0]) if first == 0 else memory
     # No overflow warnings: every torque and state is checked, and reported with its time.
     with np.errstate(over="ignore", invalid="ignore"):

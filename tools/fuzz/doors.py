@@ -16,8 +16,8 @@ import nbs_pin as nbs
 
 RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
-    "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra", "NbsPinError", "NoSuchFile", "RobotError",
-    "RobotNotFound", "SimulationDiverged", "TooLarge",
+    "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
+    "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -92,12 +92,23 @@ class Stock:
     def _identified(self) -> Any:
         return nbs.identify(self.data, self.robot)
 
+    def _tool_path(self) -> Any:
+        begin = self.robot.pose(BENT, "tip")[:3, 3]
+        return nbs.ToolPath.line(begin, [-0.1, 0.0, 0.05])
+
+    def _tool_motion(self) -> Any:
+        return nbs.tool_motion(self.robot, self.tool_path, "tip", posture=BENT)
+
     def path(self, name: str, write: Callable[[Path], Any]) -> Path:
         """A file, written at its first use."""
         file = self.folder / name
         if not file.exists():
             write(file)
         return file
+
+
+def _write_tool_path(file: Path) -> None:
+    np.savez(file, x=np.array([0.5, 0.6, 0.6]), y=np.zeros(3), z=np.array([0.3, 0.3, 0.2]))
 
 
 @functools.cache
@@ -108,6 +119,8 @@ def stock() -> Stock:
 
 _TOOL = str(Path(nbs.load_robot("three_link").urdf.path))
 Z, Q, V = np.zeros(2), np.array([0.3, -0.2]), np.array([0.1, 0.4])
+BENT = np.array([0.3, 1.2])
+"""A posture from which the tip can move in every direction."""
 
 
 def _common(s: Stock) -> dict[str, Any]:
@@ -198,6 +211,20 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "plot_tracking": {"path": s.folder / "plot.png"},
         "propose": {"error": 0.1, "disturbance": [1.0, 1.0], "duration": 0.5, "periods": (0.01,)},
         "replay": {"path": s.folder / "replay.html"},
+        "tool_motion": {"path": s.tool_path, "frame": "tip", "posture": BENT, "duration": 5.0},
+        "tool_posture": {"frame": "tip"},
+        "tool_errors": {"frame": "tip"},
+        "load_tool_path": {"path": s.path("tool.npz", _write_tool_path)},
+        "ToolPath.circle": {"start": np.array([0.5, 0.0, 0.3]), "radius": 0.1},
+        "ToolPath.line": {"start": np.array([0.5, 0.0, 0.3]), "displacement": np.array([0.1, 0.0, 0.0])},
+        "ToolPath.through": {"positions": np.array([[0.5, 0.0, 0.3], [0.6, 0.0, 0.3], [0.6, 0.0, 0.2]])},
+        "ToolPath.poses": {"s": 0.5, "orientation": np.eye(3)},
+        "ToolPath.travelled": {"s": 0.5},
+        "Robot.frame_id": {"frame": "tip"},
+        "Robot.supporting": {"frame": "tip"},
+        "Robot.pose": {"frame": "tip"},
+        "Robot.jacobian": {"frame": "tip"},
+        "Margins": {"position": 0.1, "velocity": 0.1, "effort": 1.0},
         "simulate": {"disturbance": None, "q0": Q, "v0": Z, "workers": 1},
         "stream": {"disturbance": None, "q0": Q, "v0": Z, "block": 5},
         "squared_error": {"tau": V},
@@ -220,7 +247,8 @@ def _subjects(s: Stock) -> dict[str, Any]:
         nbs.Sampled(np.arange(5.0), np.zeros((5, 2))), s.motion, nbs.SinusoidalTorque([1.0, 2.0], 2.0),
         nbs.SlidingMode.for_robot(s.robot), nbs.SlotineLi.for_robot(s.robot), nbs.SquareWave([1.0, 2.0], 2.0),
         nbs.TimeOutside(), nbs.TorqueAware.for_robot(s.robot), nbs.TorqueNoise(1.0, 0.01), nbs.Uncertainty(0.1),
-        nbs.Watch(s.certificate),
+        nbs.Watch(s.certificate), s.tool_path, s.tool_motion, nbs.Margins(0.1),
+        nbs.tool_errors(s.run, s.robot, "tip"),
     ]  # fmt: skip
     return {type(x).__name__: x for x in found} | {
         "CompiledController": s.law.compile(),
