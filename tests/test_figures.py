@@ -18,7 +18,7 @@ controller = nbs.NeuralBackstepping.for_robot(robot, friction=friction)
 reference = nbs.Sinusoid.for_robot(robot, 1.0)
 starts = reference(0.0).q + np.array([[0.3], [1.0]]) * (-1.0) ** np.arange(robot.nv)
 plant = nbs.MujocoPlant(robot, joint_friction=sys.argv[2])
-run = nbs.simulate(plant, controller, reference, 6.0, 0.001, q0=starts)
+run = nbs.simulate(plant, controller, reference, 6.0, 0.001, q0=starts, check=False)  # z1 starts outside its range
 print(json.dumps({
     "rms": metrics.rms_error(run, after=3.0).max(),
     "converged": metrics.convergence_time(run).max(),

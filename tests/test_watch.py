@@ -234,7 +234,8 @@ def turning():
     begin = np.where(arm.continuous, np.pi - 0.05, 0.5 * (np.maximum(arm.lower, -3.0) + np.minimum(arm.upper, 3.0)))
     reference = nbs.MinimumJerk([begin, begin + np.where(arm.continuous, 0.4, 0.0)], [0.0, 0.5])
     plant = nbs.DynamicsPlant(rule.dynamics)
-    run = nbs.simulate(plant, rule, reference, 0.3, PERIOD, disturbance=nbs.SquareWave(np.full(arm.nv, 0.05), 9.0))
+    wave = nbs.SquareWave(np.full(arm.nv, 0.05), 9.0)
+    run = nbs.simulate(plant, rule, reference, 0.3, PERIOD, disturbance=wave, check=False)
 
     def within(q):
         return np.where(arm.continuous, np.remainder(q + np.pi, 2.0 * np.pi) - np.pi, q)
