@@ -219,8 +219,7 @@ class Robot(Kinematics):
             ArgumentError: If a number is out of range.
             RobotError: If there is no such link, or no body has this inertia.
         """
-        rows = inertia.tolist() if isinstance(inertia, np.ndarray) else inertia
-        load = {"mass": mass, "com": com, "inertia": rows}
+        load = {"mass": mass, "com": com, "inertia": inertia}
         return self._again(payload={**self.options.get("payload", {}), frame: load})
 
     @checked(file=path, frame=text)

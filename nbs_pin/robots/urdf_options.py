@@ -4,11 +4,13 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from itertools import islice
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
+import numpy as np
+
+from nbs_pin.base.checks import floats, is_usual
 from nbs_pin.base.exceptions import ArgumentError
 
 ZeroLimits: TypeAlias = Literal["refuse", "unlimited"]
@@ -204,26 +206,31 @@ def _three(name: str) -> Callable[[Any], tuple[float, ...]]:
     return convert
 
 
+def _array(value: Any) -> np.ndarray:
+    """The value as an array of finite numbers, empty if it is none."""
+    try:
+        numbers = floats("numbers", value)
+    except ArgumentError:
+        return np.empty(0)
+    return numbers if is_usual(numbers) else np.empty(0)
+
+
 def _numbers(value: Any, count: int) -> tuple[float, ...]:
     """`count` finite numbers as a tuple, or the empty tuple."""
-    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
-        return ()
-    numbers = tuple(islice(value, count + 1))
-    return tuple(map(float, numbers)) if len(numbers) == count and all(map(_finite, numbers)) else ()
+    numbers = _array(value)
+    return tuple(numbers.tolist()) if numbers.shape == (count,) else ()
 
 
 def _six(value: Any) -> tuple[float, ...]:
     """Ixx, Ixy, Ixz, Iyy, Iyz, Izz of one number, three moments, six numbers or a symmetric matrix; else empty."""
-    if _finite(value):
-        return (float(value), 0.0, 0.0, float(value), 0.0, float(value))
-    if len(three := _numbers(value, 3)) == 3:
-        return (three[0], 0.0, 0.0, three[1], 0.0, three[2])
-    if six := _numbers(value, 6):
-        return six
-    rows = [_numbers(row, 3) for row in islice(value, 4)] if isinstance(value, Iterable) else []
-    if len(rows) != 3 or not all(rows) or any(rows[i][j] != rows[j][i] for i in range(3) for j in range(i)):
+    numbers = _array(value)
+    if numbers.shape == (6,):
+        return tuple(numbers.tolist())
+    if numbers.shape in ((), (3,)):
+        numbers = np.diag(np.full(3, numbers))
+    if numbers.shape != (3, 3) or not np.array_equal(numbers, numbers.T):
         return ()
-    return (*rows[0], *rows[1][1:], rows[2][2])
+    return tuple(numbers[np.triu_indices(3)].tolist())
 
 
 def _plain(value: Payload | Tool) -> dict[str, Any]:
