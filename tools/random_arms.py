@@ -14,10 +14,15 @@ from random_arms import random_arm
 import nbs_pin as nbs
 
 
+TRANSITION = 0.002
+"""Speed at which the law feeds most of the Coulomb friction forward [rad/s, m/s]; MuJoCo's turns over at once."""
+
+
 def error(seed: int, folder: Path) -> tuple[int, float]:
     """Number of joints, and the largest RMS error of a joint over the second half of 4 s [rad, m]."""
     robot = random_arm(seed, folder)
-    law = nbs.NeuralBackstepping.for_robot(robot, friction=nbs.JointFriction.of(robot))
+    friction = nbs.JointFriction.of(robot, TRANSITION)
+    law = nbs.NeuralBackstepping.for_robot(robot, friction=friction)
     run = nbs.simulate(nbs.MujocoPlant(robot, joint_friction="keep"), law, nbs.Sinusoid.for_robot(robot), 4.0, 0.001)
     return robot.nv, float(nbs.metrics.rms_error(run, 2.0).max())
 
