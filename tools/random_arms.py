@@ -13,7 +13,6 @@ from random_arms import random_arm
 
 import nbs_pin as nbs
 
-
 TRANSITION = 0.002
 """Speed at which the law feeds most of the Coulomb friction forward [rad/s, m/s]; MuJoCo's turns over at once."""
 
