@@ -6,34 +6,9 @@ radian: what the model does not know acts as a torque against the law's stiffnes
 allow, errs half as much again: it shapes its stiffness by the inertia, which a light wrist has little of.
 """
 
-import tempfile
-import xml.etree.ElementTree as ET
-from pathlib import Path
-
 import numpy as np
 
 import nbs_pin as nbs
-from nbs_pin.robots.catalogue import find
-
-LOAD = """
-<robot>
-  <link name="load">
-    <inertial><mass value="{mass}"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>
-  </link>
-  <joint name="load_joint" type="fixed"><parent link="panda_link8"/><child link="load"/><origin xyz="0 0 0.1"/></joint>
-</robot>
-"""
-
-
-def loaded_panda(mass: float) -> nbs.Robot:
-    """The Panda with a load [kg] 0.1 m beyond its flange: the same URDF with one link more."""
-    entry = find("panda")
-    tree = ET.parse(entry.path)
-    tree.getroot().extend(ET.fromstring(LOAD.format(mass=mass)))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "loaded_panda.urdf"
-        tree.write(path)
-        return nbs.load_robot(path, lock=entry.lock)
 
 
 def steady_error(controller: nbs.Controller, truth: nbs.Robot, reference: nbs.Sinusoid, duration: float) -> float:
@@ -44,7 +19,8 @@ def steady_error(controller: nbs.Controller, truth: nbs.Robot, reference: nbs.Si
 
 def main(duration: float = 8.0) -> dict[str, float]:
     """Prints and returns the steady error of each case [rad]."""
-    bare, loaded = nbs.load_robot("panda"), loaded_panda(1.0)
+    bare = nbs.load_robot("panda")
+    loaded = bare.with_payload("panda_link8", 1.0, com=[0.0, 0.0, 0.1], inertia=1e-3)
     reference = nbs.Sinusoid.for_robot(bare)
     laws = {"NBS": nbs.NeuralBackstepping, "computed torque": nbs.ComputedTorque}
     cases = {"no load": (bare, bare), "1 kg unknown": (bare, loaded), "1 kg known": (loaded, loaded)}

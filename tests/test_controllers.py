@@ -67,7 +67,7 @@ def test_whole_turns_of_a_continuous_joint_do_not_matter(law):
 def test_defaults_follow_a_moving_reference(law, robot):
     """Out of the box: from the reference's start, every law stays near it in the truth its model believes."""
     reference = nbs.Sinusoid.for_robot(robot, amplitude=0.2)
-    run = nbs.simulate(nbs.DynamicsPlant(PinocchioDynamics(robot)), law(robot), reference, 0.5, 0.001, check=False)
+    run = nbs.simulate(nbs.DynamicsPlant(PinocchioDynamics(robot)), law(robot), reference, 0.5, 0.001)
     error = np.abs(robot.difference(run.q, run.q_ref)).max()
     modelled = law not in (LAWS["pid"], LAWS["pd-gravity"])
     assert error < (1e-3 if modelled else 0.15)
@@ -228,7 +228,8 @@ def check_lyapunov_identity(controller: NeuralBackstepping, seed: int) -> None:
     robot, rng = dynamics.robot, np.random.default_rng(seed)
     reference = nbs.Sinusoid(amplitude=rng.uniform(0.1, 1.0, robot.nv), frequency=rng.uniform(0.5, 3.0), offset=0.0)
     start = reference(0.0).q + rng.normal(size=robot.nv)
-    run = nbs.simulate(nbs.DynamicsPlant(dynamics), controller, reference, 0.002, 1e-4, q0=start, effort_limit=np.inf)
+    anywhere = {"q0": start, "effort_limit": np.inf, "check": False}
+    run = nbs.simulate(nbs.DynamicsPlant(dynamics), controller, reference, 0.002, 1e-4, **anywhere)
     rows = slice(0, None, 4)
     disturbance = rng.normal(size=run.q[rows].shape)
     q, v, q_ref, v_ref, a_ref = (x[rows] for x in (run.q, run.v, run.q_ref, run.v_ref, run.a_ref))

@@ -139,7 +139,7 @@ def test_a_drawing_that_fails_costs_neither_run_nor_exit_code(drawn, error, tmp_
 
 
 def test_a_full_disk_while_drawing_is_told_and_keeps_the_run(tmp_path, monkeypatch, capsys):
-    def fails(run, path):
+    def fails(run, path, **_):
         raise OSError(28, "No space left on device", str(path))
 
     monkeypatch.setattr("nbs_pin.commands.track.plot_tracking", fails)

@@ -111,7 +111,7 @@ def test_on_the_reference_the_torque_is_the_inverse_dynamics(law):
 def test_the_arm_stays_on_the_reference(name):
     law = trained(name)  # absurd gains chatter at this period; the theorem is of continuous time
     reference = Sinusoid.for_robot(law.dynamics.robot, amplitude=0.2)
-    run = simulate(DynamicsPlant(law.dynamics), law, reference, 0.5, 0.005, check=False)
+    run = simulate(DynamicsPlant(law.dynamics), law, reference, 0.5, 0.005)
     assert np.abs(run.q - run.q_ref).max() < 1e-3
 
 

@@ -229,7 +229,10 @@ def _check_arm(data: Dataset, robot: Robot) -> None:
     if fault:
         raise ArgumentError(f"{fault}.")
     if not data.tau.any():
-        raise ArgumentError(f"{in_words(data, 'the data')} without torque fit inertias of every scale; record torques.")
+        raise ArgumentError(
+            f"{in_words(data, 'the data')} has no torque: inertias of every scale explain such a motion; "
+            "record torques."
+        )
 
 
 def _base_directions(
