@@ -101,7 +101,7 @@ def test_a_run_in_a_folder_is_named_by_the_option_of_the_folder(capsys, tmp_path
     [
         ("track two_link --disturbance constant:1e300", "--disturbance is 'constant:1e300'"),
         ("replay run.npz --start 3", "--start 3 does not exist"),
-        ("learn still.npz --robot two_link --model identified", "the data without torque"),
+        ("learn still.npz --robot two_link --model identified", "the data has no torque"),
         ("learn still.npz --model cholesky", "use --loss acceleration"),
         (
             "learn still.npz --model residual --robot two_link --loss acceleration",
