@@ -568,6 +568,27 @@ def test_rotors_are_read_from_a_urdf(tmp_path, stated, felt):
     np.testing.assert_allclose(robot.armature, felt, atol=1e-15)
 
 
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("two_link", {"armature": 0.2}),
+        ("two_link", {"payload": {"tip": {"mass": 1.0, "com": [0.0, 0.1, 0.0], "inertia": 0.01}}}),
+        ("two_link", {"base_rpy": [0.5, 0.2, 0.1], "base_xyz": [0.0, 0.0, 1.0]}),
+        ("three_link", {"lock": {"joint2": 0.3}}),
+    ],
+)
+def test_what_is_added_to_a_file_is_checked_against_the_description_with_it(name, options, tmp_path):
+    """The file alone is another arm: neither confirmed by it nor found false."""
+    robot = nbs.load_robot(name, **options)
+    certificate = nbs.certify(nbs.NeuralBackstepping.for_robot(robot), np.full(robot.nv, 2.0))
+    path, description = nbs.write_certificate(certificate, tmp_path / "c.json"), tmp_path / "arm.urdf"
+    assert statuses(verify(path), OPEN) == ["the tree is the arm's"]
+    description.write_bytes(robot.urdf.without_geometry())
+    assert verify(path, urdf=description).confirmed
+    assert not statuses(verify(path), FALSE)
+    assert "the tree is the arm's" in statuses(verify(path, urdf=find(name).path), FALSE)
+
+
 def test_premises_are_listed(rubbing, tmp_path):
     taken = statuses(verify(written(rubbing, tmp_path / "c.json")), TAKEN)
     assert {"disturbance", "law SlotineLi", "joint friction and |v_d|", "V(0) of the start"} <= set(taken)

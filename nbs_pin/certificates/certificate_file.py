@@ -31,6 +31,8 @@ FORMAT = "nbs_pin certificate 1"
 """Format name; another one for every change of meaning."""
 _FORMS = (("D0", "largest"), ("D0", "least"), ("I", "largest"), ("I", "least"))
 """Weight and side of the four bounds of the inertia."""
+_CHANGING = ("armature", "rotor_inertia", "payload", "tool", "base_rpy", "base_xyz", "repair", "inertia_from")
+"""Arguments of `load_robot` after which the arm is another than its file states."""
 _PREMISES = (Group.LOADS, Group.FRICTION, Group.MODEL_ERROR, Group.STRUCTURE)
 
 
@@ -148,9 +150,17 @@ def _arm(certificate: Certificate) -> dict[str, Any] | None:
     return {
         "name": "a model without an arm" if robot is None else robot.name,
         "sha256": None if robot is None else robot.sha256,
-        "urdf": None if described is None else str(described.urdf.path.absolute()),
+        "urdf": None if described is None or not is_in_its_file(described) else str(described.urdf.path.absolute()),
         "joints": [_joint(tree, i, names[i], bool(continuous[i])) for i in range(tree.nv)],
     }
+
+
+def is_in_its_file(robot: Robot) -> bool:
+    """Whether a URDF file states the tree of the arm: nothing was attached to it, locked off zero or replaced in it."""
+    options, source = robot.options, robot.urdf.path
+    changed = any(options.get(name) for name in _CHANGING)
+    moved = isinstance(options.get("lock"), dict)  # a list locks at zero
+    return source.suffix == ".urdf" and not robot.source.endswith(".toml") and not changed and not moved
 
 
 def _joint(tree: RigidTree, i: int, name: str, continuous: bool) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design
-from nbs_pin.certificates.certificate_file import write_certificate
+from nbs_pin.certificates.certificate_file import is_in_its_file, write_certificate
 from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.loads import MARGIN
 from nbs_pin.certificates.model_structure import is_exact
@@ -32,7 +32,7 @@ from nbs_pin.storage.checkpoints import load, load_with, save
 
 FILES = ("certificate.png", "run.npz", SUMMARY)
 """Files of `write_results`; run.npz only if a worst motion was found."""
-MONITOR, DESIGNED, CERTIFICATE = "monitor.png", "controller.nbs", "certificate.json"
+MONITOR, DESIGNED, CERTIFICATE, ARM = "monitor.png", "controller.nbs", "certificate.json", "arm.urdf"
 """Further files, for a monitored run, for a design and for `nbs-pin verify`."""
 
 
@@ -47,7 +47,7 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         robot = arm_of(controller, task)
         watched = None if options.monitor is None else Run.load(options.monitor)
     results = Results.of(options, robot.name, robot, against=robot.source)
-    results = results.check((*FILES, MONITOR, DESIGNED, CERTIFICATE), options.force, whose="another certificate")
+    results = results.check((*FILES, MONITOR, DESIGNED, CERTIFICATE, ARM), options.force, whose="another certificate")
     with results.made() as folder:
         proposal = None
         if options.wanted is not None:
@@ -204,23 +204,27 @@ def figures(result: Certified) -> dict[str, Any]:
 def write_results(result: Certified, results: Results, *, as_file: bool = False) -> tuple[dict[str, Any], list[str]]:
     """Write the files, the pictures last; returns the figures and the names of the files.
 
-    as_file: whether to write `CERTIFICATE`; no file of another certificate stays in the folder.
+    as_file: whether to write `CERTIFICATE`, and `ARM` if no URDF file states what was certified; no file of another
+    certificate stays in the folder.
     Raises OSError if they cannot be written.
     """
     found, folder = figures(result), results.folder
-    with results.replaced((FILES[1], DESIGNED, CERTIFICATE, FILES[0], MONITOR), found) as draft:
+    with results.replaced((FILES[1], DESIGNED, CERTIFICATE, ARM, FILES[0], MONITOR), found) as draft:
         if result.attack is not None:
             result.attack.run.save(draft / FILES[1])
         if result.proposal is not None:
             save(result.proposal.controller, draft / DESIGNED)
         if as_file:
             write_certificate(result.certificate, draft / CERTIFICATE)
+            robot = result.certificate.robot
+            if robot is not None and not is_in_its_file(robot):
+                (draft / ARM).write_bytes(robot.urdf.without_geometry())
     with drawing(folder / FILES[0]) as path:
         plot_certificate(result.certificate, result.attack, path)
     if result.watched is not None:
         with drawing(folder / MONITOR) as path:
             plot_monitor(result.watched, path, units=result.certificate.joint_units)
-    written = (FILES[0], FILES[1], MONITOR, DESIGNED, CERTIFICATE, SUMMARY)
+    written = (FILES[0], FILES[1], MONITOR, DESIGNED, CERTIFICATE, ARM, SUMMARY)
     return found, [name for name in written if (folder / name).exists()]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from nbs_pin.base.doors import BLANK, option
 from nbs_pin.robots.description import read_description
 from nbs_pin.robots.packages import Packages
-from nbs_pin.robots.urdf_checks import MOVING
+from nbs_pin.robots.urdf_checks import MOVING, nearest_to_zero
 from nbs_pin.robots.urdf_options import Payload, UrdfOptions
 from nbs_pin.robots.urdf_source import Node, shorten
 
@@ -85,7 +85,7 @@ def _add_tool(robot: Node, options: UrdfOptions) -> UrdfOptions:
     _absolute_meshes(source, Packages(tool.file, options.package_dirs))
     _fix(robot, frame, prefix + base, tool.xyz, tool.rpy)
     moving = {
-        joint.text("name"): _nearest_to_zero(joint)
+        joint.text("name"): nearest_to_zero(joint)
         for joint in source.named("joint")
         if joint.element.get("type") in MOVING and joint.element.find("mimic") is None
     }
@@ -95,14 +95,6 @@ def _add_tool(robot: Node, options: UrdfOptions) -> UrdfOptions:
         first = next(iter(new))
         warnings.warn(f"{text}; lock them elsewhere by {option('lock', {first: BLANK})}.", stacklevel=2)
     return replace(options, lock={**new, **options.lock})
-
-
-def _nearest_to_zero(joint: Node) -> float:
-    limit = joint.child("limit")
-    if limit is None or joint.element.get("type") == "continuous":
-        return 0.0
-    lower, upper = limit.number("lower", 0.0), limit.number("upper", 0.0)
-    return min(max(0.0, lower), upper) if lower < upper else 0.0
 
 
 def _absolute_meshes(source: Node, packages: Packages) -> None:

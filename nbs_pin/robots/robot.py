@@ -230,7 +230,7 @@ class Robot(Kinematics):
         xyz: Iterable[float] = (0.0, 0.0, 0.0),
         rpy: Iterable[float] = (0.0, 0.0, 0.0),
     ) -> "Robot":
-        """The same arm with the tool of a `.urdf` or `.xacro` file, its base fixed to the link `frame` ("": the last).
+        """The same arm with the tool of a description, its base fixed to the link `frame` ("": the last).
 
         xyz [m] and rpy [rad] place the tool's base in that link. Its joints are locked where they are nearest to zero,
         or where `lock` says. Raises RobotError if the tool cannot be read or there is no such link.
@@ -302,7 +302,7 @@ def load_robot(
             "robot_descriptions:NAME" for a description of that package, such as robot_descriptions:fr3_mj_description.
         gravity: Downward acceleration [m/s²] or a vector in the world frame. None takes the catalogue's or
             that of an MJCF file, else 9.81.
-        lock: Joints to fix at zero, or a dict of where to fix them [rad, m]. besides those that the catalogue fixes;
+        lock: Joints to fix at zero, or a dict of where to fix them [rad, m], besides those that the catalogue fixes;
             an empty list fixes none.
         zero_limits: "refuse" joints that state no limits, an effort or velocity that is not > 0, or an empty range at
             zero, or read these as "unlimited". None takes the catalogue's, else "refuse".

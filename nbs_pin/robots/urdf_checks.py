@@ -111,7 +111,7 @@ def _mimics(nodes: dict[str, Node], options: UrdfOptions) -> dict[str, float]:
                 break
             seen.add(source)
             node = mimics[source]
-        at = 0.0 if source in seen else options.lock.get(source, _nearest_to_zero(nodes[source]))
+        at = 0.0 if source in seen else options.lock.get(source, nearest_to_zero(nodes[source]))
         found[name] = place + factor * at
     if found:
         stated = ", ".join(f"'{name}' (of '{mimics[name].text('joint')}', at {x:g})" for name, x in found.items())
@@ -130,7 +130,8 @@ def _stated_range(node: Node) -> tuple[float, float]:
     return (lower, upper) if lower < upper else (-math.inf, math.inf)
 
 
-def _nearest_to_zero(node: Node) -> float:
+def nearest_to_zero(node: Node) -> float:
+    """The position nearest to zero within the range that a joint's element states [rad, m]."""
     lower, upper = _stated_range(node)
     return min(max(0.0, lower), upper)
 

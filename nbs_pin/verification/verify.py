@@ -72,7 +72,11 @@ def _arm(arm: dict[str, Any] | None, urdf: str | Path | None) -> tuple[list[Link
         return [], [Check("inertia", OPEN, "the model is no rigid tree")]
     path, given, name = Path(urdf or arm["urdf"] or ""), stated_tree(arm["joints"]), "the tree is the arm's"
     if urdf is None and not (path.suffix == ".urdf" and path.is_file()):
-        return given, [Check(name, OPEN, "the file names no URDF that is here; give it with --urdf")]
+        return given, [
+            Check(
+                name, OPEN, "the file names no URDF that is here; give it, or the arm.urdf beside the file, with --urdf"
+            )
+        ]
     read = urdf_tree(path, arm["joints"])
     faults, still = differences(given, read), still_joints(path, arm["joints"])
     locked = [Check("joints held at zero", TAKEN, f"{', '.join(still)}, which the file does not name")] if still else []
