@@ -23,6 +23,7 @@ from .certificates.encoders import Encoders as Encoders
 from .certificates.monitor import Monitored as Monitored, monitor as monitor
 from .certificates.online_monitor import Watch as Watch
 from .certificates.propose import Proposal as Proposal, propose as propose
+from .certificates.reference_margins import certified_margins as certified_margins
 from .certificates.uncertainty import Payload as Payload, Uncertainty as Uncertainty
 from .controllers.computed_torque import ComputedTorque as ComputedTorque
 from .controllers.controller import Controller as Controller, MemorylessController as MemorylessController

@@ -81,6 +81,16 @@ def test_a_tilted_base_turns_gravity(rpy):
     np.testing.assert_allclose(tip(tilted), turn @ tip(robot) + [0.1, 0.2, 0.9], atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["ur5", "z1", "xarm7"])
+def test_mujoco_mounts_arms_whose_root_is_called_world(name):
+    """MuJoCo takes a link of that name for the world, wherever it is."""
+    tilted = nbs.load_robot(name, base_rpy=(0.4, -0.3, 1.1), base_xyz=(0.1, 0.2, 0.9))
+    assert "world" in tilted.frames
+    q, v, tau = states(tilted.nv)
+    given = nbs.MujocoPlant(tilted).acceleration(q, v, tau)
+    np.testing.assert_allclose(given, nbs.PinocchioDynamics(tilted).forward_dynamics(q, v, tau), rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.filterwarnings("ignore:.*joints that mimic another are locked")
 def test_a_tool_is_the_arm_with_its_links(tmp_path):
     """The fingers are locked at the end of their range nearest to zero; the total is that of one body at the flange."""

@@ -53,7 +53,7 @@ def test_what_the_arm_cannot_do_is_refused_unless_asked_for(ur5, law, fault):
 def test_a_law_of_another_arm_is_refused(ur5, law):
     """Another arm is a mistake; another mass, load or friction is what a law may not know."""
     for other, said in (
-        ("ur10", "joint 'shoulder_pan_joint' is of another"),
+        ("ur10", "joint 'shoulder_lift_joint' is of another"),
         ("talos_left_arm", "its joints are arm_left"),
     ):
         lock = {"lock": ["arm_left_7_joint"]} if other == "talos_left_arm" else {}
@@ -61,6 +61,7 @@ def test_a_law_of_another_arm_is_refused(ur5, law):
         with pytest.raises(nbs.ArgumentError, match=f"the law is for {other} and the plant is ur5: {said}"):
             simulated(ur5, wrong)
     simulated(ur5.with_payload("tool0", 2.0).with_armature(0.1).with_friction(0.5), law)
+    simulated(nbs.load_robot("ur5", base_rpy=[0.5, 0.0, 1.0], base_xyz=[0.0, 0.0, 1.0]), law)
     simulated(ur5, law.compile())
 
 

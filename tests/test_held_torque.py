@@ -305,27 +305,31 @@ def test_the_hessian_of_the_potential_changes_no_faster_than_its_bound(seed):
     assert (np.abs(np.linalg.eigvalsh(0.5 * (change + change.swapaxes(1, 2)))).max(axis=1) <= bound * distance).all()
 
 
-@pytest.mark.parametrize(("name", "torque"), [("two_link", 5.0), ("ur5", 1.0)])
-def test_no_state_of_the_bounds_asks_for_more_torque_than_is_proved(name, torque):
-    robot = nbs.load_robot(name)
-    law, reference = nbs.NeuralBackstepping.for_robot(robot, seed=1), nbs.Sinusoid.for_robot(robot)
-    certificate = nbs.certify(law, np.full(robot.nv, torque), reference=reference, period=2.5e-4)
-    assert dict(certificate.assumptions)[Assumption.EFFORT] == "checked"
-    rng, level, k = np.random.default_rng(0), certificate.held.level, certificate.constants
-    times = rng.uniform(0.0, 10.0, 2000)
-    now = Reference(*reference(times))
-    z1 = rng.standard_normal((2000, robot.nv)) @ np.linalg.inv(np.linalg.cholesky(k.stiffness))
+def states_of(law, certificate, level, now):
+    """Random states with V at most the level, half of them with all that z1 leaves in the lightest motion."""
+    rng, k, n = np.random.default_rng(0), certificate.constants, law.nv
+    z1 = rng.standard_normal((2000, n)) @ np.linalg.inv(np.linalg.cholesky(k.stiffness))
     z1 *= (
         np.sqrt(rng.uniform(0.0, level, (2000, 1)))
         / np.linalg.norm(z1 @ np.linalg.cholesky(k.stiffness), axis=1)[:, None]
     )
     kept = np.maximum(level - law.potential_terms(z1, z1)[0], 0.0)
     q, mass = now.q + z1, law.dynamics.mass_matrix(now.q + z1)
-    direction = rng.standard_normal((2000, robot.nv))
+    direction = rng.standard_normal((2000, n))
     direction[::2] = np.linalg.eigh(mass)[1][::2, :, 0]  # the lightest motion is the fastest
     energy = np.einsum("ki,kij,kj->k", direction, mass, direction)
     z2 = direction * np.sqrt(2.0 * kept / energy)[:, None]
-    v = z2 + law.errors(q, 0.0 * q, *now).v_r
+    return q, z2 + law.errors(q, 0.0 * q, *now).v_r
+
+
+@pytest.mark.parametrize(("name", "torque"), [("two_link", 5.0), ("ur5", 1.0)])
+def test_no_state_of_the_bounds_asks_for_more_torque_than_is_proved(name, torque):
+    robot = nbs.load_robot(name)
+    law, reference = nbs.NeuralBackstepping.for_robot(robot, seed=1), nbs.Sinusoid.for_robot(robot)
+    certificate = nbs.certify(law, np.full(robot.nv, torque), reference=reference, period=2.5e-4)
+    assert dict(certificate.assumptions)[Assumption.EFFORT] == "checked"
+    now = Reference(*reference(np.random.default_rng(0).uniform(0.0, 10.0, 2000)))
+    q, v = states_of(law, certificate, certificate.held.level, now)
     asked = np.abs(law.torque(q, v, *now))
     wanted = np.abs(law.dynamics.reference_torque(now.q, now.v, now.v, now.a))
     assert (asked - wanted <= certificate.held.room).all()
@@ -375,3 +379,47 @@ class _Stating:
 
     def __call__(self, t):
         return self.motion(t)
+
+
+@pytest.mark.parametrize("name", ["two_link", "ur5"])
+def test_no_state_of_the_bounds_is_further_from_a_reference_than_the_margins(name):
+    """For any reference within the stated speeds, whatever its pose."""
+    robot = nbs.load_robot(name)
+    law = nbs.NeuralBackstepping.for_robot(robot, seed=1)
+    certificate = nbs.certify(law, np.full(robot.nv, 1.0))
+    margins = nbs.certified_margins(certificate, acceleration=2.0, velocity=1.0)
+    rng = np.random.default_rng(1)
+    corner = np.sign(rng.uniform(-1.0, 1.0, (2, 2000, robot.nv)))
+    now = Reference(rng.uniform(-2.0, 2.0, (2000, robot.nv)), corner[0], 2.0 * corner[1])
+    q, v = states_of(law, certificate, certificate.storage, now)
+    speed = np.abs(v - now.v).max(axis=0)
+    torque = np.abs(law.torque(q, v, *now) - law.dynamics.reference_torque(now.q, now.v, now.v, now.a)).max(axis=0)
+    assert (speed <= margins.velocity).all()
+    assert (torque <= margins.effort).all()
+    assert (speed >= 0.2 * margins.velocity).any()
+    assert (torque >= 0.1 * margins.effort).any()
+    np.testing.assert_array_equal(margins.position, certificate.joint_errors)
+    faster = nbs.certified_margins(certificate, acceleration=8.0, velocity=2.0)
+    assert (faster.effort > margins.effort).all()
+    np.testing.assert_array_equal(faster.velocity, margins.velocity)
+
+
+def test_a_path_with_certified_margins_leaves_the_arm_within_its_limits():
+    """A tool path in the least time, followed under torques at the edge of the box: no limit is reached."""
+    robot = nbs.load_robot("two_link").with_effort_limit([60.0, 40.0])
+    law, box = nbs.NeuralBackstepping.for_robot(robot, bandwidth=15.0), np.array([1.0, 1.0])
+    margins = nbs.certified_margins(nbs.certify(law, box), acceleration=3.0, velocity=1.5)
+    posture = nbs.tool_posture(robot, "tip")
+    path = nbs.ToolPath.circle(robot.pose(posture, "tip")[:3, 3], 0.3, "xz")
+    options = {"posture": posture, "fastest": True, "acceleration": 3.0}
+    with pytest.raises(nbs.ArgumentError, match="are left for the motion"):
+        nbs.tool_motion(robot.with_effort_limit(30.0), path, "tip", margins=margins, **options)
+    motion = nbs.tool_motion(robot, path, "tip", margins=margins, **options)
+    plant, steps = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot)), np.ceil(motion.duration / 2.5e-4)
+    for push in (box, -box):
+        wave = nbs.SquareWave(push, frequency=9.0)
+        run = nbs.simulate(plant, law, motion, steps * 2.5e-4, 2.5e-4, disturbance=wave)
+        assert not nbs.metrics.saturated_fraction(run).any()
+        assert (np.abs(run.v) <= robot.velocity_limit).all()
+        assert (np.abs(run.v - run.v_ref) <= margins.velocity).all()
+        assert (np.abs(run.q - run.q_ref) <= margins.position).all()

@@ -78,6 +78,20 @@ def test_the_rotor_of_a_transmission_is_felt_times_its_squared_reduction(tmp_pat
         nbs.load_robot(path, rotor_inertia=1e-5)
 
 
+@pytest.mark.parametrize("place", ["<actuator name='m'>{}</actuator>", "{}", None])
+def test_every_place_of_a_reduction_is_read(tmp_path, place):
+    """In the actuator (ROS), in the transmission (PR2) or in its joint (ros2_control): the same rotor behind it."""
+    reduction = "<mechanicalReduction>-50.0</mechanicalReduction>"
+    inside = f"<joint name='j1'>{reduction if place is None else ''}</joint>{(place or '').format(reduction)}"
+    path = arm(tmp_path, "", "", more=f"<transmission name='t'>{inside}</transmission>")
+    assert nbs.load_robot(path).urdf.without_rotor == ("j1",)
+    assert nbs.load_robot(path, armature={"j1": 0.0}).urdf.without_rotor == ()
+    known = nbs.load_robot(path, rotor_inertia={"j1": 1e-4})
+    np.testing.assert_allclose(known.armature, [0.25, 0.0])
+    with pytest.raises(nbs.RobotError, match="behind a gear of -50 is beyond reason"):
+        nbs.load_robot(path, rotor_inertia={"j1": 1e9})
+
+
 def test_what_is_given_replaces_what_the_file_states(tmp_path):
     path = arm(tmp_path, '<dynamics damping="1" friction="2" armature="3"/>', '<dynamics damping="4"/>')
     robot = nbs.load_robot(path, viscous_friction={"j2": 0.0}, coulomb_friction={"*": 0.5, "j1": 0.25}, armature=0.125)
@@ -104,7 +118,7 @@ def test_wrong_drives_are_refused(tmp_path, dynamics, said):
         nbs.load_robot(arm(tmp_path, dynamics))
 
 
-@pytest.mark.parametrize("wrong", [-1.0, np.nan, {"j1": "x"}, "0.1", {"*": np.inf}, {1: 2.0}])
+@pytest.mark.parametrize("wrong", [-1.0, np.nan, {"j1": "x"}, "0.1", {"*": np.inf}, {1: 2.0}, 1e10])
 def test_wrong_numbers_are_refused(tmp_path, wrong):
     for name in ("armature", "rotor_inertia", "viscous_friction", "coulomb_friction"):
         with pytest.raises(nbs.ArgumentError, match=f"{name} is .*give for instance"):
@@ -156,6 +170,27 @@ def test_a_file_beside_the_description_adds_to_it(tmp_path):
             nbs.load_robot(file)
 
 
+def test_what_is_given_by_name_is_added_to_the_file_and_one_number_takes_its_place(tmp_path):
+    arm(tmp_path, "", "")
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        'description = "arm.urdf"\n[armature]\nj1 = 0.25\n[payload.l2]\nmass = 1.5\n[limits.j1]\neffort = 7\n'
+    )
+    more = nbs.load_robot(file, armature={"j2": 1.0}, limits={"j1": {"velocity": 2.0}}, payload={"l1": 1.0})
+    np.testing.assert_array_equal(more.armature, [0.25, 1.0])
+    assert (more.effort_limit[0], more.velocity_limit[0]) == (7.0, 2.0)
+    assert sum(body.mass for body in more.model.inertias) == pytest.approx(4.0 + 1.5 + 1.0)
+    same = nbs.load_robot(more.source, **more.options)
+    assert same.sha256 == more.sha256
+    np.testing.assert_array_equal(same.effort_limit, more.effort_limit)
+    one = nbs.load_robot(file, armature=0.5, payload={})
+    np.testing.assert_array_equal(one.armature, [0.5, 0.5])
+    assert sum(body.mass for body in one.model.inertias) == pytest.approx(4.0)
+    assert nbs.load_robot(one.source, **one.options).sha256 == one.sha256
+    file.write_text('description = "panda"\nlock = ["panda_joint7"]\n')  # beside the fingers, which panda locks
+    assert nbs.load_robot(file).joint_names == nbs.load_robot("panda").joint_names[:6]
+
+
 def test_a_file_can_state_every_argument():
     assert (*inspect.signature(nbs.load_robot).parameters,)[1:] == OPTIONS
 
@@ -167,11 +202,7 @@ def test_the_shell_takes_what_an_error_names(tmp_path, capsys):
     words = ["--armature", "j1=0.5", "--coulomb-friction", "0.1", "--viscous-friction", "j2=1"]
     assert cli.main(["track", path, *words, *out]) == 0
     run = nbs.Run.load(tmp_path / "out" / "run.npz")
-    assert run.robot_options == {
-        "armature": {"j1": 0.5},
-        "coulomb_friction": {"*": 0.1},
-        "viscous_friction": {"j2": 1.0},
-    }
+    assert run.robot_options == {"armature": {"j1": 0.5}, "coulomb_friction": 0.1, "viscous_friction": {"j2": 1.0}}
 
 
 @pytest.mark.parametrize(

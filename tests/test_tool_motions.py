@@ -208,6 +208,48 @@ def test_a_duration_too_short_is_refused_with_joint_time_and_one_that_is_enough(
     assert 0.9 < share.max() <= 1.0
 
 
+def test_the_duration_advised_to_a_path_with_times_is_enough_too():
+    """With its own times the path was even; with a duration it begins and ends at rest, and is faster between."""
+    robot, posture, begin = begun("panda", "panda_hand")
+    angle = np.linspace(0.0, 2.0 * np.pi, 81)
+    circle = begin + 0.1 * np.stack([np.cos(angle) - 1.0, np.sin(angle), 0.0 * angle], axis=-1)
+    path = nbs.ToolPath.through(circle, times=np.linspace(0.0, 0.3, 81))
+    with pytest.raises(nbs.ArgumentError, match="give at least duration=") as no:
+        nbs.tool_motion(robot, path, "panda_hand", posture=posture)
+    enough = float(str(no.value).split("duration=")[1].split()[0])
+    limited = robot.with_effort_limit(np.inf)
+    motion = nbs.tool_motion(limited, path, "panda_hand", posture=posture, duration=enough)
+    assert 0.5 < (np.abs(motion(np.linspace(0.0, enough, 5001)).v) / robot.velocity_limit).max() <= 1.0
+
+
+def test_the_joints_stay_within_their_limits_between_the_nodes_of_the_spline():
+    """A limit that the joint passes between nodes alone is seen: all extremes of the spline are looked at."""
+    robot, motion = circle("panda", "panda_hand", radius=0.1, duration=5.0)
+    turns = motion.joints.turns()
+    np.testing.assert_allclose(np.abs(motion.joints(turns, 1)).min(axis=-1), 0.0, atol=1e-6)
+    dense, extremes = motion.joints(np.linspace(0.0, 1.0, 100_001)), motion.joints(np.append(turns, [0.0, 1.0]))
+    assert (dense.max(axis=0) <= extremes.max(axis=0) + 1e-12).all()
+    assert (dense.min(axis=0) >= extremes.min(axis=0) - 1e-12).all()
+    joint = int(np.argmax(extremes.max(axis=0) - np.maximum(*motion.joints(np.array([0.0, 1.0])))))
+    limits = {robot.joint_names[joint]: {"upper": float(extremes[:, joint].max()) - 1e-9}}
+    begin = robot.pose(motion.joints(np.zeros(1))[0], "panda_hand")[:3, 3]
+    posture = nbs.tool_posture(robot, "panda_hand")
+    with pytest.raises(nbs.ArgumentError, match=f"of joint '{robot.joint_names[joint]}', outside"):
+        nbs.tool_motion(
+            nbs.load_robot("panda", limits=limits), nbs.ToolPath.circle(begin, 0.1), "panda_hand", posture=posture
+        )
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    ({"fastest": True, "duration": 3.0}, "fastest=True finds the duration of the path; omit duration=3.0"),
+    ({"acceleration": 5.0}, "acceleration=5.0 is for the motion of least time; give fastest=True too"),
+    ({"fastest": True, "acceleration": [1.0, 2.0, 3.0]}, "acceleration has 3 numbers for the 2 joints of two_link"),
+])  # fmt: skip
+def test_settings_of_time_that_contradict_each_other_are_refused(options, said):
+    with pytest.raises(nbs.ArgumentError, match=said):
+        circle("two_link", "tip", radius=0.3, **options)
+
+
 def test_arms_with_few_joints_are_told_what_they_can_do():
     robot, posture, begin = begun("two_link", "tip")
     with pytest.raises(nbs.ArgumentError, match=r"2 joints .* varies in 3 directions.*orientation='free'"):

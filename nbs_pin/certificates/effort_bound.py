@@ -25,6 +25,24 @@ class Asked(NamedTuple):
     level: float
     """Φ + ½z2ᵀM z2 at most [J]."""
 
+    @property
+    def kinetic(self) -> float:
+        """|z2|_M at most."""
+        return math.sqrt(2.0 * self.level)
+
+    @property
+    def descent(self) -> float:
+        """x = √(∇ΦᵀΛ∇Φ) at most."""
+        return math.sqrt(self.curve.loss * self.curve.growth * self.level)
+
+
+def speed_bound(asked: Asked, arm: CoriolisBounds) -> JointArray:
+    """How far each velocity can be from that of the reference, |v_i − v_d,i| with v − v_d = z2 − Λ∇Φ [rad/s]."""
+    if not np.isfinite(asked.curve).all():
+        return np.full(len(arm.single), np.inf)
+    # The squares of |z2|_M and of √Φ share the level.
+    return np.asarray(arm.single * math.hypot(asked.kinetic, arm.loss_m * asked.descent) * UP)
+
 
 def torque_bound(asked: Asked, arm: CoriolisBounds, motion: MotionBounds, half: float) -> JointArray:
     """How far each torque of the law can be from that of the reference at its samples [N·m]; inf if unknown.
@@ -32,12 +50,10 @@ def torque_bound(asked: Asked, arm: CoriolisBounds, motion: MotionBounds, half: 
     The difference of τ = M(φ̇ − ωz2) + C(q, v)φ + G − ∇Φ − D z2 from M a_d + C(q_d, v_d)v_d + G at q_d.
     half: half the time between the samples [s].
     """
-    law, k, curve, level = asked.law, asked.constants, asked.curve, asked.level
+    law, k, curve, level, kinetic = asked.law, asked.constants, asked.curve, asked.level, asked.kinetic
     floor, isk, snu = k.floor, 1.0 / math.sqrt(k.kappa), math.sqrt(k.nu)
-    potential, kinetic = math.sqrt(level), math.sqrt(2.0 * level)  # √Φ and |z2|_M at most
     rate = np.sqrt(k.rate)
     slowing = math.sqrt(largest_eigenvalue(rate[:, None] * floor * rate))  # |Λ∇Φ| ≤ slowing x
-    loss = math.sqrt(curve.loss * curve.growth)  # x ≤ loss √Φ
     share = law.damping_share(snu * kinetic * UP)
     if not (math.isfinite(arm.turn) and np.isfinite(curve).all() and math.isfinite(share)):
         return np.full(len(floor), np.inf)
@@ -45,10 +61,10 @@ def torque_bound(asked: Asked, arm: CoriolisBounds, motion: MotionBounds, half: 
     row, own = np.sqrt(arm.diagonal), np.sqrt(np.diag(floor))
     # Linear in |z2|_M and in √Φ, whose squares share the level.
     by_speed = row * (curve.centre + k.omega + rest_m * snu) + np.abs(floor) @ arm.single + share * own * snu
-    by_potential = row * (curve.centre * arm.loss_m + rest_m * slowing) * loss
+    by_potential = row * (curve.centre * arm.loss_m + rest_m * slowing) * math.sqrt(curve.loss * curve.growth)
     by_potential += np.sqrt(asked.stiffest * curve.growth)
     linear = math.sqrt(level) * np.hypot(math.sqrt(2.0) * by_speed, by_potential)
-    pull = arm.loss_m * loss * potential, slowing * loss * potential  # Λ∇Φ in the two norms
+    pull = arm.loss_m * asked.descent, slowing * asked.descent  # Λ∇Φ in the two norms
     error = math.hypot(kinetic, pull[0]), math.hypot(snu * kinetic, pull[1])
     wanted = Sizes(motion.turn, motion.turn_d, isk * motion.speed, motion.speed)
     pairs = (arm.sizes(*error), wanted), (wanted, arm.sizes(*pull)), (arm.sizes(*error), arm.sizes(*pull))

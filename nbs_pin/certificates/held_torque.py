@@ -209,6 +209,11 @@ def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None
         return "give the reference"
     if jerk is None:
         return "the reference states no bound of its jerk, `largest_jerk`"
+    return why_no_arm_bounds(law, robot)
+
+
+def why_no_arm_bounds(law: LyapunovLaw, robot: Robot | None) -> str:
+    """Why the velocities and torques of a loop are not bounded in every pose of the arm; empty if they are."""
     if robot is None or type(law.dynamics) not in (PinocchioDynamics, AnalyticDynamics):
         return "only for the exact model of an arm"
     if law.nv > MOST_JOINTS:

@@ -61,10 +61,10 @@ def _read_gravity(words: str) -> float | list[float]:
     return values if len(values) == 3 else values[0]
 
 
-def _read_by_joint(flag: str) -> Callable[[str], dict[str, float]]:
+def _read_by_joint(flag: str) -> Callable[[str], float | dict[str, float]]:
     """A reader of one number for every joint, or of numbers by joint."""
 
-    def read(words: str) -> dict[str, float]:
+    def read(words: str) -> float | dict[str, float]:
         found: dict[str, float] = {}
         for word in words.split(","):
             joint, stated, number = word.rpartition("=")
@@ -74,7 +74,9 @@ def _read_by_joint(flag: str) -> Callable[[str], dict[str, float]]:
                     f"{flag} is '{words}'; give one number at least 0 for every joint, or JOINT=NUMBER for some: "
                     f"{flag} shoulder=0.2,elbow=0.1."
                 )
-            found[joint or "*"] = value
+            if not joint:
+                return value
+            found[joint] = value
         return found
 
     return read

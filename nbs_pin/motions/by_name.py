@@ -105,8 +105,6 @@ def _led(path: Any, robot: Robot, period: float, given: dict[str, Any]) -> tuple
     """The motion along the path and its duration in whole periods: to its end, or, of a file with times, within it."""
     from nbs_pin.motions.tool_motions import tool_motion
 
-    if given.get("fastest") and given["duration"] is not None:
-        raise ArgumentError(f"{option('fastest', True)} finds the duration of the path; omit the other.")
     motion = tool_motion(robot, path, **given)
     periods = motion.duration / period
     whole = math.floor(periods + 1e-9) if not motion.rests else math.ceil(periods - 1e-9)

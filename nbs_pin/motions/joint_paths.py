@@ -9,7 +9,7 @@ from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import BSpline, PPoly, make_interp_spline
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.doors import option
@@ -49,6 +49,13 @@ class JointPath:
         """Bound of the derivative of that order of each joint: its largest spline coefficient."""
         return np.asarray(np.abs(self.spline.derivative(order).c).max(axis=0))
 
+    def turns(self) -> Float[np.ndarray, " points"]:
+        """All s where a joint turns back: with the ends, every joint is largest and least at one of them."""
+        first = self.spline.derivative()
+        joints = (PPoly.from_spline((first.t, column, first.k)) for column in first.c.T)
+        found = np.concatenate([joint.roots(discontinuity=False, extrapolate=False) for joint in joints])
+        return np.asarray(np.sort(found[np.isfinite(found)]))  # not a number where a joint rests
+
 
 def joint_path(inverse: InverseKinematics, path: ToolPath) -> JointPath:
     """The joints along the path, from the configuration nearest to the posture that begins it.
@@ -62,7 +69,7 @@ def joint_path(inverse: InverseKinematics, path: ToolPath) -> JointPath:
     s = np.linspace(0.0, 1.0, _FIRST + 1)
     q = followed.first_nodes(s)
     while True:
-        followed.check_nodes(s, q)
+        followed.check(s, q)
         spline = make_interp_spline(s, q, k=5, axis=0)
         between = (s[:-1, None] + np.diff(s)[:, None] * _BETWEEN).ravel()
         error = pose_error(inverse.robot.pose(spline(between), inverse.frame), followed.poses(between))
@@ -70,7 +77,9 @@ def joint_path(inverse: InverseKinematics, path: ToolPath) -> JointPath:
         turned = turned if inverse.hold else np.zeros_like(turned)
         worst = np.maximum(missed, turned)
         if worst.max() <= FINE or (len(s) > _MOST and worst.max() <= COARSE):
-            return JointPath(spline, float(missed.max()), float(turned.max()))
+            joints = JointPath(spline, float(missed.max()), float(turned.max()))
+            followed.check(joints.turns(), joints(joints.turns()))
+            return joints
         if len(s) > _MOST:
             raise ArgumentError(
                 f"{followed.place(float(between[np.argmax(worst)]))} bends more sharply than the joints can follow, or "
@@ -142,8 +151,8 @@ class _Followed:
         at = f"the {self.path.name} at {self.path.travelled(s):.4g} m ({s:.1%} of it)"
         return f"{at}, x, y, z = {x:.4g}, {y:.4g}, {z:.4g} m,"
 
-    def check_nodes(self, s: Float[np.ndarray, " nodes"], q: Float[np.ndarray, "nodes n"]) -> None:
-        """Raise ArgumentError at the first node that is singular or beyond a joint limit."""
+    def check(self, s: Float[np.ndarray, " points"], q: Float[np.ndarray, "points n"]) -> None:
+        """Raise ArgumentError at the first of these points that is singular or beyond a joint limit."""
         robot = self.inverse.robot
         steady = self.inverse.steadiness(q)
         beyond = (q < robot.lower) | (q > robot.upper)

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from nbs_pin.base.checks import PerJoint
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.units import units
 from nbs_pin.motions.joint_paths import JointPath
@@ -36,16 +36,16 @@ class Shares(NamedTuple):
     effort: Float[np.ndarray, "*batch n"]
 
 
-def least_time(robot: Robot, joints: JointPath, acceleration: PerJoint | None = None) -> Stepped:
+def least_time(robot: Robot, joints: JointPath, acceleration: JointArray | None = None) -> Stepped:
     """The timing of least duration from rest to rest, whose limits hold between the nodes of the grid too.
 
-    `acceleration` is the largest |a|, one number or one per joint [rad/s²], None for none.
+    `acceleration` is the largest |a| of each joint [rad/s²], None for none.
 
     Raises:
         ArgumentError: If the arm cannot hold its own weight on the path, with the joint and the share that is missing,
             or has neither effort limits nor an acceleration limit.
     """
-    most = np.full(robot.nv, np.inf) if acceleration is None else np.broadcast_to(acceleration, (robot.nv,))
+    most = np.full(robot.nv, np.inf) if acceleration is None else acceleration
     if not (np.isfinite(most) | np.isfinite(robot.effort_limit)).all():
         i = int(np.argmin(np.isfinite(most) | np.isfinite(robot.effort_limit)))
         raise ArgumentError(

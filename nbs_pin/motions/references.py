@@ -238,8 +238,6 @@ def check_reference(
     choice("drop", "keep")("check_reference: joint_friction", joint_friction)
     t = np.linspace(0.0, duration, samples)
     desired = at_times(reference, t, robot.nv)
-    t = np.repeat(t, desired.q[0].size // robot.nv)  # several motions at once
-    desired = Reference(*(x.reshape(-1, robot.nv) for x in desired))
     degrees = " (are these degrees?)" if np.median(np.max(np.abs(desired.q), axis=-1)) > 2.0 * np.pi else ""
     _check_range(robot, t, "position", desired.q, robot.lower, robot.upper, f"stay inside{degrees}")
     _check_range(robot, t, "velocity", desired.v, -robot.velocity_limit, robot.velocity_limit, "slow it down")

@@ -113,7 +113,7 @@ def tool_motion(
         orientation: "hold" for the orientation of the path, or of the posture, throughout; "free" for positions alone.
             None holds it if six joints or more move the frame.
         duration: Time from rest to rest [s]. None takes the times of the path, or 5 s if it has none.
-        fastest: Take the least time that the velocity and effort limits of the arm allow instead.
+        fastest: Take the least time that the velocity and effort limits of the arm allow; without a duration.
         acceleration: Largest |a| of `fastest`, one number or one per joint [rad/s²]; None for no limit besides torque.
         margins: What to leave of position, velocity and effort limits.
 
@@ -130,6 +130,7 @@ def tool_motion(
         >>> bool(abs(robot.pose(motion(2.5).q, "panda_hand") - motion.pose(2.5)).max() < 1e-7)
         True
     """
+    acceleration = _check_timing(robot, duration, fastest, acceleration)
     frame = last_frame(robot) if frame is None else frame
     held = is_held(robot, frame, orientation)
     if posture is None:
@@ -153,6 +154,24 @@ def tool_motion(
     return motion
 
 
+def _check_timing(robot: Robot, duration: float | None, fastest: bool, acceleration: Any) -> np.ndarray | None:
+    """The largest |a| of each joint, or None; raises ArgumentError if the settings of time contradict each other."""
+    if fastest and duration is not None:
+        given = option("duration", duration)
+        raise ArgumentError(f"{option('fastest', True)} finds the duration of the path; omit {given}.")
+    if acceleration is None:
+        return None
+    if not fastest:
+        given, least = option("acceleration", acceleration.tolist()), option("fastest", True)
+        raise ArgumentError(f"{given} is for the motion of least time; give {least} too, or omit it.")
+    if acceleration.size not in (1, robot.nv):
+        raise ArgumentError(
+            f"acceleration has {acceleration.size} numbers for the {robot.nv} joints of {robot.name}; give one, or one "
+            "each."
+        )
+    return np.full(robot.nv, acceleration)
+
+
 def _check_speed(robot: Robot, motion: ToolMotion) -> None:
     """Raise ArgumentError if a joint is too fast, with the duration in which it is not."""
     t = np.linspace(0.0, motion.duration, _INSTANTS)
@@ -162,7 +181,8 @@ def _check_speed(robot: Robot, motion: ToolMotion) -> None:
     if share[k, i] <= 1.0:
         return
     unit = units("velocity", robot.prismatic)[i]
-    slower = float(f"{1.01 * share[k, i] * motion.duration:.3g}")
+    peak = 1.0 if motion.rests else Smooth(1.0).largest[0]  # a duration makes it begin and end at rest
+    slower = float(f"{1.01 * share[k, i] * motion.duration * peak:.3g}")
     raise ArgumentError(
         f"the {motion.path.name} needs the velocity {v[k, i]:.4g} {unit} of joint '{robot.joint_names[i]}' at t = "
         f"{t[k]:.4g} s, {share[k, i] - 1.0:.0%} above its limit {robot.velocity_limit[i]:.4g} {unit}; give at least "

@@ -29,7 +29,12 @@ def attach(robot: Node, options: UrdfOptions, packages: Packages) -> UrdfOptions
     """
     if options.tool is not None:
         options = _add_tool(robot, options)
-    for frame, payload in options.payload.items():
+    frames = [_frame(robot, frame, "payload") for frame in options.payload]
+    twice = next((frame for frame in frames if frames.count(frame) > 1), None)
+    if twice is not None:
+        problem = f"the payload of the last link '{twice}' is given twice, with its name and without"
+        raise robot.refuse(problem, "give one of them")
+    for frame, payload in zip(frames, options.payload.values(), strict=True):
         _add_payload(robot, frame, payload)
     if any(options.base_rpy) or any(options.base_xyz):
         root = _ends(robot, parents=True)[0]
@@ -49,7 +54,6 @@ def tip(robot: Node) -> str:
 
 def _add_payload(robot: Node, frame: str, payload: Payload) -> None:
     """A link with the payload's inertia, fixed to the link `frame`."""
-    frame = _frame(robot, frame, "payload")
     name = f"payload_{frame}"
     _free_name(robot, name)
     link = robot.new("link", name=name)

@@ -10,6 +10,7 @@ from typing import Any
 from nbs_pin.base.exceptions import RobotError, RobotNotFound
 from nbs_pin.robots.arm_file import read_arm_file
 from nbs_pin.robots.public_descriptions import PREFIX, find_public
+from nbs_pin.robots.urdf_options import layered
 
 
 @dataclass(frozen=True)
@@ -107,4 +108,4 @@ def _entry_of_toml(path: Path) -> Entry:
     if Path(description).suffix == ".toml":
         raise RobotError(f"{path}: its description '{description:.200}' is a .toml file too; name a URDF or an arm.")
     entry = find(description)
-    return Entry("", entry.path, path, {**entry.options, **options})
+    return Entry("", entry.path, path, layered(entry.options, options))

@@ -54,7 +54,7 @@ class Kinematics:
         return moved
 
     def pose(self, q: Float[np.ndarray, "*batch n"], frame: str) -> Float[np.ndarray, "*batch 4 4"]:
-        """Homogeneous pose [R p; 0 1] of the frame in the base frame, p [m].
+        """Homogeneous pose [R p; 0 1] of the frame in that of the root link, p [m]; of a mounted arm, in the world.
 
         Raises:
             ArgumentError: If the arm has no such frame, or q is not of finite numbers of shape (..., n) [rad].
@@ -76,7 +76,7 @@ class Kinematics:
     def jacobian(self, q: Float[np.ndarray, "*batch n"], frame: str) -> Float[np.ndarray, "*batch 6 n"]:
         """J with (ṗ, ω) = J v: velocity ṗ of the frame's origin [m/s] above its angular velocity ω [rad/s].
 
-        Both are along the axes of the base frame (Pinocchio's LOCAL_WORLD_ALIGNED).
+        Both are along the axes of the root link's frame (Pinocchio's LOCAL_WORLD_ALIGNED).
 
         Raises:
             ArgumentError: If the arm has no such frame, or q is not of finite numbers of shape (..., n) [rad].

@@ -23,7 +23,7 @@ from nbs_pin.robots.catalogue import Entry, find
 from nbs_pin.robots.kinematics import Kinematics
 from nbs_pin.robots.pinocchio_model import build_model, check_inertia, with_limits
 from nbs_pin.robots.urdf import JointData, Urdf, read_urdf
-from nbs_pin.robots.urdf_options import read_options
+from nbs_pin.robots.urdf_options import layered, read_options
 
 
 @storable(("name", "source", "options", "sha256", "effort_limit"))
@@ -295,15 +295,16 @@ def load_robot(
     """Load an arm by name, from a `.urdf`, `.xacro` or MJCF file, or from a `.toml` file that adds to one.
 
     Joints that mimic another are locked where the other is at zero, and named in a warning. A `.toml` file has the
-    `description` (name or path) and any of the arguments below.
+    `description` (name or path) and any of the arguments below. What is given here by joint, link or name is added to
+    what the catalogue and the `.toml` file give, and comes before it; an empty list or dict clears that. All else takes
+    its place, as one number for all joints does.
 
     Args:
         name_or_path: A name in `ROBOT_NAMES` (bundled or from example-robot-data), the path of a file, or
             "robot_descriptions:NAME" for a description of that package, such as robot_descriptions:fr3_mj_description.
         gravity: Downward acceleration [m/s²] or a vector in the world frame. None takes the catalogue's or
             that of an MJCF file, else 9.81.
-        lock: Joints to fix at zero, or a dict of where to fix them [rad, m], besides those that the catalogue fixes;
-            an empty list fixes none.
+        lock: Joints to fix at zero, or a dict of where to fix them [rad, m].
         zero_limits: "refuse" joints that state no limits, an effort or velocity that is not > 0, or an empty range at
             zero, or read these as "unlimited". None takes the catalogue's, else "refuse".
         limits: Limits in place of the file's, by joint ("*" for all) and by "lower", "upper" [rad, m], "effort"
@@ -345,14 +346,11 @@ def load_robot(
 
 def _load(entry: Entry, given: dict[str, Any]) -> Robot:
     """The arm of a catalogue's entry or a file, with the arguments of `load_robot` that were given."""
-    told = {**entry.options, **given}
+    told = layered(entry.options, given)
     gravity = _gravity_vector(told.pop("gravity", 9.81))
     options = read_options(told)
-    if options.lock:  # an empty list frees what the catalogue locks
-        own = read_options({"lock": entry.options.get("lock", ())}).lock
-        options = replace(options, lock={**own, **options.lock})
     urdf = read_urdf(entry.path, options)
-    is_stated = urdf.gravity is not None and "gravity" not in {**entry.options, **given}
+    is_stated = urdf.gravity is not None and "gravity" not in entry.options.keys() | given.keys()
     vector = np.array(urdf.gravity) if is_stated else gravity
     model = build_model(urdf)
     model.gravity.linear = vector

@@ -8,7 +8,7 @@ from pathlib import Path
 from nbs_pin.robots.attachments import attach
 from nbs_pin.robots.bodies import check_bodies
 from nbs_pin.robots.description import read_description
-from nbs_pin.robots.joint_drive import Drive, geared_joints, read_drives
+from nbs_pin.robots.joint_drive import Drive, read_drives, without_rotor
 from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.urdf_checks import Joint, check_axis, check_tree
 from nbs_pin.robots.urdf_limits import Limits, read_limits
@@ -84,8 +84,7 @@ def read_urdf(path: Path, options: UrdfOptions | None = None) -> Urdf:
     limits = read_limits(joints, options, left_out="unlimited" if source.is_mjcf else "refuse")
     drives = read_drives(robot, joints, options)
     moving = tuple(_settle(joint, limits[joint.name], drives[joint.name], options) for joint in joints if joint.moves)
-    geared = geared_joints(robot)
-    bare = tuple(joint.name for joint in moving if joint.name in geared and not joint.armature)
+    bare = without_rotor(robot, drives, options)
     return Urdf(robot.text("name"), path, ET.tostring(robot.element), moving, source.gravity, bare)
 
 

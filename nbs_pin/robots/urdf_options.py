@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
@@ -21,6 +22,8 @@ InertiaFrom: TypeAlias = Literal["file", "shapes"]
 INERTIA_FROM: tuple[InertiaFrom, ...] = get_args(InertiaFrom)
 DRIVE = ("armature", "rotor_inertia", "viscous_friction", "coulomb_friction")
 """Arguments with a number ≥ 0 by joint."""
+LARGEST_DRIVE = 1e9
+"""Largest coefficient of friction and rotor inertia that a joint can have [SI]."""
 LIMITS = ("lower", "upper", "effort", "velocity")
 ALL = "*"
 """Stands for every joint in `limits` and in what `DRIVE` names."""
@@ -100,12 +103,33 @@ class UrdfOptions:
             "inertia_from": self.inertia_from,
             "xacro_args": dict(self.xacro_args),
             "package_dirs": [str(folder) for folder in self.package_dirs],
-            **{key: dict(getattr(self, key)) for key in DRIVE},
+            **{key: _for_all(getattr(self, key)) for key in DRIVE},
             "payload": {frame: _plain(payload) for frame, payload in self.payload.items()},
             "tool": None if self.tool is None else _plain(self.tool),
             "base_rpy": list(self.base_rpy),
             "base_xyz": list(self.base_xyz),
         }
+
+
+def layered(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `load_robot` with others over them.
+
+    What is given by joint, link or name is added to what lies under it and comes before it, an empty list or dict
+    clears that, and everything else takes its place: a single number for all joints too.
+
+    Raises:
+        ArgumentError: If one that is added is of another type or out of range.
+    """
+    merged = {name: value for name, value in {**under, **over}.items() if value is not None}
+    for name in _ADDED:
+        if under.get(name) is None or over.get(name) is None or (name in DRIVE and _number(over[name])):
+            continue
+        convert: Callable[[Any], dict[str, Any]] = partial(_by_joint, name) if name in DRIVE else _CONVERT[name]
+        lower, upper = convert(under[name]), convert(over[name])
+        if name == "limits":
+            upper = {joint: {**lower.get(joint, {}), **limits} for joint, limits in upper.items()}
+        merged[name] = {**lower, **upper} if upper else {}
+    return merged
 
 
 def read_options(told: Mapping[str, Any]) -> UrdfOptions:
@@ -156,19 +180,24 @@ def _limits(value: Any) -> dict[str, dict[str, float | None]]:
 
 def _by_joint(name: str, value: Any) -> dict[str, float]:
     numbers = dict(value) if isinstance(value, Mapping) else {ALL: value}
-    if not all(isinstance(joint, str) and _finite(x) and x >= 0.0 for joint, x in numbers.items()):
+    if not all(isinstance(joint, str) and _number(x) and 0.0 <= x <= LARGEST_DRIVE for joint, x in numbers.items()):
         raise ArgumentError(
-            f"{name} is {value!r}, expected a finite number ≥ 0, or a dict from joints (or '{ALL}') to such numbers; "
-            f"give for instance {name}={{'elbow': 0.2}}."
+            f"{name} is {value!r}, expected a number in [0, {LARGEST_DRIVE:g}], or a dict from joints (or '{ALL}') to "
+            f"such numbers; give for instance {name}={{'elbow': 0.2}}."
         )
     return {joint: float(x) for joint, x in numbers.items()}
+
+
+def _for_all(numbers: Mapping[str, float]) -> float | dict[str, float]:
+    """One number if it is that of all joints: `layered` does not add it to what a file states by joint."""
+    return numbers[ALL] if numbers.keys() == {ALL} else dict(numbers)
 
 
 def _payloads(value: Any) -> dict[str, Payload]:
     loads = dict(value) if isinstance(value, Mapping) else {"": value}
     found = {}
     for frame, load in loads.items():
-        given = dict(load) if isinstance(load, Mapping) else {"mass": load}
+        given = vars(load) if isinstance(load, Payload) else dict(load) if isinstance(load, Mapping) else {"mass": load}
         inertia, com = _six(given.get("inertia", 0.0)), _numbers(given.get("com", (0.0, 0.0, 0.0)), 3)
         known = given.keys() <= {"mass", "com", "inertia"} and isinstance(frame, str)
         if not (known and com and inertia and _finite(given.get("mass")) and given["mass"] > 0.0):
@@ -286,3 +315,5 @@ _CONVERT: dict[str, Callable[[Any], Any]] = {
     "base_rpy": _three("base_rpy"),
     "base_xyz": _three("base_xyz"),
 }
+_ADDED = ("lock", "limits", "xacro_args", "payload", *DRIVE)
+"""Arguments given by joint, link or name."""

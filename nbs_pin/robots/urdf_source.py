@@ -114,19 +114,19 @@ class Node:
         if default is not None and key not in self.element.attrib:
             return default
         words = self.text(key).split()
-        values = tuple(float(word) if _NUMBER.fullmatch(word) else math.nan for word in words)
-        if len(values) != count or not all(math.isfinite(value) for value in values):
+        values = tuple(value for value in map(plain_number, words) if value is not None)
+        if not len(values) == len(words) == count:
             raise self._bad_number(key, "a finite number" if count == 1 else f"{count} finite numbers")
         self.element.set(key, " ".join(repr(value) for value in values))
         return values
 
     def content(self) -> float:
         """The text within the element as one finite number; raises RobotError if it is none."""
-        words = (self.element.text or "").split()
-        if len(words) != 1 or not _NUMBER.fullmatch(words[0]) or not math.isfinite(float(words[0])):
-            tag = self.element.tag
-            raise self.refuse(f"<{tag}> contains '{shorten(' '.join(words))}'", "write one finite number in it")
-        return float(words[0])
+        text = (self.element.text or "").strip()
+        value = plain_number(text)
+        if value is None:
+            raise self.refuse(f"<{self.element.tag}> contains '{shorten(text)}'", "write one finite number in it")
+        return value
 
     def _bad_number(self, key: str, expected: str) -> RobotError:
         tag, value = self.element.tag, self.text(key)
@@ -134,6 +134,12 @@ class Node:
         if "${" in value:
             remedy = "expand the file with xacro first, or give it with the ending .xacro"
         return self.refuse(f"{tag} {key} '{shorten(value)}' is not {expected}", remedy)
+
+
+def plain_number(text: str) -> float | None:
+    """The finite number that the text is in decimal digits, as every engine reads it; None if it is none."""
+    value = float(text) if _NUMBER.fullmatch(text) else math.nan
+    return value if math.isfinite(value) else None
 
 
 def shorten(text: str) -> str:

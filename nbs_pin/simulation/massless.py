@@ -7,7 +7,7 @@ import numpy as np
 
 _COPIED = (
     "type", "range", "limited", "armature", "damping", "frictionloss", "actfrcrange", "actfrclimited",
-    "solref_friction", "solimp_friction",
+    "solref_friction", "solimp_friction", "solref_limit",
 )  # fmt: skip
 
 

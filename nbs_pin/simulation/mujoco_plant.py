@@ -2,6 +2,7 @@
 
 import logging
 import threading
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, TypeAlias
@@ -228,7 +229,7 @@ def build_model(
         other = dict(zip(robot.joint_names, pairs, strict=True))
     armature = dict(zip(robot.joint_names, robot.model.armature.tolist(), strict=True))
     try:
-        spec = mujoco.MjSpec.from_string(robot.urdf.without_geometry().decode())
+        spec = mujoco.MjSpec.from_string(_without_inner_world(robot.urdf.without_geometry()))
         for joint in spec.joints:
             joint.armature = armature[joint.name]
             if joint_friction != "keep":
@@ -249,6 +250,20 @@ def build_model(
         raise RobotError(
             f"{robot.source}: MuJoCo cannot build this arm ({error}); correct that link or joint."
         ) from error
+
+
+def _without_inner_world(xml: bytes) -> str:
+    """The description with another name for a link "world" that has a parent: MuJoCo takes that link for the world."""
+    arm = ET.fromstring(xml)
+    if any(child.get("link") == "world" for child in arm.iterfind("joint/child")):
+        names, name = {link.get("name") for link in arm.iterfind("link")}, "world_link"
+        while name in names:
+            name += "_"
+        for key, path in (("name", "link"), ("link", "joint/parent"), ("link", "joint/child")):
+            for element in arm.iterfind(path):
+                if element.get(key) == "world":
+                    element.set(key, name)
+    return ET.tostring(arm, encoding="unicode")
 
 
 def _in_order(addresses: np.ndarray) -> np.ndarray | slice:

@@ -1,0 +1,90 @@
+"""What a reference must leave of the limits of an arm, so that the arm keeps them whatever disturbs it."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from nbs_pin.base.arguments import checked, joints, maybe
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.certificates.certificate import CERTIFICATE, Certificate
+from nbs_pin.certificates.coriolis import CoriolisBounds, MotionBounds
+from nbs_pin.certificates.effort_bound import Asked, speed_bound, torque_bound
+from nbs_pin.certificates.held_torque import why_no_arm_bounds
+from nbs_pin.certificates.sampled_law import Curvature, SampledLaw
+from nbs_pin.motions.limits import Margins
+from nbs_pin.robots.robot import Robot
+
+
+@checked(
+    certificate=CERTIFICATE,
+    acceleration=joints(above=0.0, unit="rad/s²"),
+    velocity=maybe(joints(above=0.0, unit="rad/s")),
+)
+def certified_margins(certificate: Certificate, acceleration: Any, velocity: Any = None) -> Margins:
+    """The distance from its limits that a reference must keep, so that the arm stays within them.
+
+    Position margins bound |z1_i|, velocity margins |v_i − v_d,i|, and effort margins the difference of each torque of
+    the law from that of the reference, M(q_d)a_d + C(q_d, v_d)v_d + G(q_d): on {V ≤ V̄} with V̄ = max(V(0), V∞), from
+    a start on the reference or the one certified, for every admissible disturbance (docs/certificates.md §15). They
+    are known like the certificate's bounds (`Certificate.label`), in continuous time, and where bounds with held
+    torques are proved, at the control instants.
+
+    Args:
+        certificate: Of the law, for the exact model of an arm, without friction that is fed forward.
+        acceleration: Largest |a_d| of the reference, one number or one per joint [rad/s²].
+        velocity: Largest |v_d| [rad/s]; None takes the velocity limits of the arm.
+
+    Returns:
+        Margins for `tool_motion`; an effort margin is inf where nothing bounds the torque.
+
+    Raises:
+        ArgumentError: If the certificate is of another kind of loop, or the arm states no velocity limit and none is
+            given.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> law = nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link"), bandwidth=20.0)
+        >>> margins = nbs.certified_margins(nbs.certify(law, 1.0), acceleration=2.0, velocity=1.0)
+        >>> bool((margins.position < 0.01).all() and (margins.effort < 50.0).all())
+        True
+    """
+    robot, law, constants = certificate.robot, certificate.controller, certificate.constants
+    why_not = why_no_arm_bounds(law, robot)
+    if certificate.bodies is not None or certificate.mismatch is not None:
+        why_not = "not where the model differs from the arm"
+    if why_not or robot is None:
+        raise ArgumentError(f"certified_margins bounds no torque: {why_not}; certify another law or arm.")
+    fastest = _one_each(robot, "velocity", robot.velocity_limit if velocity is None else velocity)
+    if not np.isfinite(fastest).all():
+        joint = robot.joint_names[int(np.argmin(np.isfinite(fastest)))]
+        raise ArgumentError(
+            f"joint '{joint}' of {robot.name} has no velocity limit; give certified_margins a velocity."
+        )
+    arm = CoriolisBounds.of(robot, constants)
+    motion = _within(arm, constants.floor, fastest, _one_each(robot, "acceleration", acceleration))
+    begin = 0.0 if certificate.start is None else certificate.start.storage
+    held = certificate.held_storage(begin)
+    level = held if math.isfinite(held) else max(begin, certificate.storage)
+    friction = certificate.comparison
+    loop = SampledLaw(law, constants, arm, motion, friction.t, friction.alpha, np.zeros(robot.nv), 0.0, 0.0)
+    asked = Asked(law, constants, *Curvature.with_diagonal(loop, level), level)
+    position = certificate.joint_errors if certificate.overshoot is None else certificate.overshoot[1]
+    return Margins(position, speed_bound(asked, arm), torque_bound(asked, arm, motion, half=0.0))
+
+
+def _one_each(robot: Robot, what: str, values: JointArray) -> JointArray:
+    if values.size not in (1, robot.nv):
+        raise ArgumentError(
+            f"{what} has {values.size} numbers for the {robot.nv} joints of {robot.name}; give one, or one each."
+        )
+    return np.full(robot.nv, values)
+
+
+def _within(arm: CoriolisBounds, floor: np.ndarray, v: JointArray, a: JointArray) -> MotionBounds:
+    """The bounds of all references with |v_d,i| ≤ v_i and |a_d,i| ≤ a_i."""
+    turning = np.abs(arm.links) @ v
+    turn, turn_d = min(arm.relative @ v, arm.link_relative @ turning), min(arm.by_floor @ v, arm.link_floor @ turning)
+    speed, acceleration = (math.sqrt(x @ np.abs(floor) @ x) for x in (v, a))
+    return MotionBounds(float(turn), float(turn_d), float(v.sum()), speed, acceleration, 0.0)
