@@ -205,7 +205,7 @@ REFUSED = {
     "track two_link --disturbance constant:1,2,3": "3 torques for 2 joints",
     "track two_link --out /proc/nowhere": "'/proc/nowhere': no such file",
     "replay none.npz": "no such file 'none.npz'",
-    "robots panda": "takes no argument 'panda'",
+    "robots pandas": "did you mean panda",
 }
 WRONG = {
     "--duration": ("nan", "inf", "0", "-1", "1_0", "٣", "1e-400", "ten"),
@@ -368,6 +368,17 @@ def test_robots_lists_every_arm(capsys):
     assert rows["double_pendulum"][1] == "none"
     assert ".xacro" in printed
     assert "nbs-pin[xacro]" in printed
+
+
+def test_robots_shows_the_joints_and_frames_of_one_arm(capsys):
+    assert cli.main(["robots", "panda", "--armature", "panda_joint2=0.25", "--payload", "2@panda_hand"]) == 0
+    printed = capsys.readouterr().out
+    rows = {line.split()[0]: line.split()[1:] for line in printed.splitlines() if line.split()}
+    assert rows["panda_joint2"] == ["-1.76", "to", "1.76", "2.175", "87", "0.003", "0", "0.25"]
+    frames = printed.split("Frames (--frame): ")[1].split(".")[0].split(", ")
+    robot = nbs.load_robot("panda", payload={"panda_hand": 2.0})
+    assert tuple(frames) == robot.frames
+    assert f"{sum(body.mass for body in robot.model.inertias):.4g} kg" in printed
 
 
 def test_version(capsys):

@@ -1,4 +1,4 @@
-"""`nbs-pin robots`: the arms known by name."""
+"""`nbs-pin robots`: the arms known by name, or what is known of one arm."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.units import TURNING, units
+from nbs_pin.base.units import TURNING, units, with_units
 from nbs_pin.cli.robots import Robots
 from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import Robot, load_robot
@@ -29,7 +29,10 @@ class Arm(NamedTuple):
 
 
 def run(options: Robots, console: Console, notes: Console) -> None:
-    """Print the table; raises NbsPinError if an arm cannot be loaded."""
+    """Print the table of all arms, or those of one; raises NbsPinError if an arm cannot be loaded."""
+    if options.robot is not None:
+        _show(load_robot(options.robot, **options.arm.given()), console)
+        return
     shown = Table(box=box.SIMPLE_HEAD)
     shown.add_column("name", no_wrap=True)
     for heading in ("joints", "effort [N·m]", "continuous", "friction"):
@@ -44,6 +47,46 @@ def run(options: Robots, console: Console, notes: Console) -> None:
         highlight=False,
         markup=False,
     )
+
+
+def _show(robot: Robot, console: Console) -> None:
+    """Print the joints of an arm with limits, friction and rotor inertia, and the frames that a tool path can lead."""
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    shown.add_column("joint", no_wrap=True)
+    ends = [_range(joint.continuous, joint.lower, joint.upper) for joint in robot.joints]
+    columns = {
+        ("range", "position"): ends,
+        ("speed", "velocity"): _texts(robot.velocity_limit),
+        ("effort", "torque"): _texts(robot.effort_limit),
+        ("viscous", "damping"): _texts(robot.damping),
+        ("Coulomb", "torque"): _texts(robot.friction),
+        ("rotor", "inertia"): _texts(robot.armature),
+    }
+    cells = []
+    for (heading, quantity), texts in columns.items():
+        given = units(quantity, robot.prismatic)
+        head = f"{heading}\n[{given[0]}]" if len(set(given)) == 1 else heading
+        shown.add_column(Text(head), justify="right", no_wrap=True)
+        cells.append(with_units(texts, given))
+    for name, *row in zip(robot.joint_names, *cells, strict=True):
+        shown.add_row(Text(name), *row)
+    console.print(shown)
+    mass = sum(body.mass for body in robot.model.inertias)
+    mounted = ", ".join(f"{x:.4g}" for x in robot.gravity_vector)
+    lines = (
+        f"{robot.name}: {robot.nv} joints that move, {mass:.4g} kg of moving parts, gravity {mounted} m/s².",
+        f"Frames (--frame): {', '.join(robot.frames)}.",
+    )
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _range(is_continuous: bool, lower: float, upper: float) -> str:
+    return "none" if is_continuous else f"{lower:.3g} to {upper:.3g}"
+
+
+def _texts(values: np.ndarray) -> list[str]:
+    return ["none" if math.isinf(value) else f"{value:.4g}" for value in values.tolist()]
 
 
 def known_arms() -> list[Arm]:
