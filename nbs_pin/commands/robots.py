@@ -51,7 +51,7 @@ def run(options: Robots, console: Console, notes: Console) -> None:
 
 def _show(robot: Robot, console: Console) -> None:
     """Print the joints of an arm with limits, friction and rotor inertia, and the frames that a tool path can lead."""
-    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    shown = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     shown.add_column("joint", no_wrap=True)
     ends = [_range(joint.continuous, joint.lower, joint.upper) for joint in robot.joints]
     columns = {
