@@ -223,21 +223,21 @@ def test_the_duration_advised_to_a_path_with_times_is_enough_too():
 
 
 def test_the_joints_stay_within_their_limits_between_the_nodes_of_the_spline():
-    """A limit that the joint passes between nodes alone is seen: all extremes of the spline are looked at."""
-    robot, motion = circle("panda", "panda_hand", radius=0.1, duration=5.0)
-    turns = motion.joints.turns()
-    np.testing.assert_allclose(np.abs(motion.joints(turns, 1)).min(axis=-1), 0.0, atol=1e-6)
-    dense, extremes = motion.joints(np.linspace(0.0, 1.0, 100_001)), motion.joints(np.append(turns, [0.0, 1.0]))
+    """A limit that a joint passes between nodes alone is seen: all extremes of the spline are looked at."""
+    robot, posture, begin = begun("ur5", "tool0")
+    path = nbs.ToolPath.circle(begin, 0.1)
+    joints = nbs.tool_motion(robot, path, "tool0", posture=posture).joints
+    turns = joints.turns()
+    np.testing.assert_allclose(np.abs(joints(turns, 1)).min(axis=-1), 0.0, atol=1e-6)
+    dense, extremes = joints(np.linspace(0.0, 1.0, 100_001)), joints(np.append(turns, [0.0, 1.0]))
     assert (dense.max(axis=0) <= extremes.max(axis=0) + 1e-12).all()
     assert (dense.min(axis=0) >= extremes.min(axis=0) - 1e-12).all()
-    joint = int(np.argmax(extremes.max(axis=0) - np.maximum(*motion.joints(np.array([0.0, 1.0])))))
-    limits = {robot.joint_names[joint]: {"upper": float(extremes[:, joint].max()) - 1e-9}}
-    begin = robot.pose(motion.joints(np.zeros(1))[0], "panda_hand")[:3, 3]
-    posture = nbs.tool_posture(robot, "panda_hand")
-    with pytest.raises(nbs.ArgumentError, match=f"of joint '{robot.joint_names[joint]}', outside"):
-        nbs.tool_motion(
-            nbs.load_robot("panda", limits=limits), nbs.ToolPath.circle(begin, 0.1), "panda_hand", posture=posture
-        )
+    nodes = joints(np.linspace(0.0, 1.0, 2 ** int(np.log2(len(joints.spline.c))) + 1))
+    passed = int(np.argmax(extremes.max(axis=0) - nodes.max(axis=0)))
+    between = float(0.5 * (extremes[:, passed].max() + nodes[:, passed].max()))
+    name = robot.joint_names[passed]
+    with pytest.raises(nbs.ArgumentError, match=f"of joint '{name}', outside"):
+        nbs.tool_motion(nbs.load_robot("ur5", limits={name: {"upper": between}}), path, "tool0", posture=posture)
 
 
 @pytest.mark.parametrize(("options", "said"), [
