@@ -33,7 +33,7 @@ def find_chromium():
 class Browser:
     """One headless page; `events` collects the protocol's events (`Network.requestWillBeSent`, …)."""
 
-    def __init__(self, width=1280, height=800, patience=60.0):
+    def __init__(self, width=1280, height=800, *more, patience=60.0):
         self.patience = patience
         self.events = []
         self._count = 0
@@ -41,7 +41,13 @@ class Browser:
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         read_in, self._out = os.pipe()
         self._in, write_out = os.pipe()
-        flags = [*FLAGS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}", "about:blank"]
+        flags = [
+            *FLAGS,
+            *more,
+            f"--user-data-dir={self._profile.name}",
+            f"--window-size={width},{height}",
+            "about:blank",
+        ]
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", "-c", LAUNCH, str(read_in), str(write_out), find_chromium(), *flags],
             pass_fds=(read_in, write_out),
@@ -101,6 +107,13 @@ class Browser:
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{expression}: {answer['exceptionDetails']}")
         return answer["result"].get("value")
+
+    def resize(self, width, height, *, dark=False):
+        """Makes the window another size, of a phone if narrow or low, and the colours those of the scheme."""
+        small = {"deviceScaleFactor": 1, "mobile": min(width, height) < 600}
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, **small)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
 
     def screenshot(self):
         """The page as PNG bytes, two pictures on."""

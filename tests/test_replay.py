@@ -6,6 +6,7 @@ import struct
 import warnings
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -13,11 +14,13 @@ import pytest
 
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
-from nbs_pin.reports.replay import body_poses, replay
+from nbs_pin.reports.replay import replay
+from nbs_pin.reports.scene import body_poses
+from nbs_pin.reports.signals import MAX_ROWS, _rows
 from nbs_pin.robots.meshes import MeshError, find_mesh, read_mesh
 from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.robot import load_robot
-from nbs_pin.robots.visuals import STEEL, Transmission, link_visuals, read_couplings, tip
+from nbs_pin.robots.visuals import STEEL, Transmission, link_visuals, read_couplings, tips
 from tests.browser import Browser, find_chromium
 
 BARE = """<robot name="bare"><link name="base"/>
@@ -67,16 +70,15 @@ def shown_pose(page, link, arm):
 
 
 def tip_link(robot):
-    last, point = tip(robot)
-    return next(frame.name for frame in robot.model.frames if frame.type == pin.FrameType.BODY
-                and frame.parentJoint == last and np.allclose(frame.placement.translation, point))  # fmt: skip
+    return tips(robot)[-1].name
 
 
 @pytest.fixture(scope="module")
 def browser():
     if find_chromium() is None:
         pytest.skip("no Chromium: install it or set $CHROMIUM")
-    with closing(Browser(640, 480)) as page:
+    with closing(Browser(800, 600)) as page:
+        page.resize(800, 600)
         yield page
 
 
@@ -152,7 +154,7 @@ def test_names_are_shown_as_they_are_and_nothing_is_fetched_or_complained_about(
     browser.open(save(moving_run(robot), tmp_path), "#t=1")
     shown = browser.evaluate("[...document.querySelectorAll('#joints tr')].map(row => row.cells[0].textContent)")
     assert tuple(shown) == robot.joint_names == ("</script><script>alert(1)</script>", "{{data}}")
-    assert "</script>" in browser.evaluate("document.getElementById('notes').textContent")
+    assert "</script>" in browser.evaluate("document.getElementById('law').textContent")
     browser.screenshot()
     assert browser.requests() == []
     loud = [entry for entry in browser.complaints() if entry.get("entry", {}).get("level") != "warning"]
@@ -167,9 +169,85 @@ def test_readout_is_the_error_of_the_run(browser, tmp_path):
     run = moving_run(robot)
     browser.open(save(run, tmp_path), "#t=1")
     row = np.searchsorted(run.t, 1.0 - 1e-9)
-    cells = browser.evaluate("[...document.querySelectorAll('#joints tr')].map(row => row.cells[2].textContent)")
-    shown = [float(text.removesuffix(" rad")) for text in cells]
+    cells = browser.evaluate("[...document.querySelectorAll('#joints tr')].map(row => row.cells[3].textContent)")
+    shown = [float(text) for text in cells]
     np.testing.assert_allclose(shown, (run.q - run.q_ref)[row], rtol=0.05)
+    cells = browser.evaluate("[...document.querySelectorAll('#joints tr')].map(row => row.cells[4].textContent)")
+    shown = [np.deg2rad(float(text.removesuffix("°"))) for text in cells]
+    np.testing.assert_allclose(shown, (run.q - run.q_ref)[row], rtol=0.05)
+
+
+def rectangle(page, selector):
+    return page.evaluate(f"(box => [box.left, box.top, box.right, box.bottom])"
+                         f"(document.querySelector('{selector}').getBoundingClientRect())")  # fmt: skip
+
+
+@pytest.mark.browser
+def test_charts_show_the_run_zoom_together_and_share_the_scale_of_the_slider(browser, tmp_path):
+    run = moving_run(load_robot("two_link"))
+    browser.open(save(run, tmp_path), "#t=1")
+    browser.evaluate("document.querySelectorAll('.signals button')[2].click()")  # the position beside |error|
+    data = browser.evaluate("replay.plots().map(plot => plot.data.map(row => [...row]))")
+    error, position = (np.array(rows) for rows in data)
+    np.testing.assert_allclose(error[1:], np.abs(run.q - run.q_ref).T, rtol=1e-5)
+    np.testing.assert_allclose(position[1::2], run.q.T, atol=1e-6)
+    np.testing.assert_allclose(position[2::2], run.q_ref.T, atol=1e-6)
+    browser.evaluate("replay.plots()[1].setScale('x', {min: .5, max: 1.5})")
+    assert browser.evaluate("replay.plots().map(plot => [plot.scales.x.min, plot.scales.x.max])") == [[0.5, 1.5]] * 2
+    left, _, right, _ = rectangle(browser, ".u-over")
+    begin, _, end, _ = rectangle(browser, "#time")
+    assert (begin + 8, end - 8) == pytest.approx((left, right), abs=1.0)  # the thumb is 16 px wide
+    assert browser.evaluate("[document.getElementById('time').min, document.getElementById('time').max]") == [
+        "0.5",
+        "1.5",
+    ]
+    browser.evaluate("replay.plots()[1].over.dispatchEvent(new MouseEvent('dblclick', {bubbles: true}))")
+    assert browser.evaluate("replay.plots()[0].scales.x.max") == 2.0
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("size", [(390, 844), (844, 390)])
+def test_on_a_phone_nothing_leaves_the_window_and_panels_leave_room_for_the_arm(size, browser, tmp_path):
+    browser.resize(*size, dark=True)
+    try:
+        browser.open(save(moving_run(load_robot("two_link")), tmp_path), "#t=1")
+        for opened in ("numbers", "charts"):
+            for selector in ("#side", "#bar", "#speed", "#label", "#time", "#fold"):
+                left, top, right, bottom = rectangle(browser, selector)
+                assert 0 <= left <= right <= size[0], (selector, opened)
+                assert 0 <= top <= bottom <= size[1], (selector, opened)
+            side, bar = rectangle(browser, "#side"), rectangle(browser, "#bar")
+            beside, between = size[0] - side[2], bar[1] - side[3]
+            assert max(beside * bar[1], size[0] * between) > 0.2 * size[0] * size[1], opened
+            browser.click("#fold" if opened == "numbers" else "#chartfold")
+        assert browser.evaluate("getComputedStyle(document.body).color") != "rgb(29, 39, 51)"  # dark
+    finally:
+        browser.resize(800, 600)
+
+
+@pytest.mark.browser
+def test_a_video_is_recorded_in_the_kind_that_its_name_says(browser, tmp_path):
+    browser.open(save(moving_run(load_robot("two_link"), duration=0.5), tmp_path), "#t=0")
+    name, kind, head = browser.evaluate(
+        "new Promise(done => { window.save = async (blob, name) => done([name, blob.type, "
+        "String.fromCharCode(...new Uint8Array(await blob.arrayBuffer()).slice(0, 8))]); "
+        "document.getElementById('video').click(); })"
+    )
+    assert (name, kind) in (("two_link.mp4", "video/mp4"), ("two_link.webm", "video/webm"))
+    assert head[4:] == "ftyp" if kind == "video/mp4" else head.startswith("\x1aE\xdf\xa3")
+
+
+@pytest.mark.browser
+def test_without_webgl_the_page_says_so_and_keeps_charts_and_numbers(tmp_path):
+    if find_chromium() is None:
+        pytest.skip("no Chromium: install it or set $CHROMIUM")
+    with closing(Browser(1280, 800, "--disable-3d-apis")) as page:
+        page.resize(1280, 800)
+        page.open(save(moving_run(load_robot("two_link")), tmp_path), "#t=1")
+        assert "WebGL" in page.evaluate("document.getElementById('absent').innerText")
+        assert page.evaluate("replay.plots().length") == 3
+        assert page.evaluate("document.querySelector('#joints td:nth-child(4)').textContent") == "0.1104"
+        assert [entry for entry in page.complaints() if entry.get("entry", {}).get("level") == "error"] == []
 
 
 # --- the file
@@ -178,7 +256,7 @@ def test_readout_is_the_error_of_the_run(browser, tmp_path):
 def test_page_is_self_contained_and_small(tmp_path):
     text = save(moving_run(load_robot("panda")), tmp_path).read_text()
     assert len(text) < 12e6
-    text = re.sub(r'<script type="text/plain" id="licence">.*?</script>', "", text, count=1, flags=re.S)
+    text = re.sub(r'<script type="text/plain" id="licences">.*?</script>', "", text, count=1, flags=re.S)
     addresses = set(re.findall(r"https?://[^\s\"'<>)]+", text))
     assert addresses <= {"http://www.w3.org/1999/xhtml"}, addresses
     assert not re.search(r"<(script|img|iframe|link)[^>]+(src|href)=\"(?!data:)", text)
@@ -190,7 +268,7 @@ def test_the_chosen_start_of_a_batch_is_shown(tmp_path):
     run = moving_run(load_robot("two_link"), batch=(2, 2))
     run.q[:, 1, 0] += 0.25
     pages = {start: save(run, tmp_path, start=start).read_text() for start in range(4)}
-    error = {start: re.search(r'"error": "([^"]+)"', page)[1] for start, page in pages.items()}
+    error = {start: re.search(r'"error":"([^"]+)"', page)[1] for start, page in pages.items()}
     assert error[0] == error[1] == error[3] != error[2]
     with pytest.raises(ArgumentError, match="starts 0 to 3"):
         save(run, tmp_path, start=4)
@@ -244,6 +322,24 @@ def test_body_poses_are_pinocchios():
         pin.forwardKinematics(robot.model, data, row)
         for placement, pose in zip(data.oMi, poses, strict=True):
             np.testing.assert_allclose(pin.XYZQUATToSE3(pose).homogeneous, placement.homogeneous, atol=1e-12)
+
+
+def test_of_a_long_run_the_rows_of_largest_error_and_torque_are_kept():
+    run = moving_run(load_robot("two_link"), duration=120.0)
+    run.q[12345, 1] += 5.0
+    run.tau_command[23456, 0] = 1e4
+    rows = _rows(run)
+    assert {0, 12345, 23456, len(run.t) - 1} <= set(rows.tolist())
+    assert len(rows) <= MAX_ROWS + 3
+    assert np.diff(rows).max() <= 3 * len(run.t) / MAX_ROWS + 1
+
+
+def test_every_branch_has_a_tip():
+    with pytest.warns(UserWarning, match="no actuator"):
+        arms = load_robot(Path(__file__).parent / "data" / "mjcf" / "two_arms.xml")
+    found = tips(arms)
+    assert len(found) == 2
+    assert {tip.joint for tip in found} == set(range(1, arms.model.njoints)) - set(arms.model.parents)
 
 
 # --- what is drawn

@@ -1,49 +1,26 @@
 """Replays of runs in the browser: one self-contained page with the arm and a translucent reference arm.
 
-The page contains meshcat's viewer, the arm as a sequence of meshcat commands, and the poses of its bodies by
-Pinocchio's forward kinematics; a small script (`replay.html`) moves them. No server is started, and the page's content
-security policy forbids every connection.
+The page contains meshcat's viewer, the arm as a sequence of meshcat commands, the poses of its bodies by Pinocchio's
+forward kinematics, which a script moves, and the run's signals, which uPlot draws. No server is started, and the page's
+content security policy forbids every connection. Without WebGL it has the charts and numbers alone.
 """
 
-import base64
-import html
-import importlib.resources
-import json
-import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import pinocchio as pin
-import umsgpack  # type: ignore[import-untyped]
-from jaxtyping import Float, Int
-from meshcat.commands import SetObject, SetTransform
-from meshcat.geometry import MeshPhongMaterial, TriangularMeshGeometry
-from meshcat.path import Path as ScenePath
 
 from nbs_pin.base.arguments import checked, count, maybe, paths, writable
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
-from nbs_pin.base.records import RUN, Run
+from nbs_pin.base.records import ROW_ARRAYS, RUN, Run
+from nbs_pin.reports.captions import law_of, settings_of
+from nbs_pin.reports.pages import page
+from nbs_pin.reports.scene import scene_of
+from nbs_pin.reports.signals import signals_of
 from nbs_pin.robots.named import robot_of
-from nbs_pin.robots.robot import ARM, Robot, configuration_difference
-from nbs_pin.robots.visuals import Visual, link_visuals, tip
-from nbs_pin.simulation.tool_errors import tool_of
-
-FRAME_RATE = 50.0
-"""Frames per second of run time [1/s]; the page interpolates between them."""
-FARTHEST = 1e6
-"""Configurations beyond this are not drawn [rad, m]."""
-LEAST_FRAMES = 300
-"""Frames of a short run along a path of the tool, whose trace is not to have corners."""
-MAX_POINTS = 400
-"""Most points of such a path."""
-SHORTEST_PATH = 1e-6
-"""Shorter ones are not drawn [m]."""
-MAX_FRAMES = 12_000
-"""Longer runs get fewer frames per second, so that the page stays small."""
+from nbs_pin.robots.robot import ARM, Robot
 
 
 @checked(run=RUN, path=writable, robot=maybe(ARM), start=count(0), package_dirs=paths)
@@ -75,155 +52,36 @@ def replay(
         replay.html
     """
     robot = robot_of(run) if robot is None else robot
+    shown = shown_run(run, robot, start, package_dirs)
+    return write_whole(path, page("replay.html", f"{robot.name}: {law_of(run)}, replay", {"runs": [shown]}))
+
+
+def shown_run(run: Run, robot: Robot, start: int = 0, package_dirs: Iterable[str | Path] = ()) -> dict[str, Any]:
+    """What a page shows of one start of a run; raises ArgumentError as `replay` does."""
     if robot.joint_names != run.joint_names:
         raise ArgumentError(
             f"the run moves joints {', '.join(run.joint_names)} but {robot.name} has {', '.join(robot.joint_names)}: "
             "give the robot that ran."
         )
-    tool = tool_of(run)
-    rows = _frame_rows(run.t, LEAST_FRAMES if tool else 0)
-    q, q_ref = (_one_start(array, start)[rows] for array in (run.q, run.q_ref))
-    if not (np.isfinite(q).all() and np.isfinite(q_ref).all()):
-        raise ArgumentError("the run has configurations that are not finite: show the part before it diverged.")
-    if max(np.abs(q).max(), np.abs(q_ref).max()) > FARTHEST:
-        raise ArgumentError(f"the run has configurations beyond ±{FARTHEST:g}: show the part before it diverged.")
-    poses = np.stack([body_poses(robot, q), body_poses(robot, q_ref)], axis=1)
-    visuals = link_visuals(robot, package_dirs)
-    joint, point = tip(robot) if tool is None else _place(robot, tool["frame"])
-    data = {
-        "name": robot.name,
-        "notes": _notes(run),
-        "joints": [{"name": joint.name, "unit": "m" if joint.prismatic else "rad"} for joint in robot.joints],
-        "bodies": [_body_node(body)[1] for body in range(robot.model.njoints)],
-        "links": {
-            frame.name: (frame.parentJoint, frame.placement.homogeneous.T.ravel().tolist())
-            for frame in robot.model.frames
-            if frame.type == pin.FrameType.BODY
-        },
-        "tip": {"body": joint, "point": point.tolist()},
-        "path": "" if tool is None else _encoded(_path(robot, _one_start(run.q_ref, start), tool["frame"]), np.float32),
-        "view": _view(robot, visuals, poses),
-        "commands": [base64.b64encode(umsgpack.packb(command)).decode() for command in _commands(robot, visuals)],
-        "times": _encoded(run.t[rows], np.float64),
-        "poses": _encoded(poses, np.float32),
-        "position": _encoded(q, np.float32),
-        "error": _encoded(configuration_difference(q, q_ref, run.continuous), np.float32),
-    }
-    return write_whole(path, _page(robot.name, data).encode())
-
-
-def body_poses(robot: Robot, q: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows bodies 7"]:
-    """Poses of the fixed base and of the body behind each joint, in the base frame: (x, y, z [m], qx, qy, qz, qw)."""
-    data = robot.model.createData()
-    poses = np.empty((len(q), robot.model.njoints, 7))
-    for row, configuration in enumerate(q):
-        pin.forwardKinematics(robot.model, data, configuration)
-        poses[row] = [pin.SE3ToXYZQUAT(placement) for placement in data.oMi]
-    return poses
-
-
-def _one_start(array: Float[np.ndarray, "rows *batch n"], start: int) -> Float[np.ndarray, "rows n"]:
-    starts = array.reshape(array.shape[0], -1, array.shape[-1])
-    if not 0 <= start < starts.shape[1]:
-        raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts.shape[1] - 1}.")
-    return starts[:, start]
-
-
-def _place(robot: Robot, frame: str) -> tuple[int, Float[np.ndarray, "3"]]:
-    """The joint that moves the frame, and the frame's origin in the frame of that joint [m]."""
-    found = robot.model.frames[robot.frame_id(frame)]
-    return int(found.parentJoint), np.array(found.placement.translation)
-
-
-def _path(robot: Robot, q_ref: Float[np.ndarray, "rows n"], frame: str) -> Float[np.ndarray, "points 3"]:
-    """The path that the tool was to follow [m], points at nearly even distances; none if it went nowhere."""
-    points = robot.pose(q_ref, frame)[:, :3, 3]
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
-    if along[-1] < SHORTEST_PATH:
-        return points[:0]
-    return np.asarray(points[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], MAX_POINTS)))])
-
-
-def _frame_rows(t: Float[np.ndarray, " rows"], least: int = 0) -> Int[np.ndarray, " frames"]:
-    """Rows to show, nearest to an even clock, the last included: every frame is a state the run recorded."""
-    count = min(max(int((t[-1] - t[0]) * FRAME_RATE) + 2, least), MAX_FRAMES)
-    after = np.searchsorted(t, np.linspace(t[0], t[-1], count) - 1e-9 * (t[-1] - t[0]))
-    return np.unique(np.minimum(after, len(t) - 1))
-
-
-def _notes(run: Run) -> str:
-    """Controller, plant and reference from the run's notes, in one line."""
-    return " · ".join(str(run.info[key]) for key in ("controller", "plant", "reference") if run.info.get(key))
-
-
-def _body_node(body: int) -> tuple[str, str]:
-    return "actual", f"body{body}"
-
-
-def _commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]:
-    """The meshcat commands that build the arm: a node per body, under it a node per shape."""
-    commands = [SetTransform(np.eye(4), ScenePath(_body_node(body))) for body in range(robot.model.njoints)]
-    for index, visual in enumerate(visuals):
-        frame = robot.model.frames[robot.model.getFrameId(visual.link, pin.FrameType.BODY)]
-        node = ScenePath((*_body_node(frame.parentJoint), f"shape{index}"))
-        geometry = TriangularMeshGeometry(visual.vertices.astype(np.float32), visual.faces.astype(np.uint32))
-        commands += [
-            SetObject(geometry, _material(visual), node),
-            SetTransform(frame.placement.homogeneous @ visual.placement, node),
-        ]
-    return [command.lower() for command in commands]
-
-
-def _material(visual: Visual) -> MeshPhongMaterial:
-    shares = [min(max(channel, 0.0), 1.0) for channel in visual.color]
-    red, green, blue = (round(255 * share) for share in shares[:3])
-    return MeshPhongMaterial(
-        color=(red << 16) + (green << 8) + blue, opacity=shares[3], specular=0x2A2A2A, shininess=38
-    )
-
-
-def _view(robot: Robot, visuals: tuple[Visual, ...], poses: Float[np.ndarray, "frames 2 bodies 7"]) -> dict[str, Any]:
-    """The view in which the whole motion of both arms is visible, and the cell width of the grid [m]."""
-    picked = poses[np.unique(np.linspace(0, len(poses) - 1, 40).astype(int))].reshape(-1, *poses.shape[2:])
-    points = [np.zeros((1, 3))]
-    for visual in visuals:
-        frame = robot.model.frames[robot.model.getFrameId(visual.link, pin.FrameType.BODY)]
-        box = np.array(np.meshgrid(*np.stack([visual.vertices.min(0), visual.vertices.max(0)], axis=1))).reshape(3, -1)
-        placement = frame.placement.homogeneous @ visual.placement
-        corners = placement[:3, :3] @ box + placement[:3, 3:]
-        for pose in picked[:, frame.parentJoint]:
-            points.append(np.asarray(pin.XYZQUATToSE3(pose).rotation @ corners).T + pose[:3])
-    cloud = np.concatenate(points)
-    target = 0.5 * (cloud.min(axis=0) + cloud.max(axis=0))
-    radius = max(float(np.linalg.norm(cloud - target, axis=1).max()), 1e-2)
-    spread, axes = np.linalg.eigh(np.cov(cloud[:, :2], rowvar=False))
-    across = axes[:, 0] * (-1.0 if axes[1, 0] > 0.0 else 1.0)
-    flat = spread[0] < 0.1 * spread[1]
-    direction = np.array([*(across if flat else (0.65, -0.76)), 0.3])
-    cell = min((10.0**k * digit for k in range(-4, 4) for digit in (1.0, 2.0, 5.0)), key=lambda c: abs(c - radius / 5))
-    outward = np.random.default_rng(0).normal(size=(160, 3))
+    one = one_start(run, start)
+    limits = [None if limit == float("inf") else limit for limit in run.effort_limit.tolist()]
     return {
-        "cloud": cloud[np.unique((cloud @ outward.T).argmax(axis=0))].tolist(),
-        "target": target.tolist(),
-        "radius": radius,
-        "direction": (direction / np.linalg.norm(direction)).tolist(),
-        "cell": float(f"{cell:.1g}"),
+        "name": robot.name,
+        "law": law_of(run),
+        "notes": settings_of(run),
+        "joints": [
+            {"name": name, **of._asdict(), "limit": limit}
+            for name, of, limit in zip(run.joint_names, run.units, limits, strict=True)
+        ],
+        "scene": scene_of(one, robot, package_dirs),
+        "signals": signals_of(one, robot),
     }
 
 
-def _encoded(array: np.ndarray, dtype: type[np.floating[Any]]) -> str:
-    return base64.b64encode(np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
-
-
-def _page(name: str, data: dict[str, Any]) -> str:
-    """The template with its four placeholders filled in one pass, so that content is never read as a placeholder."""
-    viewer = importlib.resources.files("meshcat") / "viewer" / "dist"
-    holes = {
-        "title": html.escape(f"{name} – replay"),
-        "licence": html.escape((viewer / "main.min.js.LICENSE.txt").read_text(encoding="utf-8")),
-        "meshcat": (viewer / "main.min.js").read_text(encoding="utf-8"),
-        # "<" would let a name end the script element
-        "data": json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
-    }
-    template = (importlib.resources.files("nbs_pin.reports") / "replay.html").read_text(encoding="utf-8")
-    return re.sub(r"\{\{(\w+)\}\}", lambda hole: holes[hole[1]], template)
+def one_start(run: Run, start: int) -> Run:
+    """The run with one start alone; raises ArgumentError if it has no such start."""
+    arrays = {name: getattr(run, name).reshape(len(run.t), -1, run.nv) for name in ROW_ARRAYS}
+    starts = arrays["q"].shape[1]
+    if not 0 <= start < starts:
+        raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts - 1}.")
+    return replace(run, **{name: values[:, start] for name, values in arrays.items()})

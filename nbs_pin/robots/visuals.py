@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -42,6 +42,17 @@ class Visual:
     faces: Int[np.ndarray, "f 3"]
     """Vertex indices of the triangles, counter-clockwise seen from outside."""
     color: Color
+
+
+class Tip(NamedTuple):
+    """The end of a branch: its farthest link frame, or its centre of mass if all frames are at the last joint."""
+
+    name: str
+    """The link, or the joint that moves it."""
+    joint: int
+    """Index of that joint in Pinocchio's model."""
+    point: Float[np.ndarray, "3"]
+    """Where it is in the frame of the joint [m]."""
 
 
 @dataclass(frozen=True)
@@ -116,11 +127,17 @@ def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple
     return (*visuals, *_capsules(robot, {visual.link for visual in visuals}, set(faults)))
 
 
-def tip(robot: Robot) -> tuple[int, Float[np.ndarray, "3"]]:
-    """The last joint and the tip of the arm in its frame [m]: its farthest link frame, else its centre of mass."""
-    last = robot.model.njoints - 1
-    frames = [frame for frame in robot.model.frames if frame.type == pin.FrameType.BODY and frame.parentJoint == last]
-    return last, _far_end(robot.model.inertias[last].lever, frames)
+def tips(robot: Robot) -> tuple[Tip, ...]:
+    """The end of every branch of the arm, that of the last joint last."""
+    model, parents = robot.model, set(robot.model.parents)
+    found = []
+    for joint in range(1, model.njoints):
+        if joint not in parents:
+            body = [frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.parentJoint == joint]
+            point = _far_end(model.inertias[joint].lever, body)
+            names = [frame.name for frame in body if np.array_equal(frame.placement.translation, point)]
+            found.append(Tip(next(iter(names), model.names[joint]), joint, point))
+    return tuple(found)
 
 
 def _root(robot: Robot) -> Any:

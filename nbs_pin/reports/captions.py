@@ -1,0 +1,86 @@
+"""What made a run, in words: the titles and settings of pictures and pages."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from nbs_pin.base.records import Run
+
+_NAMES = {
+    "PD": "PD control",
+    "PID": "PID control",
+    "SlotineLi": "Slotine–Li",
+    "MujocoPlant": "MuJoCo",
+    "DynamicsPlant": "Pinocchio",
+}
+"""Classes whose names are not words run together."""
+_ENGINES = {
+    "rk4": "RK4",
+    "euler": "Euler",
+    "semi_implicit_euler": "semi-implicit Euler",
+    "implicitfast": "implicitfast",
+}
+
+
+def law_of(run: Run) -> str:
+    """The control law of a run, as in "neural backstepping"."""
+    return _words(str(run.info.get("controller") or "unnamed law"))
+
+
+def arm_of(run: Run) -> str:
+    """The arm of a run, without the folder of its file."""
+    return re.sub(r"\.(urdf|xacro|xml)$", "", run.robot.rsplit("/", 1)[-1]) or f"{run.nv} joints"
+
+
+def settings_of(run: Run) -> list[str]:
+    """What else determines a run, one phrase each: rate and period of the law, motion, disturbance, plant, seed."""
+    given = run.info.get("settings")
+    given = given if isinstance(given, Mapping) else {}
+    saved = str(given.get("controller", "")).endswith(".nbs")
+    phrases = [
+        f"ω = {given['bandwidth']:g} rad/s" if "bandwidth" in given and not saved else "",
+        f"control every {1e3 * run.period:g} ms",
+        _motion(run, given),
+        _start(given),
+        "" if given.get("disturbance") in (None, "none") else f"disturbance {given['disturbance']}",
+        *_plant(str(run.info.get("plant") or ""), given),
+        *(f"{name.replace('_', ' ')} {_told(value)}" for name, value in (given.get("arm") or {}).items()),
+        f"seed {given['seed']}" if "seed" in given else "",
+    ]
+    return [phrase for phrase in phrases if phrase]
+
+
+def _motion(run: Run, given: Mapping[str, Any]) -> str:
+    motion = str(run.info.get("reference") or "").rsplit("/", 1)[-1]
+    return f"{motion} at {given['frequency']:g} rad/s" if motion == "sinusoid" and "frequency" in given else motion
+
+
+def _start(given: Mapping[str, Any]) -> str:
+    if given.get("start"):
+        return f"from {given['start']}"
+    return f"start off by {given['start_error']:g} rad" if given.get("start_error") else ""
+
+
+def _plant(text: str, given: Mapping[str, Any]) -> list[str]:
+    """The plant from its repr, as in MujocoPlant(panda, rk4, joint_friction=drop)."""
+    name, _, inside = text.rstrip(")").partition("(")
+    words = inside.split(", ")
+    engine = next((f" ({_ENGINES[word]})" for word in words if word in _ENGINES), "")
+    friction = given.get("joint_friction") or next((w.partition("=")[2] for w in words if "joint_friction=" in w), "")
+    return [
+        f"in {_words(name)}{engine}" if name else "",
+        {"drop": "no joint friction", "keep": "with joint friction"}.get(friction, ""),
+        "joint stops" if "joint_stops=keep" in words else "",
+    ]
+
+
+def _words(name: str) -> str:
+    """A class name, or the repr of an object, as words: NeuralBackstepping(…) is "neural backstepping"."""
+    name = name.partition("(")[0]
+    if not re.fullmatch(r"\w+", name):
+        return name
+    return _NAMES.get(name) or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()
+
+
+def _told(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
