@@ -2,10 +2,11 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.units import several, units
@@ -21,6 +22,7 @@ from nbs_pin.kernels.records import State, Target
 from nbs_pin.kernels.tree_layout import BASE, BODY, PLACE
 from nbs_pin.kernels.views import damping_in, pid_of, potential_in
 
+_ASCII = {"·": " ", "²": "^2", "τ": "tau", "≤": "<=", "≥": ">=", "‖": "|", "ω": "omega", "Λ": "Lambda", "−": "-", "∞": "oo", "√": "sqrt"}
 _SECTIONS = {"errors": "errors", "backstepping": "the law", "linear_law": "the law", "friction": "friction"}
 _JOINTS = {"place": "place joint", "sweep": "motion and load of body", "gather": "torque of joint"}
 """What kernels do, as remarks in the C; the latter for each joint."""
@@ -44,12 +46,12 @@ class Exported:
     """Whether the torque holds the weight of the arm."""
     precision: Precision
     title: str
-    about: list[str]
-    """What the head of the header says."""
     joint_names: tuple[str, ...]
-    prismatic: np.ndarray
+    prismatic: Bool[np.ndarray, " n"]
     robot_sha256: str
-    versions: dict[str, str] = field(default_factory=dict)
+    known: tuple[str, ...]
+    """What a certificate says of the law, line by line."""
+    versions: dict[str, str]
 
     @property
     def nv(self) -> int:
@@ -72,7 +74,7 @@ class Exported:
             "NAME": self.name,
             "PREFIX": self.name.upper(),
             "N": self.nv,
-            "TITLE": self.title,
+            "TITLE": comment(self.title),
             "VERSION": self.versions["nbs_pin"],
             "VERSIONS": ", ".join(f"{name} {version}" for name, version in self.versions.items() if name != "nbs_pin"),
             "PRECISION": self.precision,
@@ -97,7 +99,7 @@ def law_files(exported: Exported) -> dict[str, str]:
     )
     text = _without_blanks(filled("law.c", source))
     header = words | {
-        "ABOUT": "\n".join(f" * {line}".rstrip() for line in exported.about),
+        "ABOUT": "\n".join(f" * {comment(line)}".rstrip() for line in _about(exported)),
         "MEMORY": memory if remembers else "",
         "LIBM": ", ".join(_libm(text)) or "no function",
         "RATE_WORDS": " and its rate" if np.isfinite(exported.rate_limit).any() else "",
@@ -106,6 +108,33 @@ def law_files(exported: Exported) -> dict[str, str]:
         "VELOCITY_UNIT": exported.unit("velocity"),
     }
     return {f"{exported.name}.h": filled("law.h", header), f"{exported.name}.c": text}
+
+
+def pid_limit(law: Packed) -> JointArray:
+    """Where the torque of a PID saturates [N·m]."""
+    return as_python(pid_of, {})(law.weights).limit
+
+
+def comment(text: str) -> str:
+    """A text that may stand in a comment of C, in ASCII."""
+    for word, plain in _ASCII.items():
+        text = text.replace(word, plain)
+    return text.encode("ascii", "replace").decode().replace("*/", "* /").replace("\n", " ")
+
+
+def _about(exported: Exported) -> list[str]:
+    """What the head of the header says of the arm and the law."""
+    rows = zip(exported.joint_names, exported.effort_limit, exported.rate_limit, exported.prismatic, strict=True)
+    joints = [
+        f"  {i}  {name}: |tau| <= {effort:g} {'N' if slides else 'N m'}"
+        + (f", |dtau/dt| <= {rate:g} {'N' if slides else 'N m'}/s" if np.isfinite(rate) else "")
+        for i, (name, effort, rate, slides) in enumerate(rows)
+    ]
+    weight = "holds the weight of the arm" if exported.gravity else "leaves the weight of the arm to the arm itself"
+    fed = exported.code is not LawCode.PID and bool(exported.law.layout[at.FRICTION])
+    friction = "and feeds joint friction forward" if fed else "and feeds no joint friction forward"
+    certified = ["", *exported.known] if exported.known else ["", "No certificate was given at the export."]
+    return ["Joints:", *joints, "", f"The torque {weight} {friction}.", *certified]
 
 
 def traced(law: Packed, tree: Packed) -> tuple[Tape, np.ndarray]:
