@@ -12,6 +12,7 @@ from nbs_pin.base.checks import PerJoint, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.controllers.exported import export_law
+from nbs_pin.export.reals import Precision
 from nbs_pin.kernels.layout import Packed
 
 
@@ -67,7 +68,7 @@ class Controller(ABC):
         self,
         folder: str | Path,
         *,
-        precision: str = "double",
+        precision: Precision = "double",
         gravity: bool = True,
         rate_limit: PerJoint = np.inf,
         period: float = 0.001,
@@ -99,8 +100,16 @@ class Controller(ABC):
             ...     nbs.PD.for_robot(nbs.load_robot("two_link")).export(f"{folder}/two_link_pd").name
             'two_link_pd.h'
         """
-        options = {"precision": precision, "gravity": gravity, "rate_limit": np.asarray(rate_limit), "period": period}
-        return export_law(self, Path(folder), **options, certificate=certificate)[0]
+        files = export_law(
+            self,
+            Path(folder),
+            precision=precision,
+            gravity=gravity,
+            rate_limit=np.asarray(rate_limit),
+            period=period,
+            certificate=certificate,
+        )
+        return files[0]
 
 
 class MemorylessController(Controller):

@@ -9,15 +9,24 @@ from jaxtyping import Float
 
 from nbs_pin.base.arguments import writable
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.doors import where_printed
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
 from nbs_pin.export.law import Exported, pid_limit
 from nbs_pin.export.package import Steps, write_package
-from nbs_pin.export.statements import Precision
+from nbs_pin.export.reals import Precision, Real
 from nbs_pin.kernels.layout import LAW, LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
+_TITLES = {
+    LawCode.BACKSTEPPING: "Neural backstepping",
+    LawCode.SLOTINE_LI: "Slotine and Li's law",
+    LawCode.COMPUTED_TORQUE: "Computed torque",
+    LawCode.PD_REFERENCE: "PD with feedforward",
+    LawCode.PD_GRAVITY: "PD with gravity",
+    LawCode.PID: "PID",
+}
 STEPS = 1000
 """Control steps of the self-test."""
 _TURNS = 3
@@ -52,8 +61,8 @@ def export_law(
         effort_limit=pid_limit(law) if tree is None else np.full(n, np.inf) if robot is None else robot.effort_limit,
         rate_limit=np.full(n, rate_limit),
         gravity=gravity,
-        precision=precision,
-        title=f"{type(controller).__name__} for {'an arm without a name' if robot is None else robot.name}",
+        real=Real(precision),
+        title=f"{_TITLES[LawCode(law.layout[LAW])]} for {'an arm without a name' if robot is None else robot.name}",
         joint_names=names if robot is None else robot.joint_names,
         prismatic=np.zeros(n, dtype=bool) if robot is None else robot.prismatic,
         robot_sha256="" if robot is None else robot.sha256,
@@ -68,7 +77,8 @@ def _tree(law: Packed, dynamics: Any, gravity: bool) -> Packed | None:
     """The model of a law as a rigid tree; None for a PID, which has no model."""
     if law.layout[LAW] == LawCode.PID:
         if not gravity:
-            raise ArgumentError("gravity is False, but a PID has no model whose weight it could leave out; omit it.")
+            given = where_printed(python="gravity=False", shell="--without-gravity")
+            raise ArgumentError(f"{given} was given, but a PID has no model whose weight it could leave out; omit it.")
         return None
     tree: Packed | None = dynamics.packed_tree()
     if tree is None:
@@ -136,5 +146,4 @@ def _states(exported: Exported, robot: Robot | None) -> Float[np.ndarray, "5 ste
     v = v_ref + share * (rng.uniform(-speed, speed, shape) - v_ref)
     q += 2.0 * np.pi * np.rint(rng.uniform(-1.0, 1.0, shape) * turns)
     given = np.stack([q, v, q_ref, v_ref, speed * rng.normal(size=shape)])
-    return given.astype(np.float32).astype(float) if exported.precision == "float" else given
-
+    return given.astype(np.float32).astype(float) if exported.real.precision == "float" else given

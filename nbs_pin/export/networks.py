@@ -6,11 +6,10 @@ forward, and as they are packed for the way back.
 """
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
-from nbs_pin.export.statements import Precision, literal, table
+from nbs_pin.export.reals import Real
 from nbs_pin.export.templates import filled
 from nbs_pin.export.tracing import as_python
 from nbs_pin.kernels.layout import PADDING, ActivationCode, DampingCode, Packed
@@ -18,7 +17,8 @@ from nbs_pin.kernels.views import damping_of, layer, potential_of
 
 _layer, _potential, _damping = (as_python(view, {}) for view in (layer, potential_of, damping_of))
 _SQUAREPLUS = """
-const real square = a[i] * a[i] + @PARAMETER@, root = @SQRT@(square), inverse = 1 / square;
+const real magnitude = @FABS@(a[i]), square = magnitude * magnitude + @PARAMETER@;
+const real root = @SQRT@(square), inverse = 1 / square;
 const real value = (real)0.5 * (a[i] + root), first = (real)0.5 * (1 + a[i] * root * inverse);
 const real second = @HALF@ * root * inverse * inverse;
 """
@@ -32,21 +32,22 @@ _ROWS = 4
 _ACTIVATIONS = {ActivationCode.SQUAREPLUS: _SQUAREPLUS, ActivationCode.SMOOTHED_RELU: _SMOOTHED_RELU}
 
 
-def potential_c(part: Packed, precision: Precision) -> str:
+def potential_c(part: Packed, real: Real) -> str:
     """The tables and functions of a potential (`layout.pack_potential`)."""
-    phi, number = _potential(part), _numbers(precision)
+    phi = _potential(part)
     layers, n = [_layer(part, k) for k in range(phi.depth)], int(phi.n)
     sizes = [int(size) for size, _, _ in layers]
     tables = [
-        table("potential_scale", phi.scale, precision),
-        table("tangent", phi.tangent, precision),
-        table("stiffness", phi.stiffness, precision),
+        real.table("potential_scale", phi.scale),
+        real.table("tangent", phi.tangent),
+        real.table("stiffness", phi.stiffness),
     ]
-    forward, back = [], []
+    forward: list[str] = []
+    back: list[str] = []
     for k, (size, length, matrix) in enumerate(layers):
         rows = n + 1 + (sizes[k - 1] if k else 0)
         way = matrix.reshape(size, length)
-        tables += [_rows(f"potential_{k}", way[:, :rows].T, precision), _rows(f"potential_back_{k}", way, precision)]
+        tables += [_rows(f"potential_{k}", way[:, :rows].T, real), _rows(f"potential_back_{k}", way, real)]
         forward += [f"multiply_dual(potential_{k}, {_whole(rows, _ROWS)}, {_padded(size)}, u, du, a{k}, da{k});"]
         forward += [f"bend({size}, a{k}, da{k}, u + {n + 1}, du + {n + 1});"]
         back[:0] = [
@@ -57,9 +58,10 @@ def potential_c(part: Packed, precision: Precision) -> str:
     parameter = float(phi.parameter[0])
     activation = _ACTIVATIONS[ActivationCode(int(phi.code))]
     for name, text in (
-        ("@PARAMETER@", number(parameter)),
-        ("@HALF@", number(0.5 * parameter)),
-        ("@SQRT@", "sqrt" if precision == "double" else "sqrtf"),
+        ("@PARAMETER@", real.literal(parameter)),
+        ("@HALF@", real.literal(0.5 * parameter)),
+        ("@SQRT@", real.function("sqrt")),
+        ("@FABS@", real.function("fabs")),
     ):
         activation = activation.replace(name, text)
     words = {
@@ -75,12 +77,12 @@ def potential_c(part: Packed, precision: Precision) -> str:
     return "\n".join([*tables, filled("potential.c", words)])
 
 
-def damping_c(part: Packed, precision: Precision) -> str:
+def damping_c(part: Packed, real: Real) -> str:
     """The tables and functions of a damping (`layout.pack_damping`)."""
-    d, number = _damping(part), _numbers(precision)
+    d = _damping(part)
     n, depth = int(d.n), int(d.depth)
     layers = [_layer(part, k) for k in range(2 * depth)]
-    tables = [table("damping_scale", d.scale, precision), table("damping_floor", d.floor, precision)]
+    tables = [real.table("damping_scale", d.scale), real.table("damping_floor", d.floor)]
     calls: dict[str, list[str]] = {"diagonal": [], "lower": []}
     for name, first in (("diagonal", 0), ("lower", depth)):
         inputs, network = n, layers[first : first + depth]
@@ -88,32 +90,33 @@ def damping_c(part: Packed, precision: Precision) -> str:
             calls[name] = ["lower[0] = 0;"]
             continue
         for k, (size, length, matrix) in enumerate(network):
-            tables += [_rows(f"{name}_{k}", matrix.reshape(size, length)[:, : inputs + 1].T, precision)]
+            tables += [_rows(f"{name}_{k}", matrix.reshape(size, length)[:, : inputs + 1].T, real)]
             calls[name] += [f"for (int i = 0; i < {n}; i++) {{ h[i] = x[i]; }}"] if k == 0 else []
             calls[name] += [f"hyperbolic_tangents({_padded(inputs)}, {name}, h);"] if k else []
             calls[name] += [f"h[{inputs}] = 1;"]
             calls[name] += [f"multiply({name}_{k}, {_whole(inputs + 1, _ROWS)}, {_padded(size)}, h, {name});"]
             inputs = int(size)
     if DampingCode(int(d.code)) is DampingCode.PAPER:
-        m = number(d.m[0])
+        m = real.literal(d.m[0])
         free = f"diagonal[i] = diagonal[i] < 0 ? {m} : diagonal[i] + {m};"
         calls["diagonal"] += [f"for (int i = 0; i < {n}; i++) {{ {free} }}"]
     widest = max(_padded(size) for size, _, _ in layers)
     words = {
         "N": n,
+        "FABS": real.function("fabs"),
         "INPUTS": max(n, widest) + _ROWS,
         "WIDEST": widest,
         "DIAGONAL": _lines(calls["diagonal"]),
         "LOWER": _lines(calls["lower"]),
-        "INVERSE_CEILING": number(d.inverse_ceiling[0]),
+        "INVERSE_CEILING": real.literal(d.inverse_ceiling[0]),
     }
     return "\n".join([*tables, filled("damping.c", words)])
 
 
-def _rows(name: str, matrix: np.ndarray, precision: Precision) -> str:
+def _rows(name: str, matrix: np.ndarray, real: Real) -> str:
     """The rows of a matrix, as many and as long as the loops take them."""
     rows, columns = matrix.shape
-    return table(name, np.pad(matrix, ((0, _whole(rows, _ROWS) - rows), (0, _padded(columns) - columns))), precision)
+    return real.table(name, np.pad(matrix, ((0, _whole(rows, _ROWS) - rows), (0, _padded(columns) - columns))))
 
 
 def _whole(size: int, block: int) -> int:
@@ -122,10 +125,6 @@ def _whole(size: int, block: int) -> int:
 
 def _padded(size: int) -> int:
     return _whole(size, PADDING)
-
-
-def _numbers(precision: Precision) -> Callable[[float], str]:
-    return lambda x: literal(float(x), precision)
 
 
 def _lines(lines: list[str], depth: int = 1) -> str:

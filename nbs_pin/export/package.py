@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.files import write_whole
 from nbs_pin.export.law import Exported, law_files
-from nbs_pin.export.statements import Precision, literal
+from nbs_pin.export.reals import Precision, Real
 from nbs_pin.export.templates import filled
 
 TOLERANCE: dict[Precision, float] = {"double": 1e-12, "float": 1e-4}
@@ -54,16 +54,16 @@ def sent(exported: Exported, steps: Steps) -> Float[np.ndarray, "steps n"]:
 def _around(exported: Exported, steps: Steps) -> dict[str, str]:
     name, package = exported.name, f"{exported.name.lower()}_controller"
     rows = np.concatenate([steps.given, steps.torque[None], sent(exported, steps)[None]]).swapaxes(0, 1)
-    franka, single = exported.nv == _FRANKA_JOINTS, exported.precision == "float"
+    franka, single = exported.nv == _FRANKA_JOINTS, exported.real.precision == "float"
     words = exported.words | {
         "COUNT": len(rows),
-        "STEPS": ",\n".join(_row(row, exported.precision) for row in rows),
-        "PERIOD": literal(steps.period, exported.precision),
-        "TOLERANCE": f"{TOLERANCE[exported.precision]:g}",
+        "STEPS": ",\n".join(_row(row, exported.real) for row in rows),
+        "PERIOD": exported.real.literal(steps.period),
+        "TOLERANCE": f"{TOLERANCE[exported.real.precision]:g}",
         # The parts of a torque may cancel: in float, what is left of them is compared with the size of a usual torque.
         "SMALLEST_SIZE": f"{np.median(np.abs(steps.torque).max(axis=1)) if single else 0.0:.6g}",
         "OR_MEDIAN": ", or of the median torque's where that is larger" if single else "",
-        "SUFFIX": "f" if single else "",
+        "SUFFIX": exported.real.suffix,
         "PACKAGE": package,
         "TITLE_XML": escape(exported.title),
         "JOINTS": ", ".join(json.dumps(joint) for joint in exported.joint_names),
@@ -87,6 +87,6 @@ def _around(exported: Exported, steps: Steps) -> dict[str, str]:
     return {place: filled(template, words) for place, template in places.items()}
 
 
-def _row(row: Float[np.ndarray, "7 n"], precision: Precision) -> str:
-    vectors = (", ".join(literal(x, precision) for x in vector) for vector in row)
+def _row(row: Float[np.ndarray, "7 n"], real: Real) -> str:
+    vectors = (", ".join(real.literal(x) for x in vector) for vector in row)
     return "    {" + ",\n     ".join(f"{{{vector}}}" for vector in vectors) + "}"

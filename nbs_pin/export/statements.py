@@ -2,14 +2,11 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
-import numpy as np
-
+from nbs_pin.export.reals import Real
 from nbs_pin.export.symbols import Call, Number, Remark, Symbol, Tape
 
-Precision: TypeAlias = Literal["double", "float"]
-"""The type of numbers in C."""
 Outputs: TypeAlias = Mapping[str, Sequence[Number]]
 _LONGEST = 90
 """Characters above which an expression gets a variable of its own."""
@@ -26,21 +23,9 @@ class _Text(NamedTuple):
         return self.text if self.strength >= strength else f"({self.text})"
 
 
-def literal(x: float, precision: Precision) -> str:
-    """The shortest number of C that reads back as x."""
-    return f"{np.float32(x)}f" if precision == "float" else repr(float(x))
-
-
-def table(name: str, values: np.ndarray, precision: Precision) -> str:
-    """A constant array."""
-    words = [literal(x, precision) for x in np.ravel(values).tolist()]
-    rows = [", ".join(words[k : k + 8]) for k in range(0, len(words), 8)]
-    return f"static const real {name}[{len(words)}] = {{\n    " + ",\n    ".join(rows) + "};\n"
-
-
-def statements(tape: Tape, outputs: Outputs, precision: Precision) -> str:
+def statements(tape: Tape, outputs: Outputs, real: Real) -> str:
     """The operations that the arrays in `outputs` need, in order, and the assignments to these."""
-    writer, lines, remark = _Writer(_uses(tape, outputs), precision), [], ""
+    writer, lines, remark = _Writer(_uses(tape, outputs), real), [], ""
     for entry in tape.entries:
         if isinstance(entry, Remark):
             remark = entry.text
@@ -71,8 +56,8 @@ def _uses(tape: Tape, outputs: Outputs) -> Counter[int]:
 class _Writer:
     """Writes symbols: short ones that are used once in place, others by the name of a variable."""
 
-    def __init__(self, uses: Counter[int], precision: Precision) -> None:
-        self.uses, self.precision = uses, precision
+    def __init__(self, uses: Counter[int], real: Real) -> None:
+        self.uses, self.real = uses, real
         self._written: dict[int, _Text] = {}
 
     def definition(self, x: Symbol) -> Iterator[str]:
@@ -98,7 +83,7 @@ class _Writer:
         """An operand."""
         if isinstance(x, Symbol):
             return self._written[x.place]
-        return _Text(literal(x, self.precision), _SUM if x < 0.0 else _ATOM)
+        return _Text(self.real.literal(x), _SUM if x < 0.0 else _ATOM)
 
     def _expression(self, x: Symbol) -> _Text:
         if x.operation == "leaf":
@@ -107,7 +92,7 @@ class _Writer:
         if x.operation == "negative":
             return _Text(f"-{operands[0].within(_PRODUCT)}", _SUM)
         if len(operands) == 1:
-            return _Text(f"{x.operation}{'f' if self.precision == 'float' else ''}({operands[0].text})", _ATOM)
+            return _Text(f"{self.real.function(x.operation)}({operands[0].text})", _ATOM)
         strength = _SUM if x.operation in "+-" else _PRODUCT
         # C reads from the left: an operand on the right must hold together more strongly to keep the order.
         left, right = operands[0].within(strength), operands[1].within(strength + 1)
