@@ -17,7 +17,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = [
     {"base"},
     {"kernels", "robots"},
-    {"dynamics", "motions"},
+    {"dynamics", "export", "motions"},
     {"controllers", "inertia"},
     {"simulation", "storage"},
     {"accuracy", "identification", "training"},

@@ -24,6 +24,7 @@ from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.exit_codes import BAD_INPUT, NO_PROMISE, SIGNALLED
+from nbs_pin.cli.export import Export
 from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.reproduce import Reproduce
@@ -42,6 +43,7 @@ COMMANDS: dict[str, type] = {
     "compare": Compare,
     "certify": Certify,
     "verify": Verify,
+    "export": Export,
     "replay": Replay,
     "reproduce": Reproduce,
     "bench": Bench,

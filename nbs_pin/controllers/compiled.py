@@ -54,6 +54,10 @@ class CompiledController(MemorylessController):
         """Number of joints."""
         return self.dynamics.nv
 
+    def packed_law(self, *, numpy: bool = True) -> Packed:
+        """The constants and weights that it was made of, as arrays."""
+        return self.law
+
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ [N·m]; arguments (..., nv), fastest as contiguous float64 vectors (nv,).
 

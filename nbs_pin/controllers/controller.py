@@ -1,13 +1,18 @@
 """The interface of all controllers: memory and state in, torque and memory out."""
 
 from abc import ABC, abstractmethod
+from pathlib import Path
 from typing import Any
 
-from nbs_pin.base.arguments import a, checked, flag
+import numpy as np
+
+from nbs_pin.base.arguments import PERIOD, a, checked, choice, flag, joints, path
 from nbs_pin.base.arrays import Array, Vectors
-from nbs_pin.base.checks import told
+from nbs_pin.base.checks import PerJoint, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
+from nbs_pin.controllers.exported import export_law
+from nbs_pin.export.reals import Precision
 from nbs_pin.kernels.layout import Packed
 
 
@@ -51,6 +56,60 @@ class Controller(ABC):
         package, a subclass, which may compute another torque, or a network with a user-defined activation.
         """
         return self
+
+    @checked(
+        folder=path,
+        precision=choice("double", "float"),
+        gravity=flag,
+        rate_limit=joints(above=0.0, unit="N·m/s", infinite=True),
+        period=PERIOD,
+    )
+    def export(
+        self,
+        folder: str | Path,
+        *,
+        precision: Precision = "double",
+        gravity: bool = True,
+        rate_limit: PerJoint = np.inf,
+        period: float = 0.001,
+        certificate: Any = None,
+    ) -> Path:
+        """Write the law as C99 without heap and globals, with self-test and what middleware needs (docs/export.md).
+
+        Files and functions are called after the folder: panda_law/ gets panda_law.h and panda_law.c with
+        `panda_law_step`.
+
+        Args:
+            folder: Where to write; created if missing, files of the same names are replaced.
+            precision: "double" or "float".
+            gravity: False leaves G(q) out, for an arm that adds it itself, as Franka's do.
+            rate_limit: Largest change of the torque per second [N·m/s], one number or one per joint; inf for none.
+            period: Control period of the self-test [s].
+            certificate: A `Certificate` of this law, whose bounds the header then states, or None.
+
+        Returns:
+            The header.
+
+        Raises:
+            ArgumentError: For a law without a compiled form, a model that is no rigid tree, or another's certificate.
+
+        Example:
+            >>> import tempfile
+            >>> import nbs_pin as nbs
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     nbs.PD.for_robot(nbs.load_robot("two_link")).export(f"{folder}/two_link_pd").name
+            'two_link_pd.h'
+        """
+        files = export_law(
+            self,
+            Path(folder),
+            precision=precision,
+            gravity=gravity,
+            rate_limit=np.asarray(rate_limit),
+            period=period,
+            certificate=certificate,
+        )
+        return files[0]
 
 
 class MemorylessController(Controller):

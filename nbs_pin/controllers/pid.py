@@ -179,12 +179,16 @@ class CompiledPID(Controller):
 
     def __init__(self, law: Packed) -> None:
         compile_laws()
-        self.weights = law.weights
+        self.law, self.weights = law, law.weights
 
     @property
     def nv(self) -> int:
         """Number of joints."""
         return len(self.weights) // 6
+
+    def packed_law(self, *, numpy: bool = True) -> Packed:
+        """The gains and limits that it was made of, as arrays."""
+        return self.law
 
     def initial_memory(self, q: Vectors) -> PIDMemory:
         """Zero integral and derivative."""

@@ -1,0 +1,149 @@
+"""A controller as a package of C: what the generator needs of it, and the control steps of its self-test."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arguments import writable
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.doors import where_printed
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
+from nbs_pin.base.versions import versions
+from nbs_pin.export.law import Exported, pid_limit
+from nbs_pin.export.package import Steps, write_package
+from nbs_pin.export.reals import Precision, Real
+from nbs_pin.kernels.layout import LAW, LawCode, Packed
+from nbs_pin.robots.robot import Robot
+
+_TITLES = {
+    LawCode.BACKSTEPPING: "Neural backstepping",
+    LawCode.SLOTINE_LI: "Slotine and Li's law",
+    LawCode.COMPUTED_TORQUE: "Computed torque",
+    LawCode.PD_REFERENCE: "PD with feedforward",
+    LawCode.PD_GRAVITY: "PD with gravity",
+    LawCode.PID: "PID",
+}
+STEPS = 1000
+"""Control steps of the self-test."""
+_TURNS = 3
+"""Most whole turns of a continuous joint in the self-test."""
+_SPEED = 2.0
+"""Largest speed in the self-test of a joint without a limit [rad/s, m/s]."""
+
+
+def export_law(
+    controller: Any,  # a Controller, whose module imports this one
+    folder: Path,
+    *,
+    precision: Precision,
+    gravity: bool,
+    rate_limit: JointArray,
+    period: float,
+    certificate: Any,
+) -> list[Path]:
+    """Write the package of `Controller.export` and return its files; raises ArgumentError for what has no C form."""
+    law, n = controller.packed_law(), controller.nv
+    dynamics = getattr(controller, "dynamics", None)
+    robot = getattr(controller, "robot", None) if dynamics is None else dynamics.robot
+    tree, names = _tree(law, dynamics, gravity), tuple(f"joint{i + 1}" for i in range(n))
+    if rate_limit.shape not in ((), (n,)):
+        raise ArgumentError(f"rate_limit has {rate_limit.size} numbers, expected {n}; give one per joint.")
+    if certificate is not None:
+        _check_same(certificate.controller, law)
+    exported = Exported(
+        name=_identifier(folder),
+        law=law,
+        tree=tree,
+        effort_limit=pid_limit(law) if tree is None else np.full(n, np.inf) if robot is None else robot.effort_limit,
+        rate_limit=np.full(n, rate_limit),
+        gravity=gravity,
+        real=Real(precision),
+        title=f"{_TITLES[LawCode(law.layout[LAW])]} for {'an arm without a name' if robot is None else robot.name}",
+        joint_names=names if robot is None else robot.joint_names,
+        prismatic=np.zeros(n, dtype=bool) if robot is None else robot.prismatic,
+        robot_sha256="" if robot is None else robot.sha256,
+        known=() if certificate is None else _known(certificate),
+        versions=versions(),
+    )
+    writable("export: folder", folder / f"{exported.name}.h")
+    return write_package(folder, exported, _steps(controller, dynamics, robot, exported, period))
+
+
+def _tree(law: Packed, dynamics: Any, gravity: bool) -> Packed | None:
+    """The model of a law as a rigid tree; None for a PID, which has no model."""
+    if law.layout[LAW] == LawCode.PID:
+        if not gravity:
+            given = where_printed(python="gravity=False", shell="--without-gravity")
+            raise ArgumentError(f"{given} was given, but a PID has no model whose weight it could leave out; omit it.")
+        return None
+    tree: Packed | None = dynamics.packed_tree()
+    if tree is None:
+        raise ArgumentError(
+            f"the law's model is a {type(dynamics).__name__}, which is no rigid tree and has no C form; export a law"
+            " with PinocchioDynamics, IdentifiedDynamics or a learned chain."
+        )
+    return tree
+
+
+def _check_same(certified: Any, law: Packed) -> None:
+    """Raise ArgumentError unless the certified law is this one."""
+    own = certified.packed_law()
+    if not all(np.array_equal(x, y) for x, y in zip(own, law, strict=True)):
+        raise ArgumentError("certificate is for a law with other numbers; certify the one that is exported.")
+
+
+def _known(certificate: Any) -> tuple[str, ...]:
+    """The numbers of a certificate and what they rest on, line by line."""
+    stated = certificate.summary()
+    joints = ", ".join(f"{x:.4g} {unit}" for x, unit in zip(stated["joint_errors_rad"], stated["units"], strict=True))
+    void = [f"conditions that do not hold: {'; '.join(stated['void'])}"] if stated["void"] else []
+    return (
+        f"certificate, {stated['label']}, for disturbances {stated['disturbance']}:",
+        f"error of all joints at most {stated['error_rad']:.4g} rad, of each at most {joints}",
+        *void,
+        *(f"assumed: {each['assumption']} ({each['checked']})" for each in stated["assumptions"]),
+    )
+
+
+def _identifier(folder: Path) -> str:
+    """What files and functions are called, after the folder: a name of C with an underscore, so no keyword of it."""
+    name = re.sub(r"[^A-Za-z0-9_]", "_", folder.absolute().name).strip("_")
+    name = name if name[:1].isalpha() else f"law_{name}".rstrip("_")
+    return name if "_" in name else f"{name}_law"
+
+
+def _steps(controller: Any, dynamics: Any, robot: Robot | None, exported: Exported, period: float) -> Steps:
+    given = _states(exported, robot)
+    q, v, *aim = given
+    memory = controller.initial_memory(q[0])
+    if memory is None:
+        torque, _ = controller.step(None, q, v, Reference(*aim), period)
+    else:
+        torque = np.empty_like(q)
+        for k in range(len(q)):
+            reference = Reference(*(x[k] for x in aim))
+            torque[k], memory = controller.step(memory, q[k], v[k], reference, period)
+    if not exported.gravity:
+        torque = torque - dynamics.gravity(q)
+    return Steps(period, given, torque)
+
+
+def _states(exported: Exported, robot: Robot | None) -> Float[np.ndarray, "5 steps n"]:
+    """Random states within the limits: errors from small to as large as the range, and whole turns where they wrap."""
+    rng, n = np.random.default_rng(0), exported.nv
+    low, high, speed = np.full(n, -np.pi), np.full(n, np.pi), np.full(n, _SPEED)
+    turns = np.zeros(n)
+    if robot is not None:
+        (low, high), turns = robot.sampling_range, _TURNS * robot.continuous
+        speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, _SPEED)
+    shape, share = (STEPS, n), 10.0 ** rng.uniform(-4.0, 0.0, (STEPS, 1))
+    q_ref, v_ref = rng.uniform(low, high, shape), rng.uniform(-speed, speed, shape)
+    q = q_ref + share * (rng.uniform(low, high, shape) - q_ref)
+    v = v_ref + share * (rng.uniform(-speed, speed, shape) - v_ref)
+    q += 2.0 * np.pi * np.rint(rng.uniform(-1.0, 1.0, shape) * turns)
+    given = np.stack([q, v, q_ref, v_ref, speed * rng.normal(size=shape)])
+    return given.astype(np.float32).astype(float) if exported.real.precision == "float" else given

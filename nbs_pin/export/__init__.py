@@ -1,0 +1,1 @@
+"""Laws as C: what the kernels do, written out for one arm."""

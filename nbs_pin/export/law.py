@@ -1,0 +1,180 @@
+"""A packed law and its model of the arm as one header and one source file of C."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool
+
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.units import several, units
+from nbs_pin.export.networks import damping_c, potential_c
+from nbs_pin.export.reals import Real
+from nbs_pin.export.statements import statements
+from nbs_pin.export.templates import filled
+from nbs_pin.export.traced_law import traced
+from nbs_pin.export.tracing import as_python
+from nbs_pin.kernels import layout as at
+from nbs_pin.kernels.layout import LawCode, Packed
+from nbs_pin.kernels.views import damping_in, pid_of, potential_in
+
+_ASCII = {"·": " ", "²": "^2", "τ": "tau", "≤": "<=", "≥": ">=", "‖": "|", "ω": "omega", "Λ": "Lambda", "−": "-"}
+_CLAMPED = "static real clamped(real x, real most)\n{\n    return x > most ? most : (x < -most ? -most : x);\n}\n"
+_LIBM = re.compile(r"\b((?:sin|cos|sqrt|tanh|ceil|fabs)f?)\(")
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """A law that becomes C."""
+
+    name: str
+    """What its files and functions begin with; an identifier of C."""
+    law: Packed
+    """As `layout.pack_law` or `layout.pack_pid` packs it."""
+    tree: Packed | None
+    """Its model (`tree_layout.pack_tree`); None for a PID."""
+    effort_limit: JointArray
+    """[N·m, N]; inf where there is none."""
+    rate_limit: JointArray
+    """Largest change of the torque per second [N·m/s, N/s]; inf where there is none."""
+    gravity: bool
+    """Whether the torque holds the weight of the arm."""
+    real: Real
+    title: str
+    joint_names: tuple[str, ...]
+    prismatic: Bool[np.ndarray, " n"]
+    robot_sha256: str
+    """Empty for a law whose arm has no description."""
+    known: tuple[str, ...]
+    """What a certificate says of the law, line by line."""
+    versions: dict[str, str]
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return int(self.law.layout[at.JOINTS])
+
+    @property
+    def code(self) -> LawCode:
+        """Which law it is."""
+        return LawCode(int(self.law.layout[at.LAW]))
+
+    def unit(self, quantity: str) -> str:
+        """The unit of a quantity of all joints, for a comment."""
+        return comment(several(units(quantity, self.prismatic)))
+
+    @property
+    def words(self) -> dict[str, object]:
+        """What every template needs."""
+        libraries = (f"{name} {version}" for name, version in self.versions.items() if name != "nbs_pin")
+        return {
+            "NAME": self.name,
+            "PREFIX": self.name.upper(),
+            "N": self.nv,
+            "TITLE": comment(self.title),
+            "VERSION": self.versions["nbs_pin"],
+            "VERSIONS": ", ".join(libraries),
+            "PRECISION": self.real.precision,
+            "SHA256": self.robot_sha256,
+            "TORQUE_UNIT": self.unit("torque"),
+            "POSITION_UNIT": self.unit("position"),
+            "VELOCITY_UNIT": self.unit("velocity"),
+        }
+
+
+def law_files(exported: Exported) -> dict[str, str]:
+    """The header and the source file, by name."""
+    words, remembers = exported.words, exported.code is LawCode.PID
+    parts, torque = _pid(exported) if exported.tree is None else _on_tree(exported, exported.tree)
+    tables, limits = _limits(exported)
+    source = words | {
+        "PARTS": "\n".join([*parts, *tables]),
+        "TORQUE": torque,
+        "START": _inner(["state->integral[i] = 0;", "state->derivative[i] = 0;"] if remembers else []),
+        "LIMITS": _inner(limits),
+    }
+    text = _without_blanks(filled("law.c", source))
+    header = words | {
+        "ABOUT": "\n".join(f" * {comment(line)}".rstrip() for line in _about(exported)),
+        "MEMORY": filled("pid_memory.h", words) if remembers else "",
+        "LIBM": ", ".join(sorted(set(_LIBM.findall(text)))) or "nothing",
+        "RATE_WORDS": " and its rate" if np.isfinite(exported.rate_limit).any() else "",
+    }
+    return {f"{exported.name}.h": filled("law.h", header), f"{exported.name}.c": text}
+
+
+def pid_limit(law: Packed) -> JointArray:
+    """Where the torque of a PID saturates [N·m]."""
+    return as_python(pid_of, {})(law.weights).limit
+
+
+def comment(text: str) -> str:
+    """A text that may stand in a comment of C, in ASCII."""
+    for word, plain in _ASCII.items():
+        text = text.replace(word, plain)
+    return text.encode("ascii", "replace").decode().replace("*/", "* /").replace("\n", " ")
+
+
+def _about(exported: Exported) -> list[str]:
+    """What the head of the header says of the arm and the law."""
+    joints = []
+    for i, (name, unit) in enumerate(zip(exported.joint_names, units("torque", exported.prismatic), strict=True)):
+        effort, rate = exported.effort_limit[i], exported.rate_limit[i]
+        rated = f", |dtau/dt| <= {rate:g} {unit}/s" if np.isfinite(rate) else ""
+        joints.append(f"  {i}  {name}: |tau| <= {effort:g} {unit}{rated}")
+    weight = "holds the weight of the arm" if exported.gravity else "leaves the weight of the arm to the arm itself"
+    fed = exported.tree is not None and bool(exported.law.layout[at.FRICTION])
+    friction = "feeds joint friction forward" if fed else "feeds no joint friction forward"
+    certified = exported.known or ("No certificate was given at the export.",)
+    return ["Joints:", *joints, "", f"The torque {weight} and {friction}.", "", *certified]
+
+
+def _on_tree(exported: Exported, tree: Packed) -> tuple[list[str], str]:
+    """Tables and functions, and the body of the torque, of a law with a model."""
+    parts: list[str] = []
+    if exported.code is LawCode.BACKSTEPPING:
+        phi, d = (as_python(view, {})(exported.law) for view in (potential_in, damping_in))
+        parts = [potential_c(phi, exported.real), damping_c(d, exported.real)]
+    tape, tau = traced(exported.law, tree, exported.gravity)
+    # All laws have the same arguments, though not each needs them all.
+    idle = [f"    (void){name};" for name in ("state", "v", "q_ref", "v_ref", "a_ref", "period")]
+    return parts, "\n".join([*idle, statements(tape, {"tau": tau.tolist()}, exported.real)])
+
+
+def _pid(exported: Exported) -> tuple[list[str], str]:
+    """Tables, and the body of the torque, of a PID."""
+    gains, real = as_python(pid_of, {})(exported.law.weights), exported.real
+    tables = gains._asdict() | {"saturated": gains.limit}
+    del tables["limit"]
+    words = {
+        "N": exported.nv,
+        "PI": real.literal(np.pi),
+        "TURN": real.literal(2.0 * np.pi),
+        "CEIL": real.function("ceil"),
+    }
+    return [real.table(name, values) for name, values in tables.items()], filled("pid.c", words)
+
+
+def _limits(exported: Exported) -> tuple[list[str], list[str]]:
+    """Tables of the limits that there are, and what is done to next.tau[i]."""
+    tables, lines = [], []
+    if np.isfinite(exported.effort_limit).any():
+        tables += [exported.real.table("effort_limit", exported.effort_limit)]
+        lines += ["next.tau[i] = clamped(next.tau[i], effort_limit[i]);"]
+    if np.isfinite(exported.rate_limit).any():
+        tables += [exported.real.table("rate_limit", exported.rate_limit)]
+        lines += ["next.tau[i] = state->tau[i] + clamped(next.tau[i] - state->tau[i], rate_limit[i] * period);"]
+    return ([*tables, _CLAMPED] if lines else []), lines
+
+
+def _inner(lines: list[str]) -> str:
+    return "\n".join(f"            {line}" for line in lines)
+
+
+def _without_blanks(text: str) -> str:
+    """The text without blank lines that follow another or a bracket."""
+    lines: list[str] = []
+    for line in text.splitlines():
+        if line.strip() or not (lines and (lines[-1] == "" or lines[-1].endswith("{"))):
+            lines.append(line.rstrip())
+    return "\n".join(lines) + "\n"
