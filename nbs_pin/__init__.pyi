@@ -82,6 +82,8 @@ from .reports.plotting import plot_tracking as plot_tracking
 from .reports.replay import replay as replay
 from .robots.catalogue import ROBOT_NAMES as ROBOT_NAMES
 from .robots.robot import Robot as Robot, load_robot as load_robot
+from .runtime.guard import Fault as Fault, Guard as Guard, Mode as Mode
+from .runtime.guarded import FaultReport as FaultReport, Guarded as Guarded, Sample as Sample
 from .simulation import metrics as metrics
 from .simulation.costs import TimeOutside as TimeOutside, TorqueAware as TorqueAware, squared_error as squared_error
 from .simulation.dynamics_plant import DynamicsPlant as DynamicsPlant
