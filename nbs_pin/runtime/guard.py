@@ -23,11 +23,13 @@ from nbs_pin.robots.robot import ARM, Robot
 
 PATIENCE = 20
 """Missed or bad samples in a row at which the guard stops."""
-TORQUE_RATE = 1000.0
-"""Default of the largest |Δτ|/period [N·m/s], what a Franka arm takes."""
+TORQUE_RATES = {"panda": 1000.0, "fr3": 1000.0}
+"""Largest |Δτ|/period that the maker states [N·m/s], by arm."""
+FULL_EFFORT_IN = 0.025
+"""Time from no torque to the effort limit where no maker states a rate [s], at 1000 N·m/s or more."""
 ERROR, SLIDE = 0.5, 0.1
 """Default errors beyond which a loop counts as diverged [rad, m]."""
-RESOLUTION, SLIDE_RESOLUTION = 2.0 * np.pi * 2.0**-12, 1e-4
+RESOLUTION, SLIDE_RESOLUTION = 2.0 * np.pi * 2.0**-11, 1e-4
 """Default encoder steps [rad, m]."""
 BRAKE = 10.0
 """Bandwidth of the gains whose damping the safe stop has [rad/s]."""
@@ -120,7 +122,7 @@ class Guard:
         >>> import nbs_pin as nbs
         >>> guard = nbs.Guard.for_robot(nbs.load_robot("panda"))
         >>> guard.effort_limit[0], guard.torque_rate[0], guard.error_limit[0]
-        (87.0, 1000.0, 0.5)
+        (np.float64(87.0), np.float64(1000.0), np.float64(0.5))
     """
 
     period: float
@@ -134,7 +136,7 @@ class Guard:
     upper: PerJoint
     damping: PerJoint
     """Damping of the safe stop [N·m·s/rad]."""
-    torque_rate: PerJoint = TORQUE_RATE
+    torque_rate: PerJoint = np.inf
     """Largest |Δτ|/period [N·m/s]."""
     error_limit: PerJoint = ERROR
     """|z1| beyond which the loop has diverged [rad]; a certificate's bounds are the natural choice."""
@@ -178,7 +180,7 @@ class Guard:
         robot=ARM,
         period=PERIOD,
         certificate=maybe(CERTIFICATE),
-        torque_rate=joints(above=0.0, unit="N·m/s", infinite=True),
+        torque_rate=maybe(joints(above=0.0, unit="N·m/s", infinite=True)),
         external_limit=joints(above=0.0, unit="N·m", infinite=True),
         compensated=flag,
     )
@@ -188,11 +190,17 @@ class Guard:
         period: float = 0.001,
         *,
         certificate: Certificate | None = None,
-        torque_rate: PerJoint = TORQUE_RATE,
+        torque_rate: PerJoint = None,
         external_limit: PerJoint = np.inf,
         compensated: bool = False,
     ) -> "Guard":
-        """The guard of an arm: its limits, and the certificate's bounds of each |z1| in place of 0.5 rad (0.1 m)."""
+        """The guard of an arm: its limits, and the certificate's bounds of each |z1| in place of 0.5 rad (0.1 m).
+
+        Without a torque rate it takes the maker's (`TORQUE_RATES`), or one that reaches the effort limit in 25 ms.
+        """
+        if torque_rate is None:
+            reached = np.maximum(1000.0, robot.effort_limit / FULL_EFFORT_IN)
+            torque_rate = TORQUE_RATES.get(robot.name, reached)
         gains = gains_for_robot(robot, PinocchioDynamics(robot), bandwidth=BRAKE, period=max(period, 0.005))
         error = np.where(robot.prismatic, SLIDE, ERROR) if certificate is None else certificate.joint_errors
         return cls(

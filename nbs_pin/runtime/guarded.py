@@ -164,6 +164,15 @@ class Guarded:
         return Mode(int(self.state[at.MODE]))
 
     @property
+    def tau(self) -> JointArray:
+        """The torque that was sent last [N·m]; before the first, the one that holds the arm."""
+        return self.guard.vector(self.state, at.TAU).copy()
+
+    def gravity(self, q: JointArray) -> JointArray:
+        """G(q) by the guard's model [N·m]."""
+        return np.asarray(self._model.gravity(q))
+
+    @property
     def counters(self) -> Counters:
         """What has happened since `begin`."""
         return self.guard.counters(self.state)
@@ -209,7 +218,7 @@ class Guarded:
         if self.guard.compensated or fault is not Fault.NONE or action >= at.BRAKE:
             gravity = self._model.gravity(self.guard.vector(state, at.Q))
         at.release(config, state, command, gravity, int(fault))
-        tau = self.guard.vector(state, at.TAU).copy()
+        tau = self.tau
         self._seen.append(Seen(sample, aim, tau))
         if self.report is None and state[at.MODE] == at.STOPPED:
             self.report = self._reported(sample, trace)
