@@ -60,6 +60,7 @@ from .identification.fit import fit as fit
 from .identification.identify import identify as identify
 from .identification.logs import load_log as load_log
 from .identification.measurement import Noise as Noise
+from .motions.approach import Approach as Approach
 from .motions.disturbances import (
     ConstantTorque as ConstantTorque,
     SinusoidalTorque as SinusoidalTorque,
@@ -83,6 +84,12 @@ from .reports.plotting import plot_tracking as plot_tracking
 from .reports.replay import replay as replay
 from .robots.catalogue import ROBOT_NAMES as ROBOT_NAMES
 from .robots.robot import Robot as Robot, load_robot as load_robot
+from .runtime.arms import ArmInterface as ArmInterface, PlantArm as PlantArm
+from .runtime.drive import Driven as Driven, drive as drive
+from .runtime.franka_arm import FrankaArm as FrankaArm
+from .runtime.guard import Fault as Fault, Guard as Guard, Mode as Mode
+from .runtime.guarded import FaultReport as FaultReport, Guarded as Guarded, Sample as Sample
+from .runtime.ur_arm import URArm as URArm
 from .simulation import metrics as metrics
 from .simulation.costs import TimeOutside as TimeOutside, TorqueAware as TorqueAware, squared_error as squared_error
 from .simulation.dynamics_plant import DynamicsPlant as DynamicsPlant

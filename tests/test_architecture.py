@@ -22,7 +22,7 @@ FLOORS = [
     {"simulation", "storage"},
     {"accuracy", "identification", "training"},
     {"certificates", "cli", "verification"},
-    {"reports"},
+    {"reports", "runtime"},
     {"benchmarks", "reproduction"},
     {"commands"},
 ]

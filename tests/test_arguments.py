@@ -14,6 +14,7 @@ from hypothesis import given, strategies as st
 import nbs_pin as nbs
 from nbs_pin.base.arguments import checked, count, number
 from nbs_pin.base.checks import LARGEST, floats, integral, real
+from nbs_pin.dynamics.registry import make_network
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 
@@ -172,7 +173,14 @@ def test_one_compiled_law_one_plant_and_one_watch_serve_many_threads():
     assert in_threads(lambda x: law.torque(*x, zero, zero, zero), states)
     assert in_threads(lambda x: np.array(plant.step(*x, zero, 0.001)), states)
     assert in_threads(lambda x: plant.mass_matrix(x[0]), states)
+    assert in_threads(lambda x: np.array(PLANT.step(*x, zero, 0.001)), states)
     assert in_threads(lambda x: PLANT.dynamics.reference_torque(*x, zero, zero), states)
+    network = nbs.LagrangianDynamics(make_network("cholesky", [False, False], seed=0), ROBOT)  # no tree: another kernel
+    learned = nbs.NeuralBackstepping.for_robot(ROBOT, dynamics=network).compile()
+    assert in_threads(lambda x: learned.torque(*x, zero, zero, zero), states)
+    pid = nbs.PID.for_robot(ROBOT).compile()
+    rest, aim = pid.initial_memory(zero), nbs.Reference(zero, zero, zero)
+    assert in_threads(lambda x: pid.step(rest, *x, aim, 0.001)[0], states)
     watch, aim = nbs.Watch(nbs.certify(LAW, [5.0, 5.0])), nbs.Reference(zero, zero, zero)
     _, memory = watch.step(None, 0.0, zero, zero, aim, zero, zero)
     assert in_threads(lambda x: watch.step(memory, 0.001, *x, aim, zero, zero)[0].storage, states)

@@ -20,7 +20,8 @@ class CompiledController(MemorylessController):
 
     If the model is a rigid tree (`DynamicsProvider.packed_tree`), one kernel computes the torque; otherwise the law's
     kernel is combined with the model's own `reference_torque`. The object is a snapshot: later changes of the original
-    controller do not affect it. Batches run on all cores, NaN gives NaN. It owns scratch space: use one per thread.
+    controller do not affect it. Batches run on all cores, NaN gives NaN. Threads may share it: each call takes scratch
+    space that no other is using.
 
     Args:
         law: Constants and weights as numpy arrays (`Controller.packed_law`).

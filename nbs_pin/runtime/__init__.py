@@ -1,0 +1,1 @@
+"""Laws on arms: the guard, arms, the loop at a fixed rate."""

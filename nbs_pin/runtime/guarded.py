@@ -1,0 +1,246 @@
+"""A law behind a guard: samples in, torques that may be sent out, and a report when it stops."""
+
+import threading
+import traceback
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nbs_pin.base.arguments import a, checked, maybe, number
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.checks import vector_of
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
+from nbs_pin.controllers.controller import CONTROLLER, Controller, MemorylessController
+from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.kernels import guarding as at
+from nbs_pin.kernels.jit import NOT_TAKEN
+from nbs_pin.robots.robot import ARM, Robot
+from nbs_pin.runtime.guard import Counters, Fault, Guard, Mode
+
+LAST = 50
+"""Samples of a report."""
+PROBE = 0.1
+"""Time between two comparisons of the law's holding torque with gravity [s]."""
+_OF_GRAVITY, _OF_EFFORT = 0.5, 0.02  # a holding torque that differs by more than both is that of another arm
+
+
+class Sample(NamedTuple):
+    """What an arm tells at a control instant."""
+
+    t: float
+    """Time by the arm's clock [s]."""
+    q: JointArray
+    """Position [rad]."""
+    v: JointArray
+    """Velocity [rad/s]."""
+    fresh: bool = True
+    """Whether the arm has told anything new since the last sample."""
+    external: JointArray | None = None
+    """Torque from outside as the arm or an observer estimates it [N·m], None where nobody does."""
+    fault: str = ""
+    """What the arm says is wrong with it; it stops the guard."""
+
+
+class Seen(NamedTuple):
+    """One of the last samples of a report."""
+
+    sample: Sample
+    aim: Reference
+    tau: JointArray
+    """Torque that was sent [N·m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class FaultReport:
+    """Why a guard stopped, when, and what it had seen last."""
+
+    code: Fault
+    time: float
+    """Of the last sample [s]."""
+    message: str
+    traceback: str
+    """Of the exception that the law raised, or empty."""
+    counters: Counters
+    samples: tuple[Seen, ...]
+    """The last samples, oldest first."""
+
+    @property
+    def t(self) -> Float[np.ndarray, " rows"]:
+        """Times of the last samples [s]."""
+        return np.array([seen.sample.t for seen in self.samples])
+
+    @property
+    def q(self) -> Float[np.ndarray, "rows n"]:
+        """Positions in the last samples [rad]."""
+        return np.array([seen.sample.q for seen in self.samples])
+
+    @property
+    def tau(self) -> Float[np.ndarray, "rows n"]:
+        """Torques that were sent at the last samples [N·m]."""
+        return np.array([seen.tau for seen in self.samples])
+
+    @property
+    def fresh(self) -> Bool[np.ndarray, " rows"]:
+        """Which of the last samples had arrived."""
+        return np.array([seen.sample.fresh for seen in self.samples])
+
+    def __str__(self) -> str:
+        return f"{self.code.name} at t = {self.time:.4g} s: {self.message}"
+
+
+class Guarded:
+    """A law on an arm behind a guard: every torque is finite, within the effort limits and within the torque rate.
+
+    `step` is called once per period. A law that raises stops the arm in the same period; the exception does not leave.
+    One thread at a time may use it.
+
+    Args:
+        law: The control law, compiled if it can be.
+        robot: The arm, by whose model the guard holds it.
+        guard: The limits; None takes `Guard.for_robot(robot)`.
+        lookahead: How far ahead the law is evaluated [s], as in `simulate`; None is half a period.
+
+    Raises:
+        ArgumentError: If law, robot and guard are for different numbers of joints.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> guarded, aim = nbs.Guarded(nbs.PD.for_robot(robot), robot), nbs.Hold([0.3, 0.2])(0.0)
+        >>> guarded.begin(aim.q, aim)
+        >>> tau = guarded.step(nbs.Sample(0.0, aim.q, aim.v), aim)
+        >>> guarded.step(nbs.Sample(0.001, aim.q * np.nan, aim.v), aim).tolist() == tau.tolist(), guarded.mode.name
+        (True, 'DEGRADED')
+    """
+
+    @checked(
+        law=CONTROLLER,
+        robot=ARM,
+        guard=maybe(a(Guard, "a Guard, such as Guard.for_robot(robot)")),
+        lookahead=maybe(number(least=0.0, most=1.0, unit="s")),
+    )
+    def __init__(
+        self, law: Controller, robot: Robot, guard: Guard | None = None, *, lookahead: float | None = None
+    ) -> None:
+        self.guard = Guard.for_robot(robot) if guard is None else guard
+        if not law.nv == robot.nv == self.guard.nv:
+            raise ArgumentError(
+                f"the law has {law.nv} joints, the guard {self.guard.nv} and {robot.name} {robot.nv}; build all for one"
+                " arm."
+            )
+        compiled = law.compile()
+        self.law = compiled if isinstance(compiled, Controller) else law
+        self.robot, self.lead = robot, 0.5 * self.guard.period if lookahead is None else lookahead
+        self._model, self._using = PinocchioDynamics(robot), threading.Lock()
+        self._unknown, self._nothing = np.full(robot.nv, np.nan), np.zeros(robot.nv)
+        self._every = max(1, round(PROBE / self.guard.period))
+        self._state: np.ndarray | None = None
+        self.report: FaultReport | None = None
+        """Why it stopped; None while it has not."""
+
+    def begin(self, q: Any, aim: Reference) -> None:
+        """Begin, or begin again, with an arm that is held at q [rad]; a stop is left in this way only."""
+        n = self.robot.nv
+        at_rest, wanted = vector_of("q", q, n, "rad"), vector_of("aim.q", aim.q, n, "rad")
+        self._state = self.guard.begin(at_rest, wanted, self._model.gravity(at_rest))
+        self._memory, self._count, self.report = self.law.initial_memory(at_rest), 0, None
+        self._seen: deque[Seen] = deque(maxlen=LAST)
+
+    @property
+    def state(self) -> np.ndarray:
+        """The guard's state (`kernels/guarding.py`)."""
+        if self._state is None:
+            raise ArgumentError("the guard has not begun; call begin(q, aim) with the position of the arm.")
+        return self._state
+
+    @property
+    def mode(self) -> Mode:
+        """OK, DEGRADED or STOPPED."""
+        return Mode(int(self.state[at.MODE]))
+
+    @property
+    def tau(self) -> JointArray:
+        """The torque that was sent last [N·m]; before the first, the one that holds the arm."""
+        return self.guard.vector(self.state, at.TAU).copy()
+
+    def gravity(self, q: JointArray) -> JointArray:
+        """G(q) by the guard's model [N·m]."""
+        return np.asarray(self._model.gravity(q))
+
+    @property
+    def counters(self) -> Counters:
+        """What has happened since `begin`."""
+        return self.guard.counters(self.state)
+
+    def step(self, sample: Sample, aim: Reference, *, overrun: bool = False, stop: bool = False) -> JointArray:
+        """The torque to send [N·m], without G(q) if the guard is for an arm that adds it.
+
+        Args:
+            sample: What the arm tells.
+            aim: The reference at the time of the sample plus the lookahead.
+            overrun: Whether the last step came back after the end of its period.
+            stop: Whether to stop.
+
+        Raises:
+            ArgumentError: Before `begin`, and if another thread is in it.
+        """
+        if not self._using.acquire(blocking=False):
+            raise ArgumentError("a Guarded is being used by another thread; give every thread its own.")
+        try:
+            return self._step(sample, aim, overrun, stop)
+        finally:
+            self._using.release()
+
+    def _step(self, sample: Sample, aim: Reference, overrun: bool, stop: bool) -> JointArray:
+        state, config, told = self.state, self.guard.config, sample.external
+        external = self._nothing if told is None else told
+        fault, trace = Fault.ARM if sample.fault else Fault.REQUESTED if stop else Fault.NONE, ""
+        seen = sample.q, sample.v, aim.q, aim.v, external
+        try:
+            action = at.admit(config, state, sample.t, sample.fresh, overrun, *seen)
+        except NOT_TAKEN:  # not all contiguous float64 vectors
+            seen = tuple(np.ascontiguousarray(x, dtype=float).ravel() for x in seen)
+            action = at.admit(config, state, float(sample.t), bool(sample.fresh), overrun, *seen)
+        command, gravity = self._unknown, self._unknown
+        if action == at.COMPUTE and fault is Fault.NONE:
+            try:
+                command = self._command(sample, aim)
+                self._count += 1
+                if self._count % self._every == 1 and not self._holds(aim.q):
+                    fault = Fault.MODEL
+            except Exception:  # a law may raise anything; its arm is stopped, and the report has the traceback
+                fault, trace = Fault.LAW, traceback.format_exc()
+        if self.guard.compensated or fault is not Fault.NONE or action >= at.BRAKE:
+            gravity = self._model.gravity(self.guard.vector(state, at.Q))
+        at.release(config, state, command, gravity, int(fault))
+        tau = self.tau
+        self._seen.append(Seen(sample, aim, tau))
+        if self.report is None and state[at.MODE] == at.STOPPED:
+            self.report = self._reported(sample, trace)
+        return tau
+
+    def _command(self, sample: Sample, aim: Reference) -> JointArray:
+        lead, dv = self.lead, self.lead * aim.a
+        q, v = sample.q + lead * (sample.v + 0.5 * dv), sample.v + dv
+        command, self._memory = self.law.step(self._memory, q, v, aim, self.guard.period)
+        return np.ascontiguousarray(command, dtype=float)
+
+    def _holds(self, q: JointArray) -> bool:
+        """Whether the law, at rest where it wants to be, carries the arm; a law with memory is not asked."""
+        if not isinstance(self.law, MemorylessController):
+            return True
+        gravity = self._model.gravity(q)
+        off = self.law.torque(q, self._nothing, q, self._nothing, self._nothing) - gravity
+        tolerance = np.maximum(_OF_GRAVITY * np.abs(gravity).max(), _OF_EFFORT * self.guard.effort_limit)
+        return bool((np.abs(off) <= tolerance).all())
+
+    def _reported(self, sample: Sample, trace: str) -> FaultReport:
+        code = Fault(int(self.state[at.CODE]))
+        told = sample.fault if code is Fault.ARM else trace.strip().rsplit("\n", 1)[-1]
+        message = f"{code.sentence}{f' ({told})' if told else ''}"
+        return FaultReport(code, float(self.state[at.AT]), message, trace, self.counters, tuple(self._seen))
