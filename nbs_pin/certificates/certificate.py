@@ -1,6 +1,7 @@
 """A certificate: bounds of the tracking error, what they rest on, and how each is known."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,7 +13,8 @@ from nbs_pin.base.arguments import a, checked, number, numbers_or_one
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.records import Reference
-from nbs_pin.base.units import over_joints, several, units
+from nbs_pin.base.shown import Cells, Shown, joints_told
+from nbs_pin.base.units import measured, over_joints, several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.body_error import BodyError
 from nbs_pin.certificates.claims import Assumed, Assumption, Condition, Role, assumed
@@ -43,8 +45,8 @@ class Start(NamedTuple):
     """V(0) [J]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Certificate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(Shown):
     """Bounds of the closed loop of a `LyapunovLaw`, each labelled by how it is known (docs/certificates.md).
 
     They hold for every admissible disturbance and every reference, under `assumptions`; with a `mismatch`, for loops
@@ -86,6 +88,17 @@ class Certificate:
     """The start from which the overshoot is bounded."""
     held: HeldTorque | None = None
     """What is proved of the loop with held torques; None without a period."""
+
+    def _facts(self) -> Iterable[str]:
+        arm = joints_told(self.controller.nv) if self.robot is None else self.robot.name
+        bound = f"‖z1‖ ≤ {measured(self.error, several(self.joint_units))}"
+        clock = "held torques" if self.held is not None and self.held.is_proved else "continuous time"
+        void = (f"VOID: {len(self.void)} conditions fail",) if self.void else ()
+        return arm, self.disturbance, f"{self.label} {bound} in {clock}", *void
+
+    def _cells(self) -> Cells:
+        each = zip(self.joint_names, self.joint_errors.tolist(), self.joint_units, strict=True)
+        return Cells(("joint", "error at most"), [(name, measured(error, unit)) for name, error, unit in each])
 
     @property
     def label(self) -> Label:

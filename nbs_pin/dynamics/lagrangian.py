@@ -69,6 +69,9 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         """Number of joints."""
         return self.network.nv
 
+    def _facts(self) -> Iterable[str]:
+        return type(self.network).__name__, *super()._facts(), f"{sum(x.numel() for x in self.parameters())} numbers"
+
     @property
     def robot(self) -> Robot | None:
         """The arm, if one was given."""
