@@ -92,9 +92,8 @@ class Certificate(Shown):
     def _facts(self) -> Iterable[str]:
         arm = joints_told(self.controller.nv) if self.robot is None else self.robot.name
         bound = f"‖z1‖ ≤ {measured(self.error, several(self.joint_units))}"
-        clock = "held torques" if self.held is not None and self.held.is_proved else "continuous time"
         void = (f"VOID: {len(self.void)} conditions fail",) if self.void else ()
-        return arm, self.disturbance, f"{self.label} {bound} in {clock}", *void
+        return arm, self.disturbance, f"{self.label} {bound} in {self.clock}", *void
 
     def _cells(self) -> Cells:
         each = zip(self.joint_names, self.joint_errors.tolist(), self.joint_units, strict=True)
@@ -170,6 +169,22 @@ class Certificate(Shown):
                 "with a control period as much shorter; rotor inertia that the URDF leaves out would allow more"
             )
         return tuple(found)
+
+    @property
+    def clock(self) -> str:
+        """What the bounds hold for: continuous time, or torques that are held for a control period."""
+        if self.held is None or not self.held.is_proved:
+            return "continuous time"
+        return f"control periods of {1e3 * self.held.readings.period:.4g} ms"
+
+    @property
+    def unproved_hold(self) -> str:
+        """Why nothing is proved of torques that are held for the period; empty if it is, or without a period."""
+        if self.held is None or self.held.is_proved:
+            return ""
+        longest = f"the longest period with a proof is {1e3 * self.held.longest:.3g} ms"
+        why = self.held.why_not or (longest if self.held.longest else "no period tried has a proof")
+        return f"nothing is proved of torques held for {1e3 * self.held.readings.period:.4g} ms: {why}"
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -250,6 +265,8 @@ class Certificate(Shown):
             "joints": list(self.joint_names),
             "units": list(self.joint_units),
             "label": str(self.label),
+            "clock": self.clock,
+            "unproved_hold": self.unproved_hold,
             "void": list(self.void),
             "lines": [line.plain() for line in self.lines],
             "conditions": [condition.plain() for condition in self.conditions],

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from nbs_pin.base.units import TURNING, units
 from nbs_pin.cli.robots import Robots
+from nbs_pin.commands.results import next_step
 from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import Robot, load_robot
 
@@ -44,6 +45,7 @@ def run(options: Robots, console: Console, notes: Console) -> None:
         highlight=False,
         markup=False,
     )
+    console.print(next_step("track", "panda"), highlight=False)
 
 
 def known_arms() -> list[Arm]:

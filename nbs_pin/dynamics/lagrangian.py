@@ -1,7 +1,7 @@
 """A learned Lagrangian as a dynamics model, for numpy arrays and torch tensors."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any
 
