@@ -347,7 +347,7 @@ def reproduced(tmp_path_factory):
         fine=(14.0, 0.005),
         poses=certificate_poses.Scale(arms=("two_link",), samples=500, climbs=4, sweeps=3),
     )
-    return folder, certificate_study.reproduce_certificates(folder, scale=scale)
+    return folder, list(certificate_study.reproduce_certificates(folder, scale=scale))
 
 
 def test_no_bound_of_the_study_is_broken_and_the_papers_is(reproduced):

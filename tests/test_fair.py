@@ -113,9 +113,8 @@ def test_a_law_that_diverges_is_not_converged():
 
 
 def test_the_page_the_csv_and_the_figures_carry_one_table(rows, monkeypatch, tmp_path):
-    monkeypatch.setattr(fair, "SETTINGS", (SMALL,))
-    monkeypatch.setattr(fair, "compare_fairly", lambda **_: rows)
-    sections = fair.fair_part(tmp_path, 0, False)
+    monkeypatch.setattr(fair, "compare_fairly", lambda *_, **__: rows)
+    sections = fair.fair_part(tmp_path, 0, False, (SMALL,))
     page = "\n".join(section.markdown for section in sections)
     with (tmp_path / "fair.csv").open() as file:
         written = list(csv.DictReader(file))

@@ -186,7 +186,7 @@ def small(tmp_path_factory, chain):
         patch.setattr(learned_loop, "ARMS", ("three_link",))
         patch.setattr(learned_loop, "learn_chains", lambda *_: chains)
         patch.setattr(study, "cores", lambda: 1)
-        return folder, learned_loop.reproduce_learned(folder, seed=3, scale=SMALL)
+        return folder, list(learned_loop.reproduce_learned(folder, seed=3, scale=SMALL))
 
 
 def test_the_page_and_the_files_carry_what_was_found(small):

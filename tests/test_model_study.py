@@ -60,7 +60,7 @@ def one_thread():
 def small(tmp_path_factory):
     """Folder and sections of a small study."""
     folder = tmp_path_factory.mktemp("models")
-    return folder, model_study.reproduce_models(folder, seed=3, scale=SMALL)
+    return folder, list(model_study.reproduce_models(folder, seed=3, scale=SMALL))
 
 
 def rows(path):

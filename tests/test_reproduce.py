@@ -31,7 +31,7 @@ def small(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reproduced")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_alpha, "SQUARE_DURATION", 30.0)
-        return folder, paper.reproduce_paper(folder, seed=0, scale=SMALL)
+        return folder, list(paper.reproduce_paper(folder, seed=0, scale=SMALL))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -212,7 +212,7 @@ def test_the_command_joins_the_parts(tmp_path, quick, capsys):
     assert "## First\n\nSeed 7." in (folder / "report.md").read_text()
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["figures"] == {"seed": 7}
-    assert summary["settings"] == {"part": "paper", "seed": 7}
+    assert summary["settings"] == {"part": "paper", "quick": False, "seed": 7}
     assert "report.md" in capsys.readouterr().out
     assert main(["reproduce", "--part", "paper", "--seed", "7", "--out", str(folder)]) == 0
     assert main(["reproduce", "--part", "paper", "--seed", "8", "--out", str(folder)]) == 2

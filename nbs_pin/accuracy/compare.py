@@ -1,6 +1,6 @@
 """Errors of a dynamics model relative to a true one, as defined in `accuracy/relative_errors.py`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import RUN, Run
+from nbs_pin.base.shown import Cells, Shown
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 
@@ -43,8 +44,8 @@ class Scale(NamedTuple):
     """Relative error of c τ̂, at most that of τ̂; small compared with `inverse` if only the scale is wrong."""
 
 
-@dataclass(frozen=True, eq=False)
-class ModelErrors:
+@dataclass(frozen=True, eq=False, repr=False)
+class ModelErrors(Shown):
     """Result of `compare`; relative errors are in the Frobenius norm over the samples (0.01 is one per cent)."""
 
     mass_matrix: float
@@ -89,6 +90,15 @@ class ModelErrors:
     """Errors over the states of the run and the true accelerations there."""
     mismatch: Mismatch | None = None
     """δ along the run and its bound (`accuracy/mismatch.py`)."""
+
+    def _facts(self) -> Iterable[str]:
+        of = {"M": self.mass_matrix, "C v": self.coriolis, "G": self.gravity, "torque": self.inverse}
+        return *(f"{name} {error:.2e}" for name, error in of.items()), f"relative, {self.samples} samples"
+
+    def _cells(self) -> Cells:
+        shown = {"M": "mass_matrix", "C v": "coriolis", "G": "gravity", "torque": "inverse", "acceleration": "forward"}
+        rows = [(name, f"{getattr(self, key):.2e}") for name, key in shown.items()]
+        return Cells(("", "relative error"), rows)
 
     @property
     def errors(self) -> Errors:

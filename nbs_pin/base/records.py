@@ -2,7 +2,8 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +17,8 @@ from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
-from nbs_pin.base.units import JointUnits, units_of
+from nbs_pin.base.shown import Cells, Shown, joints_told
+from nbs_pin.base.units import JointUnits, measured, units_of
 
 RUN_FORMAT = "nbs_pin run 1"
 """Value of the entry `format` in a run file."""
@@ -44,8 +46,8 @@ class Reference(NamedTuple):
     a: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Run:
+@dataclass(frozen=True, eq=False, repr=False)
+class Run(Shown):
     """A recorded simulation; row k of every array belongs to the control instant t[k].
 
     The torque in row k acts from t[k] to t[k+1]; the torque in the last row was computed but not applied.
@@ -121,6 +123,21 @@ class Run:
     def nv(self) -> int:
         """Number of joints."""
         return int(self.q.shape[-1])
+
+    def _facts(self) -> Iterable[str]:
+        starts = math.prod(self.q.shape[1:-1])
+        several = () if starts == 1 else (f"{starts} starts",)
+        arm = (self.robot.rsplit("/", 1)[-1],) if self.robot else ()
+        length = f"{self.t[-1] - self.t[0]:.6g} s at {1e3 * self.period:.6g} ms"
+        return *arm, joints_told(self.nv), length, *several
+
+    def _cells(self) -> Cells:
+        error = self.q - self.q_ref
+        error = np.where(self.continuous, np.arctan2(np.sin(error), np.cos(error)), error)
+        worst, torque = (np.abs(x).max(axis=tuple(range(x.ndim - 1))) for x in (error, self.tau))
+        each = zip(self.joint_names, worst, torque, self.units, strict=True)
+        rows = [(name, measured(e, of.position), measured(tau, of.torque)) for name, e, tau, of in each]
+        return Cells(("joint", "largest error", "largest torque"), rows)
 
     @property
     def slides(self) -> Bool[np.ndarray, " n"]:

@@ -85,6 +85,8 @@ SETTINGS = (
     Setting("panda", 0.01, starts=12, checking=6, start_error=0.5, search=40, epochs=120),
     Setting("panda", 0.001, starts=4, checking=6, start_error=0.5, duration=0.6),
 )
+QUICK = (Setting("two_link", 0.01, starts=4, checking=2, start_error=1.0, search=3, epochs=10),)
+"""To see the page in a minute; nothing is tuned to its end."""
 
 
 class Row(NamedTuple):
@@ -173,16 +175,16 @@ def judge(setting: Setting, name: str, law: Any, *, count: int, seed: int) -> li
     return rows
 
 
-def fair_part(folder: Path, seed: int, progress: bool) -> list[Section]:
+def fair_part(folder: Path, seed: int, progress: bool, settings: Sequence[Setting] = SETTINGS) -> list[Section]:
     """Run the comparison, write `fair.csv` and `fair.png` into the folder and return the sections of the page."""
     from nbs_pin.reports.charts import plot_comparison
 
-    rows = compare_fairly(seed=seed, progress=progress)
+    rows = compare_fairly(settings, seed=seed, progress=progress)
     records = [row._asdict() for row in rows]
     write_csv(folder / "fair.csv", Row._fields, rows)
     plot_comparison(records, folder / "fair.png")
     sections = [Section("The fair comparison", _protocol(rows, seed), {"fair": plain(records)})]
-    for s in SETTINGS:
+    for s in settings:
         limit = "|τ| ≤ 100 N·m" if s.arm == "two_link" else "its own effort limits"
         own = [row for row in rows if (row.arm, row.period_s) == (s.arm, s.period)]
         sections.append(Section(f"{s.arm}, control at {1000 * s.period:g} ms, {limit}", _tables(own)))

@@ -1,6 +1,5 @@
 """The fault matrix: what goes wrong, how much, and what must come of it (docs/runtime.md)."""
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -225,7 +224,9 @@ def delay(arm: Arm, rng: np.random.Generator, size: tuple[int, float]) -> Verdic
     return below(Trial(arm, delay=size[0]).run(), size[1])
 
 
-@rows("F14 rate, gains for it", "RMS ≤ {}", ("500 Hz", (0.002, 5e-4)), ("250 Hz", (0.004, 1e-3)), ("100 Hz", (0.01, 5e-3)))
+@rows(
+    "F14 rate, gains for it", "RMS ≤ {}", ("500 Hz", (0.002, 5e-4)), ("250 Hz", (0.004, 1e-3)), ("100 Hz", (0.01, 5e-3))
+)
 def rate(arm: Arm, rng: np.random.Generator, size: tuple[float, float]) -> Verdict:
     """Loop and law both have a longer period."""
     law = NeuralBackstepping.for_robot(arm.robot, period=size[0])
@@ -374,7 +375,9 @@ def jump(arm: Arm, rng: np.random.Generator, size: float) -> Verdict:
     return stopped(outcome, "REFERENCE", within=19 * PERIOD)
 
 
-@rows("F24 start 1 rad off, at speed", "{}", ("approach", (True, "peak ≤ 0.01")), ("none", (False, "settles, or stops")))
+@rows(
+    "F24 start 1 rad off, at speed", "{}", ("approach", (True, "peak ≤ 0.01")), ("none", (False, "settles, or stops"))
+)
 def far(arm: Arm, rng: np.random.Generator, size: tuple[bool, str]) -> Verdict:
     """The arm starts 1 rad off in every joint, at up to a quarter of its velocity limit (at most 2 rad/s)."""
     begin, n = arm.motion(0.0), arm.robot.nv

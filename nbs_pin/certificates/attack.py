@@ -4,7 +4,7 @@ Every motion starts on its reference, z1 = z2 = 0, and the torque is held over e
 lower bound of the worst error, never an upper one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -17,7 +17,8 @@ from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Run
-from nbs_pin.base.units import several, units
+from nbs_pin.base.shown import Shown
+from nbs_pin.base.units import measured, several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.ensemble import LoopEnsemble, Peaks, law_of
 from nbs_pin.certificates.torque_waves import FASTEST, SLOWEST, constant, in_step, random_disturbances, square
@@ -28,8 +29,8 @@ from nbs_pin.motions.references import DesiredMotion
 __all__ = ["Attack", "Peaks", "attack", "random_disturbances", "worst_of"]
 
 
-@dataclass(frozen=True, eq=False)
-class Attack:
+@dataclass(frozen=True, eq=False, repr=False)
+class Attack(Shown):
     """The worst motion that `attack` found; its errors are lower bounds of the worst ones."""
 
     error: float
@@ -48,6 +49,10 @@ class Attack:
     """Length of every motion [s]."""
     period: float
     """Control period [s]."""
+
+    def _facts(self) -> Iterable[str]:
+        unit = several(of.position for of in self.run.units)
+        return f"worst ‖z1‖ found {measured(self.error, unit)}", self.found_by, f"{self.duration:.4g} s"
 
 
 @checked(

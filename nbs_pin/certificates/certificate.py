@@ -1,6 +1,7 @@
 """A certificate: bounds of the tracking error, what they rest on, and how each is known."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,7 +13,8 @@ from nbs_pin.base.arguments import a, checked, number, numbers_or_one
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.claims import Claim, Group, Label, weakest
 from nbs_pin.base.records import Reference
-from nbs_pin.base.units import over_joints, several, units
+from nbs_pin.base.shown import Cells, Shown, joints_told
+from nbs_pin.base.units import measured, over_joints, several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.body_error import BodyError
 from nbs_pin.certificates.claims import Assumed, Assumption, Condition, Role, assumed
@@ -43,8 +45,8 @@ class Start(NamedTuple):
     """V(0) [J]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Certificate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(Shown):
     """Bounds of the closed loop of a `LyapunovLaw`, each labelled by how it is known (docs/certificates.md).
 
     They hold for every admissible disturbance and every reference, under `assumptions`; with a `mismatch`, for loops
@@ -86,6 +88,16 @@ class Certificate:
     """The start from which the overshoot is bounded."""
     held: HeldTorque | None = None
     """What is proved of the loop with held torques; None without a period."""
+
+    def _facts(self) -> Iterable[str]:
+        arm = joints_told(self.controller.nv) if self.robot is None else self.robot.name
+        bound = f"‖z1‖ ≤ {measured(self.error, several(self.joint_units))}"
+        void = (f"VOID: {len(self.void)} conditions fail",) if self.void else ()
+        return arm, self.disturbance, f"{self.label} {bound} in {self.clock}", *void
+
+    def _cells(self) -> Cells:
+        each = zip(self.joint_names, self.joint_errors.tolist(), self.joint_units, strict=True)
+        return Cells(("joint", "error at most"), [(name, measured(error, unit)) for name, error, unit in each])
 
     @property
     def label(self) -> Label:
@@ -157,6 +169,22 @@ class Certificate:
                 "with a control period as much shorter; rotor inertia that the URDF leaves out would allow more"
             )
         return tuple(found)
+
+    @property
+    def clock(self) -> str:
+        """What the bounds hold for: continuous time, or torques that are held for a control period."""
+        if self.held is None or not self.held.is_proved:
+            return "continuous time"
+        return f"control periods of {1e3 * self.held.readings.period:.4g} ms"
+
+    @property
+    def unproved_hold(self) -> str:
+        """Why nothing is proved of torques that are held for the period; empty if it is, or without a period."""
+        if self.held is None or self.held.is_proved:
+            return ""
+        longest = f"the longest period with a proof is {1e3 * self.held.longest:.3g} ms"
+        why = self.held.why_not or (longest if self.held.longest else "no period tried has a proof")
+        return f"nothing is proved of torques held for {1e3 * self.held.readings.period:.4g} ms: {why}"
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -237,6 +265,8 @@ class Certificate:
             "joints": list(self.joint_names),
             "units": list(self.joint_units),
             "label": str(self.label),
+            "clock": self.clock,
+            "unproved_hold": self.unproved_hold,
             "void": list(self.void),
             "lines": [line.plain() for line in self.lines],
             "conditions": [condition.plain() for condition in self.conditions],

@@ -1,5 +1,6 @@
 """Check of a run against a certificate: V beside its bound, and the assumptions that failed."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float
 from nbs_pin.base.arguments import a, checked, count, maybe
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import RUN, Run
+from nbs_pin.base.shown import Shown
 from nbs_pin.certificates.assumptions import (
     JUMPS,
     Promise,
@@ -37,8 +39,8 @@ from nbs_pin.certificates.glance import Glance, labels
 from nbs_pin.certificates.window_watch import UNEXPLAINED, WindowWatch
 
 
-@dataclass(frozen=True, eq=False)
-class Monitored:
+@dataclass(frozen=True, eq=False, repr=False)
+class Monitored(Shown):
     """V and the errors along one motion, their certified bounds, the terms of V̇, and the assumptions that failed."""
 
     t: Float[np.ndarray, " rows"]
@@ -74,6 +76,9 @@ class Monitored:
     """From encoders: simple faults each of which would explain the torques of the last window with any."""
     basis: str = ""
     """What else the verdict has to say of the bounds."""
+
+    def _facts(self) -> Iterable[str]:
+        return f"{len(self.t)} rows", self.verdict
 
     @cached_property
     def exceeded(self) -> Bool[np.ndarray, " rows"]:

@@ -1,6 +1,7 @@
 """Check of a closed loop against a certificate while it runs."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, cast
@@ -12,6 +13,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import floats, real, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import Shown
 from nbs_pin.certificates.assumptions import JUMPS, LARGEST, check_certificate, listed, looks_like, not_finite, sentence
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
@@ -58,8 +60,8 @@ class Watched(NamedTuple):
         return not self.excesses
 
 
-@dataclass(frozen=True, eq=False)
-class Watch:
+@dataclass(frozen=True, eq=False, repr=False)
+class Watch(Shown):
     """Check of a closed loop against a certificate while it runs, one control instant after the other.
 
     The caller keeps the memory. As a live arm records no disturbance, an unexplained torque is attributed to both model
@@ -83,6 +85,9 @@ class Watch:
     def __post_init__(self) -> None:
         check_certificate(self.certificate)
         check_fields(self, encoders=maybe(a(Encoders, "Encoders, such as Encoders.of_bits(16)")))
+
+    def _facts(self) -> Iterable[str]:
+        return repr(self.certificate), "exact states" if self.encoders is None else repr(self.encoders)
 
     @cached_property
     def _way(self) -> PeriodWatch | WindowWatch:

@@ -6,7 +6,7 @@ of that shape that certifies the wanted error (docs/certificates.md §10).
 """
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -16,7 +16,8 @@ from nbs_pin.base.arguments import DURATION, PERIOD, SEED, checked, many, maybe
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
-from nbs_pin.base.units import units
+from nbs_pin.base.shown import Shown
+from nbs_pin.base.units import measured, several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.comparison_system import ComparisonSystem, level, reach
@@ -46,8 +47,8 @@ _SPARE = 1.0 - 1e-6
 """Share of the wanted error that the design aims at, to leave room for the rounding of its certificate."""
 
 
-@dataclass(frozen=True, eq=False)
-class Proposal:
+@dataclass(frozen=True, eq=False, repr=False)
+class Proposal(Shown):
     """An inertia-shaped law that certifies the wanted error."""
 
     gains: Gains
@@ -68,6 +69,12 @@ class Proposal:
     """Largest √(K_i/M_e,i)·h, at most `STIFF`."""
     fast: float
     """ωh, at most `FAST`."""
+
+    def _facts(self) -> Iterable[str]:
+        robot = self.controller.dynamics.robot
+        unit = "rad" if robot is None else several(units("position", robot.prismatic))
+        error, rate = f"‖z1‖ ≤ {measured(self.error, unit)}", f"ω = {self.gains.bandwidth:.3g} rad/s"
+        return error, rate, f"period {1e3 * self.period:.4g} ms", f"{self.share:.0%} of a torque limit"
 
 
 @checked(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from nbs_pin.cli.values import integer
+from nbs_pin.cli.values import Verbose, integer
 
 
 @dataclass(frozen=True)
@@ -26,3 +26,5 @@ class Bench:
     """summary.json of an earlier bench; print the figures that changed by more than 10 %."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for summary.json and joints.png."""
+    verbose: Verbose = False
+    """Also print every row; summary.json always has every number."""

@@ -13,6 +13,7 @@ from nbs_pin.cli.file_units import FileUnits
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import (
     OptionError,
+    Verbose,
     choice,
     default,
     integer,
@@ -60,8 +61,9 @@ def friction_text() -> PrimitiveConstructorSpec[str]:
 class Certify(FileUnits):
     """Certify a controller: bound its tracking error under any bounded disturbance, and say how each bound is known.
 
-    Print every constant, condition and bound with its label PROVED, VERIFIED, PROBABILISTIC or EMPIRICAL, and write
-    certificate.png, run.npz (the worst motion found) and summary.json. With --json, also write certificate.json, which
+    Print the bound of the error with its label PROVED, VERIFIED, PROBABILISTIC or EMPIRICAL, with -v every constant and
+    condition, too, and write certificate.png, run.npz (the worst motion found) and summary.json. The exit code is 3 if
+    nothing is promised. With --json, also write certificate.json, which
     nbs-pin verify checks again. With --wanted, also design gains and a control
     period that certify an error, and write controller.nbs.
 
@@ -133,6 +135,8 @@ class Certify(FileUnits):
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another certificate in that folder."""
+    verbose: Verbose = False
+    """Also print the tables; summary.json always has every number."""
     tool: OfTool = field(default_factory=ToolOptions)
     """How a path of the tool is followed."""
     arm: OfArm = field(default_factory=ArmOptions)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
-from nbs_pin.cli.values import default, integer, number
+from nbs_pin.cli.values import Verbose, default, integer, number
 
 
 @dataclass(frozen=True)
@@ -49,5 +49,7 @@ class Collect:
     """Folder for the results."""
     force: bool = False
     """Overwrite other data in that folder."""
+    verbose: Verbose = False
+    """Also print the tables; summary.json always has every number."""
     arm: OfArm = field(default_factory=ArmOptions)
     """How the arm is read."""

@@ -9,7 +9,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
-from nbs_pin.cli.values import OptionError, default, integer, number, text
+from nbs_pin.cli.values import OptionError, Verbose, default, integer, number, text
 
 
 def joint_pair() -> PrimitiveConstructorSpec[str]:
@@ -61,5 +61,7 @@ class Compare:
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another comparison in that folder."""
+    verbose: Verbose = False
+    """Also print the tables; summary.json always has every number."""
     arm: OfArm = field(default_factory=ArmOptions)
     """How the arm is read."""

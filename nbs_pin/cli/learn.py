@@ -8,7 +8,7 @@ import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
-from nbs_pin.cli.values import choice, default, integer, number
+from nbs_pin.cli.values import Verbose, choice, default, integer, number
 from nbs_pin.identification.registry import MODELS
 
 
@@ -55,5 +55,7 @@ class Learn(FileUnits):
     """Folder for the results."""
     force: bool = False
     """Overwrite another model in that folder."""
+    verbose: Verbose = False
+    """Also print the tables; summary.json always has every number."""
     arm: OfArm = field(default_factory=ArmOptions)
     """How the arm is read."""

@@ -13,6 +13,8 @@ from nbs_pin.cli.values import integer
 class Reproduce:
     """Reproduce the paper's experiments or run further studies; write report.md, summary.json, figures and CSV files.
 
+    Ctrl-C keeps the sections that are done.
+
     Example: nbs-pin reproduce --out out/reproduce
     """
 
@@ -22,6 +24,8 @@ class Reproduce:
     models: learned models against the truth, from clean and noisy data, with and without structure; about an hour.
     certificates: certified errors against the worst ones found, a counterexample to the paper's bound,
     and bounds of the inertia against sampled configurations."""
+    quick: bool = False
+    """A page with few seeds, arms and epochs, to see what there is: its figures are not those of the study."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
     """First seed; every page says how many were run."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/reproduce")

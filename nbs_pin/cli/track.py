@@ -10,7 +10,17 @@ import tyro
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
-from nbs_pin.cli.values import SAVED, choice, configuration, default, disturbance_text, integer, number
+from nbs_pin.cli.values import (
+    SAVED,
+    Verbose,
+    choice,
+    choices,
+    configuration,
+    default,
+    disturbance_text,
+    integer,
+    number,
+)
 from nbs_pin.controllers.registry import LAWS
 from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
 
@@ -19,6 +29,8 @@ from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
 class Track(FileUnits):
     """Simulate an arm that follows a motion, and write run.npz, summary.json, tracking.png and replay.html.
 
+    With several laws, write a run of each, comparison.png and summary.json. Ctrl-C keeps what was simulated.
+
     Example: nbs-pin track panda --start-error 0.3 --disturbance square:5@8 --out out/panda
     """
 
@@ -26,8 +38,8 @@ class Track(FileUnits):
     """An arm by name (see nbs-pin robots) or a path to a .urdf, .xacro or MJCF file."""
     plant: Annotated[str, choice("--plant", PLANTS)] = "mujoco"
     """Simulator of the arm."""
-    controller: Annotated[str, choice("--controller", LAWS, SAVED)] = "nbs"
-    """A law by name, or a .nbs file with a controller and its gains.
+    controller: Annotated[str, choices("--controller", LAWS, SAVED)] = "nbs"
+    """A law by name, or a .nbs file with a controller and its gains; several, separated by commas, are compared.
     nbs-paper: the paper's controller on two_link, its networks with gains for the arm on any other."""
     reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
     """Motion to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints.
@@ -78,6 +90,8 @@ class Track(FileUnits):
     """Folder for the results."""
     force: bool = False
     """Overwrite the results of another run in that folder."""
+    verbose: Verbose = False
+    """Also print the tables; summary.json always has every number."""
     tool: OfTool = field(default_factory=ToolOptions)
     """How a path of the tool is followed."""
     arm: OfArm = field(default_factory=ArmOptions)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
-from nbs_pin.cli.values import SAVED, choice, default, integer, number, positive_list
+from nbs_pin.cli.values import SAVED, Verbose, choice, default, integer, number, positive_list
 from nbs_pin.controllers.registry import LAWS
 
 
@@ -68,5 +68,7 @@ class Train:
     """Continue the training in that folder as if it had not been stopped."""
     force: bool = False
     """Overwrite the results of another training in that folder."""
+    verbose: Verbose = False
+    """Also print the tables; summary.json always has every number."""
     arm: OfArm = field(default_factory=ArmOptions)
     """How the arm is read."""

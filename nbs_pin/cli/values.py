@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
@@ -17,6 +17,8 @@ _INTEGER = re.compile(r"[0-9]+")
 _LARGEST = 1e30  # torque of a disturbance [N·m, N]
 SAVED = ".nbs"
 """File extension of saved controllers and models."""
+Verbose: TypeAlias = Annotated[bool, tyro.conf.arg(aliases=["-v"])]
+"""Whether to print tables below the verdict."""
 DisturbanceKind: TypeAlias = Literal["constant", "square", "sine", "noise"]
 
 
@@ -90,6 +92,21 @@ def choice(flag: str, known: Collection[str], ending: str = "") -> PrimitiveCons
         return words[0]
 
     return _spec(f"{{{','.join((*known, *([f'FILE{ending}'] if ending else [])))}}}", parse, str)
+
+
+def choices(flag: str, known: Collection[str], ending: str = "") -> PrimitiveConstructorSpec[str]:
+    """A tyro parser of one or several of what `choice` takes, different ones, separated by commas."""
+    one = choice(flag, known, ending)
+
+    def parse(words: list[str]) -> str:
+        names = words[0].split(",")
+        for name in names:
+            one.instance_from_str([name])
+        if len({*names}) < len(names):
+            raise OptionError(f"{flag} is '{words[0]}', with one of them twice; give different ones.")
+        return words[0]
+
+    return _spec(f"{one.metavar}[,…]", parse, str)
 
 
 def default(hint: str) -> Any:

@@ -11,7 +11,7 @@ from nbs_pin.base.files import replaced_together
 from nbs_pin.benchmarks import bench
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import SUMMARY, drawing, summary_text, table
+from nbs_pin.commands.results import SUMMARY, drawing, summary_text, table, tell
 from nbs_pin.reports.charts import plot_scaling
 
 _COLUMNS = {
@@ -54,12 +54,22 @@ def run(options: Bench, console: Console, notes: Console) -> None:
     series = {name: [figures[key] for figures in chain] for name, key in lines.items()}
     with drawing(picture):
         plot_scaling([figures["joints"] for figures in chain], series, picture)
-    for what, columns in _COLUMNS.items():
-        if any(row.what == what for row in rows):
-            console.print(_shown(what, columns, [row for row in rows if row.what == what]))
+    kinds = [what for what in _COLUMNS if any(row.what == what for row in rows)]
+    tables = [_shown(what, _COLUMNS[what], [row for row in rows if row.what == what]) for what in kinds]
+    tell(console, _verdict(rows), (), tables, verbose=options.verbose)
     if known is not None:
         console.print(_moved(bench.compare(rows, known)))
     console.print(str(options.out / SUMMARY), str(picture), sep="\n", highlight=False)
+
+
+def _verdict(rows: list[bench.Row]) -> str:
+    """The time of one control step of the first law of every arm."""
+    steps: dict[str, bench.Row] = {}
+    for row in rows:
+        if row.what == "control step":
+            steps.setdefault(row.arm, row)
+    told = (f"{arm} {row.figures['p50_us']:.3g} µs ({row.how})" for arm, row in steps.items())
+    return f"one control step, median: {', '.join(told)}"
 
 
 def _read(path: Path) -> Any:

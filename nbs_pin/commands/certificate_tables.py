@@ -1,5 +1,6 @@
 """A certificate as tables on the console."""
 
+import math
 from typing import Any
 
 from rich import box
@@ -7,7 +8,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.units import SLIDING, column, units
+from nbs_pin.base.units import SLIDING, column, measured, units
+from nbs_pin.commands.results import tell
 
 _ERRORS = ("rad", "m", "rad, m")
 """Units of the error bounds, which have a table of their own."""
@@ -33,12 +35,36 @@ _GAINS = {
 """Columns of a design per joint: the figures, and the fields of `JointUnits` that say in what they are."""
 
 
-def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Print the error bounds first, then what they rest on; `figures` from `commands.certify.figures`."""
-    certificate = figures["certificate"]
-    console.print(Text(f"{title}: {certificate['disturbance']}", style="bold"), soft_wrap=True)
+def print_certificate(console: Console, law: str, figures: dict[str, Any], *, verbose: bool) -> None:
+    """Print the promise, and all that it rests on if wanted; `figures` from `commands.certify.figures`."""
+    tell(console, headline(law, figures), verbose=verbose)
     if figures["design"] is not None:
         console.print(_design(figures))
+    if verbose:
+        _print_grounds(console, figures)
+    for text in _closing(figures):
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def headline(law: str, figures: dict[str, Any]) -> str:
+    """In one sentence what is promised of every joint, how that is known, and for which clock."""
+    certificate = figures["certificate"]
+    errors = certificate["joint_overshoots_rad"] or certificate["joint_errors_rad"]
+    worst: dict[str, float] = {}
+    for error, unit in zip(errors, certificate["units"], strict=True):
+        worst[unit] = max(worst.get(unit, 0.0), math.inf if error is None else error)
+    strays = " or ".join(measured(error, unit) for unit, error in worst.items())
+    start = "the start given" if certificate["joint_overshoots_rad"] else "a start on the motion"
+    told = (
+        f"no joint of {figures['arm'] or 'the arm'} strays more than {strays} from its motion under "
+        f"{certificate['disturbance']} ({law}, from {start}, in {certificate['clock']})"
+    )
+    return f"NOT PROMISED: that {told}" if certificate["void"] else f"{certificate['label']}: {told}"
+
+
+def _print_grounds(console: Console, figures: dict[str, Any]) -> None:
+    """Print the error bounds first, then what they rest on."""
+    certificate = figures["certificate"]
     bounds = [line for line in certificate["lines"] if line["group"] == "bounds" and line["unit"] in _ERRORS]
     reasons = [line["because"] for line in bounds]
     bounds.sort(key=lambda line: reasons.index(line["because"]))
@@ -49,8 +75,6 @@ def print_certificate(console: Console, title: str, figures: dict[str, Any]) -> 
         lines = [line for line in certificate["lines"] if line["group"] == name and line not in bounds]
         if lines:
             console.print(_claims(name, lines))
-    for text in _closing(figures):
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def _table(title: str, *headings: str) -> Table:
@@ -135,7 +159,7 @@ def _design(figures: dict[str, Any]) -> Table:
 
 def _closing(figures: dict[str, Any]) -> list[str]:
     certificate, found, watched = figures["certificate"], figures["attack"], figures["monitor"]
-    lines = []
+    lines = [certificate["unproved_hold"]] if certificate["unproved_hold"] else []
     if found is not None:
         how = f"{found['found_by']}, {found['duration_s']:.3g} s at {1e3 * found['period_s']:g} ms"
         search = how if found["thorough"] else f"{how}; waves alone, --attack searches further"

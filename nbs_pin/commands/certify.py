@@ -58,8 +58,8 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         with notes.status(f"drawing the picture into {folder}"):
             found, written = write_results(result, results, as_file=options.json)
     law = Path(options.controller).name if options.controller.endswith(SAVED) else "a law built for it"
-    print_certificate(console, f"{robot.name}, {law}", found)
-    results.show(console, written)
+    print_certificate(console, law, found, verbose=options.verbose)
+    results.show(console, written, *(("verify", folder / CERTIFICATE) if options.json else ()))
     return NO_PROMISE if result.certificate.void else 0
 
 

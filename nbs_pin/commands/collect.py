@@ -10,7 +10,7 @@ from rich.text import Text
 from nbs_pin.base.units import by_quantity, column, units_of
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import torque_limits
@@ -44,8 +44,8 @@ def run(options: Collect, console: Console, notes: Console) -> None:
                 data.save(draft / FILES[0])
             with drawing(folder / FILES[1]) as path:
                 plot_coverage(data, path, robot)
-    _print(console, f"{robot.name}, {options.recipe}", found)
-    results.show(console, FILES)
+    _print(console, f"{robot.name}, {options.recipe}", found, verbose=options.verbose)
+    results.show(console, FILES, "learn", results.folder / FILES[0])
 
 
 def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
@@ -99,8 +99,8 @@ def _rms(x: np.ndarray) -> list[float]:
     return np.sqrt((x**2).mean(axis=0)).tolist()
 
 
-def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Print a row per joint; `figures` from the function of that name."""
+def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool) -> None:
+    """Print what was recorded, and a row per joint; `figures` from the function of that name."""
     names = {
         "q from": ("q_least_rad", "position"),
         "to": ("q_most_rad", "position"),
@@ -115,6 +115,12 @@ def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)
-    console.print(shown)
     plural = "trajectory" if figures["trajectories"] == 1 else "trajectories"
-    console.print(f"{figures['samples']} samples of {figures['trajectories']} {plural}", highlight=False)
+    limited = max(figures["at_torque_limit_fraction"])
+    tell(
+        console,
+        f"{figures['samples']} samples of {figures['trajectories']} {plural} of {title}",
+        [f"at a torque limit in at most {limited:.1%} of the samples of a joint"],
+        [shown],
+        verbose=verbose,
+    )

@@ -19,7 +19,7 @@ from nbs_pin.base.records import Run
 from nbs_pin.base.units import by_quantity, several, units_of
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.values import SAVED, OptionError
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
 from nbs_pin.controllers.gains import gains_for_robot
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -59,7 +59,7 @@ def run(options: Compare, console: Console, notes: Console) -> None:
         result = compare_models(model, robot, **given, progress=True)
         with notes.status(f"drawing the page into {folder}"):
             found = write_results(result, robot, results, title)
-    _print(console, title, found)
+    _print(console, title, found, verbose=options.verbose)
     results.show(console, FILES)
 
 
@@ -291,24 +291,32 @@ def _pair(options: Compare, nv: int) -> tuple[int, int] | None:
     return first - 1, second - 1
 
 
-def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Print the errors over the box and along the run, then figures of the whole model."""
+def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool) -> None:
+    """Print the error of the torque, the errors over the box and along the run, and figures of the whole model."""
     along = figures["along_run"]
     shown = table(title, "box", *([] if along is None else ["closed loop"]), first="relative error of")
     for key, name in _PRINTED.items():
         values = (figures["relative_error"], *([] if along is None else [along]))
         shown.add_row(name, *(_number(of[key]) for of in values))
-    console.print(shown)
     low, high = figures["mass_ratio"]
-    for line in (
+    error = figures["relative_error"]
+    verdict = (
+        f"{title}: its torques are off by {_percent(error['inverse'])} of the true ones "
+        f"(M {_percent(error['mass_matrix'])}, C v {_percent(error['coriolis'])}, G {_percent(error['gravity'])})"
+    )
+    lines = (
         f"torque nMSE {_number(figures['torque_nmse'])}; least eigenvalue of the model's M "
         f"{_number(figures['eigenvalue_margin_kgm2'])} kg·m²; {_number(low)} M ≤ model's M ≤ {_number(high)} M",
         f"torque × {figures['scale_factor']:.6g} fits best, with a relative error of {_number(figures['scale_error'])}",
         f"free motion: true energy drifts by {_number(figures['energy_drift'])} of the kinetic energy "
         f"(integrator alone {_number(figures['energy_drift_floor'])})",
         *_mismatch_lines(figures),
-    ):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    )
+    tell(console, verdict, lines, [shown], verbose=verbose)
+
+
+def _percent(share: float | None) -> str:
+    return "not finite" if share is None else f"{100.0 * share:.2g} %"
 
 
 def _mismatch_lines(figures: dict[str, Any]) -> list[str]:

@@ -15,7 +15,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
 from nbs_pin.base.units import by_quantity, column, several, units
 from nbs_pin.cli.learn import Learn
-from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table, tell
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
@@ -56,8 +56,9 @@ def run(options: Learn, console: Console, notes: Console) -> None:
                 save(result.model, draft / FILES[0], info={"learned": results.facts | {"interrupted": interrupted}})
             with drawing(folder / FILES[1]) as path:
                 plot_learning(result, path)
-    _print(console, f"{name}, {options.model}", found)
-    results.show(console, FILES)
+    _print(console, f"{name}, {options.model}", found, verbose=options.verbose)
+    known = robot is not None and not interrupted
+    results.show(console, FILES, *(("compare", results.folder / FILES[0]) if known else ()))
     if interrupted:
         raise KeyboardInterrupt
 
@@ -181,8 +182,8 @@ def _errors(result: Learned, data: Dataset) -> np.ndarray:
     return np.sqrt(np.square(torque_errors(result.model, data, result.friction)).mean(axis=0))
 
 
-def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Print a row per joint, then figures of the whole arm."""
+def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool) -> None:
+    """Print how good the model is, and a row per joint."""
     test, viscous, of = figures["rms_test_torque_error_Nm"], figures["viscous_friction"], figures["units"]
     none = ["none"] * len(figures["joints"])
     coulomb = [f"{x:.3g}" for x in figures["coulomb_friction_Nm"] or ()] or none
@@ -196,9 +197,19 @@ def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)
-    console.print(shown)
-    for line in _lines(figures):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    tell(console, _verdict(title, figures), _lines(figures), [shown], verbose=verbose)
+
+
+def _verdict(title: str, figures: dict[str, Any]) -> str:
+    """The joint with the largest torque error, beside how much its torque varies."""
+    held_out = figures["rms_test_torque_error_Nm"]
+    errors, where = (figures["rms_torque_error_Nm"], "the data") if held_out is None else (held_out, "held-out data")
+    worst = max(range(len(errors)), key=lambda i: errors[i] / max(figures["torque_deviation_Nm"][i], 1e-300))
+    joint, unit = figures["joints"][worst], figures["units"]["torque"][worst]
+    return (
+        f"{title}: on {where} the torque of {joint}, the worst joint, is off by {errors[worst]:.3g} {unit} RMS, where "
+        f"it varies by {figures['torque_deviation_Nm'][worst]:.3g} {unit}"
+    )
 
 
 def _lines(figures: dict[str, Any]) -> list[str]:

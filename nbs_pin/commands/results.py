@@ -6,6 +6,7 @@ import hashlib
 import inspect
 import json
 import re
+import shlex
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ from nbs_pin.robots.robot import Robot
 
 SUMMARY = "summary.json"
 _MOST_FOLDERS = 1000
-_NO_SETTINGS = ("out", "resume", "force")
+_NO_SETTINGS = ("out", "resume", "force", "verbose")
 
 
 @dataclass(frozen=True)
@@ -125,11 +126,29 @@ class Results:
             summary = summary_text(self.facts | more | {"figures": figures})
             (draft / SUMMARY).write_text(summary, encoding="utf-8")
 
-    def show(self, console: Console, names: Iterable[str]) -> None:
-        """Print the paths of the results that exist, one per line."""
+    def show(self, console: Console, names: Iterable[str], *following: str | Path) -> None:
+        """Print the paths of the results that exist, one per line, and the arguments of a command to go on with."""
         for name in names:
             if (self.folder / name).exists():
                 console.print(str(self.folder / name), soft_wrap=True, highlight=False, markup=False)
+        if following:
+            console.print(next_step(*following), soft_wrap=True, highlight=False, markup=False)
+
+
+def next_step(*arguments: str | Path) -> str:
+    """The line that names the next command, as it can be typed."""
+    return f"next: nbs-pin {shlex.join(map(str, arguments))}"
+
+
+def tell(
+    console: Console, verdict: str, lines: Iterable[str] = (), tables: Iterable[Table] = (), *, verbose: bool
+) -> None:
+    """Print the verdict, the tables if the user wants them, and the lines that qualify the verdict."""
+    console.print(Text(verdict, style="bold"), soft_wrap=True)
+    for shown in tables if verbose else ():
+        console.print(shown)
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from nbs_pin.base.units import TURNING, units, with_units
 from nbs_pin.cli.robots import Robots
+from nbs_pin.commands.results import next_step
 from nbs_pin.robots.catalogue import ROBOT_NAMES
 from nbs_pin.robots.robot import Robot, load_robot
 
@@ -47,6 +48,7 @@ def run(options: Robots, console: Console, notes: Console) -> None:
         highlight=False,
         markup=False,
     )
+    console.print(next_step("track", "panda"), highlight=False)
 
 
 def _show(robot: Robot, console: Console) -> None:

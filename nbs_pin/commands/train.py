@@ -12,7 +12,7 @@ from nbs_pin.base.units import by_quantity, several
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import plain_numbers
 from nbs_pin.commands.inputs import arm_of, law_of
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table
+from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import Sinusoid, check_reference
@@ -54,8 +54,10 @@ def run(options: Train, console: Console, notes: Console) -> None:
         interrupted = result.training.stopped == "interrupted"
         with notes.status(f"drawing the picture into {folder}"):
             found = write_results(result, results, interrupted=interrupted)
-    _print(console, f"{robot.name}, {options.controller}", found)
-    results.show(console, FILES)
+    _print(console, f"{robot.name}, {options.controller}", found, verbose=options.verbose)
+    resumed = ("train", options.robot, "--resume", "--out", results.folder)
+    tracked = ("track", options.robot, "--controller", results.folder / FILES[0], "--period", f"{options.period:g}")
+    results.show(console, FILES, *(resumed if interrupted else tracked))
     if interrupted:
         raise KeyboardInterrupt
 
@@ -156,8 +158,8 @@ def write_results(result: Trained, results: Results, *, interrupted: bool) -> di
     return numbers
 
 
-def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
-    """Print a row per figure, before and after training; `figures` from the function of that name."""
+def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool) -> None:
+    """Print the gain, and a row per figure, before and after training; `figures` from the function of that name."""
     shown = table(title, "before", "after", first="")
     for name in ("training", "held-out"):
         costs = figures[f"{name.replace('-', '_')}_cost"]
@@ -173,16 +175,23 @@ def _print(console: Console, title: str, figures: dict[str, Any]) -> None:
         Text(f"RMS torque [{figures['units']['torque']}]"), *(_number(on["rms_torque_Nm"], ".4g") for on in both)
     )
     shown.add_row(Text("some joint at its limit"), *(_number(on["saturated_fraction"], ".2%") for on in both))
-    console.print(shown)
     ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
-    for line in (
-        f"held-out cost lowered by {_number(figures['held_out_cost_lowered_by'], '.1%')}; "
+    before, after = (_seconds(on["convergence_time_median_s"]) for on in both)
+    verdict = (
+        f"{title}: held-out cost lowered by {_number(figures['held_out_cost_lowered_by'], '.1%')}; half of the fresh "
+        f"starts have converged after {after}, {before} before training"
+    )
+    lines = (
         f"converged means ‖error‖ < 0.1 {figures['units']['position']} to the end, "
         f"over {figures['fresh_starts']} fresh starts",
         f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
         f"the best after {figures['best_epoch']}",
-    ):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    )
+    tell(console, verdict, lines, [shown], verbose=verbose)
+
+
+def _seconds(time: float | None) -> str:
+    return "no time" if time is None else f"{time:.3f} s"
 
 
 def _number(value: float | None, form: str) -> str:

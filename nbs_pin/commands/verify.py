@@ -7,6 +7,7 @@ from rich.text import Text
 
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.verify import Verify
+from nbs_pin.commands.results import tell
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.verification.stated import FALSE, OPEN, TAKEN, VERIFIED
 from nbs_pin.verification.verify import Verification, verify
@@ -24,10 +25,9 @@ def run(options: Verify, console: Console, notes: Console) -> int:
     with notes.status(f"checking {options.certificate}"):
         robot = None if options.robot is None else load_robot(options.robot)
         found = verify(options.certificate, urdf=options.urdf, robot=robot)
-    for status, title in _TITLES.items():
-        if any(check.status == status for check in found.checks):
-            console.print(_table(title, found, status))
-    console.print(_verdict(found), highlight=False, markup=False, soft_wrap=True)
+    shown = _TITLES if options.verbose else (FALSE, OPEN)
+    present = [status for status in shown if any(check.status == status for check in found.checks)]
+    tell(console, _verdict(found), (), [_table(_TITLES[status], found, status) for status in present], verbose=True)
     return 0 if found.confirmed else NO_PROMISE
 
 

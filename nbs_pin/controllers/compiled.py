@@ -1,5 +1,6 @@
 """Control laws as machine code: the same torque in microseconds."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -7,11 +8,12 @@ import numpy as np
 from nbs_pin.base.arrays import Array, Vectors, as_vectors, finite_result, is_torch_array
 from nbs_pin.base.checks import all_finite
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import joints_told
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.kernels.laws import compile_laws, compile_tree_law, law_signals, law_workspace, pack_tree_law, tree_law
-from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.layout import LAW, LawCode, Packed
 from nbs_pin.kernels.threads import Scratch, over_cores
 
 
@@ -58,6 +60,11 @@ class CompiledController(MemorylessController):
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """The constants and weights that it was made of, as arrays."""
         return self.law
+
+    def _facts(self) -> Iterable[str]:
+        law = LawCode(int(self.law.layout[LAW])).name.lower().replace("_", " ")
+        arm = () if self.dynamics.robot is None else (self.dynamics.robot.name,)
+        return law, *arm, joints_told(self.nv), f"model {type(self.dynamics).__name__}"
 
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:
         """τ [N·m]; arguments (..., nv), fastest as contiguous float64 vectors (nv,).

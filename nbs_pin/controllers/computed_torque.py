@@ -1,10 +1,13 @@
 """Computed torque: inverse dynamics with linear error dynamics."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from nbs_pin.base.arguments import BANDWIDTH, PERIOD, checked, maybe
 from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors, finite_result
 from nbs_pin.base.known_code import known_code
+from nbs_pin.base.shown import spread
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.gains import (
     PerJoint,
@@ -66,6 +69,9 @@ class ComputedTorque(ModelLaw):
         warn_if_too_fast(robot, dynamics, 2.0 * bandwidth)
         kp = np.maximum(4.0 * bandwidth**2, gains.stiffness / largest_inertia(robot, dynamics))
         return cls(dynamics, kp=kp, kd=2.0 * np.sqrt(kp), friction=friction)
+
+    def _gains_told(self) -> Iterable[str]:
+        return spread("k_p", self.kp, "1/s²"), spread("k_d", self.kd, "1/s")
 
     @property
     def kp(self) -> JointArray:

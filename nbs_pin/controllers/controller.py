@@ -1,6 +1,7 @@
 """The interface of all controllers: memory and state in, torque and memory out."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +12,22 @@ from nbs_pin.base.arrays import Array, Vectors
 from nbs_pin.base.checks import PerJoint, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import Shown, joints_told
 from nbs_pin.controllers.exported import export_law
 from nbs_pin.export.reals import Precision
 from nbs_pin.kernels.layout import Packed
 
 
-class Controller(ABC):
+class Controller(Shown, ABC):
     """A tracking law, evaluated once per control period; its memory is a value that the caller keeps."""
 
     @property
     @abstractmethod
     def nv(self) -> int:
         """Number of joints."""
+
+    def _facts(self) -> Iterable[str]:
+        return (joints_told(self.nv),)
 
     @abstractmethod
     def initial_memory(self, q: Vectors) -> Any:

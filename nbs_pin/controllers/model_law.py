@@ -1,5 +1,6 @@
 """Base of all laws with a model of the arm: model, friction feed-forward, parameters and compiled form."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from torch import nn
@@ -7,6 +8,7 @@ from torch import nn
 from nbs_pin.base.arguments import checked, flag
 from nbs_pin.base.arrays import Array
 from nbs_pin.base.known_code import defines
+from nbs_pin.base.shown import joints_told
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import Controller, MemorylessController
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
@@ -34,6 +36,15 @@ class ModelLaw(MemorylessController, nn.Module):
     def nv(self) -> int:
         """Number of joints."""
         return self.dynamics.nv
+
+    def _facts(self) -> Iterable[str]:
+        arm = () if self.dynamics.robot is None else (self.dynamics.robot.name,)
+        friction = () if self.friction is None else ("with friction",)
+        return *arm, joints_told(self.nv), f"model {type(self.dynamics).__name__}", *self._gains_told(), *friction
+
+    def _gains_told(self) -> Iterable[str]:
+        """The ranges of the gains, for `_facts`."""
+        return ()
 
     @property
     def packable(self) -> bool:

@@ -1,7 +1,7 @@
 """The neural backstepping (NBS) law: tracking that is stable for every value of its network weights."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, as_vectors
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import first_foreign, known_code
+from nbs_pin.base.shown import spread
 from nbs_pin.base.storable import Tensors, storable
 from nbs_pin.base.tensors import positive_scale
 from nbs_pin.controllers.damping import Damping
@@ -178,6 +179,11 @@ class NeuralBackstepping(LyapunovLaw):
         tau = feedforward - e.gradient - self.damping.force(e.z2)
         tau = tau if self.friction is None else tau + self.friction.torque(e.v_r)
         return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
+
+    def _gains_told(self) -> Iterable[str]:
+        stiffness, rate = 2.0 * np.diagonal(self.potential.stiffness.numpy()), self.rate.numpy()
+        told = spread("Λ", rate, "rad/s per N·m"), spread("K", stiffness, "N·m/rad")
+        return f"ω = {self.inertial_rate:.3g} rad/s", *told
 
     def potential_terms(self, z1: Array, dz: Array) -> tuple[Array, Array, Array]:
         """Φ(z1) [J], ∇Φ(z1) [N·m] and ∇²Φ(z1) dz of the potential network."""

@@ -1,8 +1,11 @@
 """PD control with a model: gravity compensation or PD+ feedforward."""
 
+from collections.abc import Iterable
+
 from nbs_pin.base.arguments import BANDWIDTH, PERIOD, checked, choice, maybe
 from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors, finite_result
 from nbs_pin.base.known_code import known_code
+from nbs_pin.base.shown import spread
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, stored_gains
 from nbs_pin.controllers.model_law import ModelLaw
@@ -73,6 +76,9 @@ class PD(ModelLaw):
         dynamics = PinocchioDynamics(robot) if dynamics is None else dynamics
         kp, kd = pd_gains(robot, dynamics, bandwidth=bandwidth, period=period)
         return cls(dynamics, feedforward=feedforward, kp=kp, kd=kd, friction=friction)
+
+    def _gains_told(self) -> Iterable[str]:
+        return spread("K_p", self.kp, "N·m/rad"), spread("K_d", self.kd, "N·m·s/rad")
 
     @property
     def kp(self) -> JointArray:

@@ -1,5 +1,6 @@
 """PID control of each joint without a model, as in industrial controllers."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import joints_told, spread
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import PerJoint, PositiveGains, pd_gains, stored_gains
@@ -104,6 +106,15 @@ class PID(Controller, nn.Module):
     def nv(self) -> int:
         """Number of joints."""
         return len(self.effort_limit)
+
+    def _facts(self) -> Iterable[str]:
+        arm = () if self.robot is None else (self.robot.name,)
+        gains = (
+            spread("K_p", self.kp, "N·m/rad"),
+            spread("K_i", self.ki, "N·m/(rad·s)"),
+            spread("K_d", self.kd, "N·m·s/rad"),
+        )
+        return *arm, joints_told(self.nv), *gains
 
     @property
     def kp(self) -> JointArray:

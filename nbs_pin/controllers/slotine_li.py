@@ -1,5 +1,7 @@
 """The passivity-based law of Slotine and Li with a known model."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float
 
@@ -8,6 +10,7 @@ from nbs_pin.base.arrays import Array, JointArray, Matrices, Vectors, array_name
 from nbs_pin.base.claims import Claim, known
 from nbs_pin.base.intervals import Interval
 from nbs_pin.base.known_code import foreign_code, known_code
+from nbs_pin.base.shown import spread
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.gains import (
     PerJoint,
@@ -73,6 +76,9 @@ class SlotineLi(LyapunovLaw):
         warn_if_too_fast(robot, dynamics, bandwidth)
         gain = np.minimum(gains.stiffness / bandwidth, 0.5 * effective_inertia(robot, dynamics) / period)
         return cls(dynamics, rate=np.full(robot.nv, bandwidth), gain=gain, friction=friction)
+
+    def _gains_told(self) -> Iterable[str]:
+        return spread("λ", self.rate, "1/s"), spread("K", self.gain, "N·m·s/rad")
 
     @property
     def rate(self) -> JointArray:

@@ -1,7 +1,7 @@
 """A learned Lagrangian as a dynamics model, for numpy arrays and torch tensors."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any
 
@@ -68,6 +68,9 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
     def nv(self) -> int:
         """Number of joints."""
         return self.network.nv
+
+    def _facts(self) -> Iterable[str]:
+        return type(self.network).__name__, *super()._facts(), f"{sum(x.numel() for x in self.parameters())} numbers"
 
     @property
     def robot(self) -> Robot | None:

@@ -1,15 +1,17 @@
 """The interface of all dynamics models: M, C, G and V, from which the equations of motion follow."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 
 from nbs_pin.base.arguments import a, checked
 from nbs_pin.base.arrays import Matrices, Scalars, Vectors, array_namespace, as_vectors, finite_result, matvec
+from nbs_pin.base.shown import Shown, joints_told
 from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 
 
-class DynamicsProvider(ABC):
+class DynamicsProvider(Shown, ABC):
     """M(q) v̇ + C(q, v) v + G(q) = τ with M ≻ 0, G = +∂V/∂q and C the Christoffel matrix of M (docs/theory.md §1).
 
     Subclasses implement the abstract methods. Arrays may have leading batch axes; numpy arrays give numpy arrays, and
@@ -26,6 +28,10 @@ class DynamicsProvider(ABC):
     def robot(self) -> Robot | None:
         """The arm that this model describes, or None for a model without a URDF."""
         return None
+
+    def _facts(self) -> Iterable[str]:
+        arm = () if self.robot is None else (self.robot.name,)
+        return *arm, joints_told(self.nv)
 
     @abstractmethod
     def mass_matrix(self, q: Vectors) -> Matrices:

@@ -1,7 +1,7 @@
 """Datasets: measured states, accelerations and torques of an arm, sorted into trajectories."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +16,7 @@ from nbs_pin.base.checks import LARGEST, floats, is_usual, told
 from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
+from nbs_pin.base.shown import Shown, joints_told
 
 DATASET_FORMAT = "nbs_pin dataset 1"
 """Value of the `format` entry of a data file."""
@@ -27,8 +28,8 @@ _KINDS: dict[tuple[str, ...], type] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Dataset:
+@dataclass(frozen=True, eq=False, repr=False)
+class Dataset(Shown):
     """Samples of an arm in motion; row k of every array belongs to the same instant.
 
     The samples of a trajectory are contiguous and in the order of time. They are correlated, so `split` holds out whole
@@ -45,7 +46,7 @@ class Dataset:
         >>> t = np.linspace(0.0, 1.0, 50)
         >>> q, v, a = (x[:, None] for x in (np.sin(t), np.cos(t), -np.sin(t)))
         >>> nbs.Dataset(q, v, a, 2.0 * a, t, trajectory=np.arange(50) // 25, parents=[0], prismatic=[False])
-        Dataset(50 samples, 2 trajectories, 1 joints)
+        Dataset(50 samples, 2 trajectories, 1 joint)
     """
 
     q: Float[np.ndarray, "samples n"]
@@ -81,9 +82,9 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.t)
 
-    def __repr__(self) -> str:
+    def _facts(self) -> Iterable[str]:
         of = f" of {self.robot}" if self.robot else ""
-        return f"Dataset({len(self)} samples{of}, {self.trajectories} trajectories, {self.nv} joints)"
+        return f"{len(self)} samples{of}", f"{self.trajectories} trajectories", joints_told(self.nv)
 
     @property
     def nv(self) -> int:

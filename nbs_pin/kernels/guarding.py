@@ -209,16 +209,7 @@ def _braked(t: float, q: Vec, s: Part, c: Part) -> None:
 
 @exact_kernel
 def admit(
-    config: Vec,
-    state: Vec,
-    t: float,
-    fresh: bool,
-    overrun: bool,
-    q: Vec,
-    v: Vec,
-    q_ref: Vec,
-    v_ref: Vec,
-    external: Vec,
+    config: Vec, state: Vec, t: float, fresh: bool, overrun: bool, q: Vec, v: Vec, q_ref: Vec, v_ref: Vec, external: Vec
 ) -> int:
     """What is to be computed at this instant: COMPUTE, HOLD, BRAKE or RELEASE.
 

@@ -1,7 +1,7 @@
 """Desired motions from samples and from files: a C² spline with exact derivatives, held constant beyond its ends."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,7 @@ from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import Shown, joints_told
 from nbs_pin.base.units import units
 from nbs_pin.motions.recordings import (
     Joints,
@@ -40,8 +41,8 @@ _APART = 2.0  # times the steps beside it is what an outlier departs from both n
 _MISREAD = 0.1  # tolerance of a stated velocity against dq/dt, relative to the joint's largest speed
 
 
-@dataclass(frozen=True, eq=False)
-class Sampled:
+@dataclass(frozen=True, eq=False, repr=False)
+class Sampled(Shown):
     """The not-a-knot cubic spline through samples q (k, n) [rad] at increasing times t (k,) [s].
 
     q is C², and v and a are its exact derivatives. Before the first and after the last sample, q is held with
@@ -66,6 +67,9 @@ class Sampled:
             raise ArgumentError(f"samples of a reference: {fault}.")
         object.__setattr__(self, "t", t)
         object.__setattr__(self, "q", q)
+
+    def _facts(self) -> Iterable[str]:
+        return joints_told(self.q.shape[1]), f"{len(self.t)} samples", f"{self.t[0]:.4g} to {self.t[-1]:.4g} s"
 
     @property
     def duration(self) -> float:

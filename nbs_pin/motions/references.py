@@ -3,7 +3,7 @@
 t is a time [s], giving shapes (n,), or an array of times, giving shapes (..., n); `simulate` takes any such callable.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -15,6 +15,7 @@ from nbs_pin.base.checks import LARGEST, SMALLEST, PerJoint, floats, is_usual, p
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import Shown, joints_told, spread
 from nbs_pin.base.units import units
 from nbs_pin.robots.robot import ARM, Robot
 
@@ -70,8 +71,8 @@ def instants(t: Any) -> np.ndarray:
     return array
 
 
-@dataclass(frozen=True, eq=False)
-class Sinusoid:
+@dataclass(frozen=True, eq=False, repr=False)
+class Sinusoid(Shown):
     """q = offset + amplitude·sin(frequency·t + phase), each one number or one per joint.
 
     amplitude, offset and phase [rad]; frequency [rad/s]. Numbers alone give the motion of one joint.
@@ -105,6 +106,10 @@ class Sinusoid:
         span = np.minimum(robot.upper - robot.lower, 2.0 * np.pi)
         reach = np.minimum.reduce([np.full(robot.nv, amplitude), 0.25 * span, 0.5 * robot.velocity_limit / frequency])
         return cls(reach, frequency, 0.5 * np.pi * (np.arange(robot.nv) % 2), resting_posture(robot))
+
+    def _facts(self) -> Iterable[str]:
+        ranges = spread("amplitude", self.amplitude, "rad"), spread("frequency", self.frequency, "rad/s")
+        return joints_told(np.size(self.amplitude)), *ranges
 
     @property
     def largest_jerk(self) -> np.ndarray:
@@ -167,8 +172,8 @@ class Hold:
         return Reference(zero + q, zero, zero.copy())
 
 
-@dataclass(frozen=True, eq=False)
-class MinimumJerk:
+@dataclass(frozen=True, eq=False, repr=False)
+class MinimumJerk(Shown):
     """Motion through waypoints, at rest at each: quintics 10s³ − 15s⁴ + 6s⁵, which minimise the integral of jerk².
 
     waypoints (k, n) [rad] are reached at increasing times (k,) [s]; q is held before the first and after the last.
@@ -197,6 +202,10 @@ class MinimumJerk:
             raise ArgumentError(f"times must increase, but times[{k + 1}] = {times[k + 1]} ≤ {times[k]}; correct them.")
         object.__setattr__(self, "waypoints", waypoints)
         object.__setattr__(self, "times", times)
+
+    def _facts(self) -> Iterable[str]:
+        joints = joints_told(self.waypoints.shape[1])
+        return joints, f"{len(self.times)} waypoints", f"{self.times[0]:.4g} to {self.times[-1]:.4g} s"
 
     @property
     def duration(self) -> float:

@@ -1,5 +1,6 @@
 """Motions of joints that lead a frame along a path of the tool, and when."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from nbs_pin.base.checks import PerJoint, vector_of
 from nbs_pin.base.doors import BLANK, argument, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import Shown
 from nbs_pin.base.units import units
 from nbs_pin.motions.inverse_kinematics import InverseKinematics
 from nbs_pin.motions.joint_paths import JointPath, joint_path
@@ -28,8 +30,8 @@ DURATION_OF_PATH = 5.0
 _INSTANTS = 2001
 
 
-@dataclass(frozen=True, eq=False)
-class ToolMotion:
+@dataclass(frozen=True, eq=False, repr=False)
+class ToolMotion(Shown):
     """q(s(t)) of an arm whose frame follows a path; v = q'ṡ and a = q''ṡ² + q's̈ are its exact derivatives.
 
     It rests at the beginning before t = 0 and at the end after `duration`. Made by `tool_motion`.
@@ -43,6 +45,9 @@ class ToolMotion:
     """Orientation where the path states none: that of the posture."""
     held: bool
     """Whether the orientation is that of the path, or of the beginning; otherwise it is free."""
+
+    def _facts(self) -> Iterable[str]:
+        return repr(self.frame), repr(self.path), f"{self.duration:.4g} s"
 
     @property
     def duration(self) -> float:

@@ -4,7 +4,7 @@ A path is a curve over s from 0 to 1 in the base frame of the arm. How its joint
 `tool_motions.py`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,8 @@ from nbs_pin.base.arguments import checked, either, maybe, number, numbers, numb
 from nbs_pin.base.checks import told
 from nbs_pin.base.doors import argument
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import Shown
+from nbs_pin.base.units import measured
 
 _PLANES = {"xy": (0.0, 0.0, 1.0), "xz": (0.0, -1.0, 0.0), "yz": (1.0, 0.0, 0.0)}
 _SAMPLES = 2001
@@ -38,8 +40,8 @@ def _plane(name: str, value: Any) -> np.ndarray:
     return np.asarray(normal / np.linalg.norm(normal))
 
 
-@dataclass(frozen=True, eq=False)
-class ToolPath:
+@dataclass(frozen=True, eq=False, repr=False)
+class ToolPath(Shown):
     """A path of a frame of an arm: positions, and orientations if the path states them.
 
     It is made by `circle`, `line`, `through` or `load`. Curves are at least twice continuously differentiable in s.
@@ -53,6 +55,9 @@ class ToolPath:
     """Rotation matrix at s: shape (...) to (..., 3, 3); None leaves the orientation to the motion."""
     duration: float | None = None
     """Time that a path with times takes, t = s · duration [s]; None for a path without."""
+
+    def _facts(self) -> Iterable[str]:
+        return self.name, measured(self.length, "m")
 
     @property
     def length(self) -> float:

@@ -61,6 +61,19 @@ class Scale(NamedTuple):
     poses: certificate_poses.Scale = certificate_poses.Scale()
 
 
+QUICK = Scale(
+    arms=("two_link",),
+    moduli=(1.0,),
+    dampings=(1.0,),
+    random=50,
+    family=20,
+    longest=300,
+    rounds=2,
+    poses=certificate_poses.Scale(("two_link", "panda"), samples=2_000, climbs=6),
+)
+"""To see the page in a minute; its figures are not those of the study."""
+
+
 class Row(NamedTuple):
     """One law, its bound and the worst errors found."""
 
@@ -99,16 +112,17 @@ class Case(NamedTuple):
 
 def reproduce_certificates(
     folder: Path, seed: int = 0, progress: bool = False, scale: Scale | None = None
-) -> list[Section]:
-    """Run the study, write `FILES` into the folder and return the sections of the page."""
+) -> Iterator[Section]:
+    """Run the study, write `FILES` into the folder and yield the sections of the page, each once it is done."""
     scale = scale or Scale()
     cases = [*one_joint_cases(scale, seed), *arm_cases(scale, seed)]
     rows: list[Row] = []
     for case in tracked(cases, lambda: f"certificates: {cases[min(len(rows), len(cases) - 1)].law}", progress):
         rows.append(held(case, scale, seed))
+    yield _section(rows, scale, seed, folder)
+    yield _counterexample(scale)
     poses = certificate_poses.study(scale.poses, seed, progress)
-    sections = [_section(rows, scale, seed, folder), _counterexample(scale)]
-    return [*sections, certificate_poses.section(poses, scale.poses, folder)]
+    yield certificate_poses.section(poses, scale.poses, folder)
 
 
 def one_joint() -> Robot:

@@ -1,6 +1,6 @@
 """Control on learned models: MuJoCo with gravity, every law beside the one on the exact model; the paper's Figure 5."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -58,6 +58,10 @@ class Scale(NamedTuple):
     learners: Sequence[passive_data.Learner] = passive_data.LEARNERS
 
 
+QUICK = Scale(samples=500, settle=4.0, turns=0.2, seeds=1, swing=2_000, epochs=10, duration=20.0)
+"""To see the page in a minute; its figures are not those of the study."""
+
+
 class Row(NamedTuple):
     """One law on one reference."""
 
@@ -74,20 +78,23 @@ class Row(NamedTuple):
     peak_torque_Nm: float
 
 
-def reproduce_learned(folder: Path, seed: int = 0, progress: bool = False, scale: Scale | None = None) -> list[Section]:
-    """Run the study, write `FILES` into the folder and return the sections of the page."""
+def reproduce_learned(
+    folder: Path, seed: int = 0, progress: bool = False, scale: Scale | None = None
+) -> Iterator[Section]:
+    """Run the study, write `FILES` into the folder and yield the sections of the page, each once it is done."""
     scale = scale or Scale()
     studied = list(on_all_cores(_on_arm, [(name, scale, seed) for name in ARMS], "control on learned models", progress))
     rows, chains = [row for _, found in studied for row in found], studied[0][0]
+    yield _section(rows, scale, seed, folder)
     seeds = range(seed, seed + scale.seeds)
     passive = passive_data.learn_passively(load_robot(ARMS[0]), seeds, scale.learners, scale.swing, progress)
+    yield passive_data.section(passive, folder)
     learned = {
         "a chain, excited data": chains[CLEAN],
         "cholesky, the paper's swing": passive.models["cholesky", "one swing", seed],
     }
     runs = figure5.follow_again(learned, epochs=scale.epochs, duration=scale.duration, seed=seed, progress=progress)
-    sections = [_section(rows, scale, seed, folder), passive_data.section(passive, folder)]
-    return [*sections, figure5.section(runs, folder)]
+    yield figure5.section(runs, folder)
 
 
 def _on_arm(name: str, scale: Scale, seed: int) -> tuple[dict[str, DynamicsProvider], list[Row]]:

@@ -1,6 +1,6 @@
 """Learned models against the truth: from clean data (in this module), from noisy data, and by their structure."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,16 +44,32 @@ class Scale(NamedTuple):
     """Models, and the settings of `fit` that bound their time."""
 
 
-def reproduce_models(folder: Path, seed: int = 0, progress: bool = False, scale: Scale | None = None) -> list[Section]:
-    """Run the study, write `FILES` into the folder and return the sections of the page."""
+QUICK = Scale(
+    fresh=300,
+    seeds=1,
+    clean_arms=("three_link",),
+    clean_samples=300,
+    noise_arms=("three_link",),
+    noise_seeds=1,
+    noise_samples=(300,),
+    structure_samples=(300,),
+    structures={"chain": {}, "cholesky": {"iterations": 5}, "unconstrained": {"iterations": 5}},
+)
+"""To see the page in a minute; its figures are not those of the study."""
+
+
+def reproduce_models(
+    folder: Path, seed: int = 0, progress: bool = False, scale: Scale | None = None
+) -> Iterator[Section]:
+    """Run the study, write `FILES` into the folder and yield the sections of the page, each once it is done."""
     scale = scale or Scale()
     seeds, noisy_seeds = range(seed, seed + scale.seeds), range(seed, seed + scale.noise_seeds)
     clean = clean_trials(scale.clean_arms, scale.clean_samples, seeds, scale.fresh, progress)
-    sections = [clean_section(clean, folder)]
+    yield clean_section(clean, folder)
     noisy = noise_trials(scale.noise_arms, scale.noise_samples, noisy_seeds, scale.fresh, progress, scale.mlp)
-    sections.append(noise_section(noisy, folder))
+    yield noise_section(noisy, folder)
     structured = structure_trials(scale.structures, scale.structure_samples, seeds, scale.fresh, progress)
-    return [*sections, structure_section(structured, folder)]
+    yield structure_section(structured, folder)
 
 
 def clean_trials(arms: Sequence[str], samples: int, seeds: Sequence[int], fresh: int, progress: bool) -> list[Trial]:

@@ -30,8 +30,14 @@ class Scale(NamedTuple):
     """Duration of every run that is scored [s]."""
 
 
-def reproduce_paper(folder: Path, seed: int = 0, progress: bool = False, scale: Scale | None = None) -> list[Section]:
-    """Run the study, write `FILES` into the folder and return the sections of the page."""
+QUICK = Scale(seeds=2, epochs=20, alphas=5, duration=20.0)
+"""To see the page in half a minute; its figures are not the paper's."""
+
+
+def reproduce_paper(
+    folder: Path, seed: int = 0, progress: bool = False, scale: Scale | None = None
+) -> Iterator[Section]:
+    """Run the study, write `FILES` into the folder and yield the sections of the page, each once it is done."""
     scale = scale or Scale()
     seeds = range(seed, seed + scale.seeds)
     alphas = np.linspace(0.0, 2.0, scale.alphas + 1)[1:]
@@ -39,11 +45,11 @@ def reproduce_paper(folder: Path, seed: int = 0, progress: bool = False, scale: 
         pids, pid_runs = paper_table.pid_rows(scale.duration)
         authors, authors_run = paper_table.authors_rows(seeds, scale.epochs, scale.duration, progress)
         package, package_runs = paper_table.package_rows(seeds, scale.epochs, scale.duration, progress)
+        yield paper_table.section([*pids, *authors, *package], seeds, folder)
+        yield _motions(seeds, authors_run, package_runs, pid_runs, folder)
         flat = paper_alpha.as_printed(alphas, seeds, scale.epochs, scale.duration)
         swept = paper_alpha.sweep(alphas, seed, scale.epochs, scale.duration, progress)
-        motions = _motions(seeds, authors_run, package_runs, pid_runs, folder)
-    table = paper_table.section([*pids, *authors, *package], seeds, folder)
-    return [table, motions, paper_alpha.section(flat, swept, seeds, folder)]
+    yield paper_alpha.section(flat, swept, seeds, folder)
 
 
 @contextmanager

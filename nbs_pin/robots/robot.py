@@ -17,8 +17,9 @@ from nbs_pin.base.arguments import a, checked, mapping, maybe, number, path, tex
 from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors
 from nbs_pin.base.checks import SMALLEST, PerJoint, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import Cells, Shown, joints_told, spread
 from nbs_pin.base.storable import storable
-from nbs_pin.base.units import several, units
+from nbs_pin.base.units import several, units, units_of
 from nbs_pin.robots.catalogue import Entry, find
 from nbs_pin.robots.kinematics import Kinematics
 from nbs_pin.robots.pinocchio_model import build_model, check_inertia, with_limits
@@ -28,7 +29,7 @@ from nbs_pin.robots.urdf_options import layered, read_options
 
 @storable(("name", "source", "options", "sha256", "effort_limit"))
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot(Kinematics):
+class Robot(Shown, Kinematics):
     """A fixed-base arm with nq = nv = n joints, as returned by `load_robot`.
 
     A `continuous` joint is an unbounded revolute joint whose tracking error is wrapped (`difference`); locked joints
@@ -56,8 +57,17 @@ class Robot(Kinematics):
         """Number of joints."""
         return int(self.model.nv)
 
-    def __repr__(self) -> str:
-        return f"Robot({self.name!r}, {self.nv} joints)"
+    def _facts(self) -> Iterable[str]:
+        mass, kinds = sum(body.mass for body in self.model.inertias), units("torque", self.prismatic)
+        efforts = (spread("", self.effort_limit[[kind == unit for kind in kinds]], unit) for unit in sorted({*kinds}))
+        return repr(self.name), joints_told(self.nv), f"{mass:.3g} kg", f"effort{' and'.join(efforts)}"
+
+    def _cells(self) -> Cells:
+        of = zip(self.joints, units_of(self.prismatic), strict=True)
+        rows = [(joint.name, f"{joint.lower:.3g} to {joint.upper:.3g} {unit.position}",
+                 f"{joint.velocity:.3g} {unit.velocity}", f"{joint.effort:.3g} {unit.torque}")
+                for joint, unit in of]  # fmt: skip
+        return Cells(("joint", "position", "velocity", "effort"), rows)
 
     @cached_property
     def joints(self) -> tuple[JointData, ...]:

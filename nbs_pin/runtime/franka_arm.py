@@ -49,7 +49,9 @@ class FrankaArm:
         try:
             self._robot = self._franka.Robot(host, config.kEnforce if real_time else config.kIgnore)
         except Exception as error:  # the client's exceptions have no common base but Exception
-            raise ArgumentError(f"no Franka arm answers at '{host}' ({error}); check address, cable and FCI.") from error
+            raise ArgumentError(
+                f"no Franka arm answers at '{host}' ({error}); check address, cable and FCI."
+            ) from error
         self._recover, self._fault = recover, ""
         self._control: Any = None
         self._last: Sample | None = None

@@ -1,5 +1,6 @@
 """A plant from a dynamics model, integrated in time."""
 
+from collections.abc import Iterable
 from functools import partial
 
 import numpy as np
@@ -70,8 +71,8 @@ class DynamicsPlant(Plant):
         friction = JointFriction.of(robot) if joint_friction == "keep" else None
         return cls(PinocchioDynamics(robot), integrator or "rk4", friction)
 
-    def __repr__(self) -> str:
-        return f"DynamicsPlant({type(self.dynamics).__name__}, {self.integrator})"
+    def _facts(self) -> Iterable[str]:
+        return type(self.dynamics).__name__, self.integrator
 
     @property
     def nv(self) -> int:

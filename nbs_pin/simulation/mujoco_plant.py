@@ -3,7 +3,7 @@
 import logging
 import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Literal, TypeAlias
 
@@ -110,9 +110,9 @@ class MujocoPlant(Plant):
         mujoco.set_mju_user_warning(_LOGGER.info)
         self._bind()
 
-    def __repr__(self) -> str:
-        stops = ", joint_stops=keep" if self.joint_stops == "keep" else ""
-        return f"MujocoPlant({self._robot.name}, {self.integrator}, joint_friction={self.joint_friction}{stops})"
+    def _facts(self) -> Iterable[str]:
+        stops = ("joint_stops=keep",) if self.joint_stops == "keep" else ()
+        return self._robot.name, self.integrator, f"joint_friction={self.joint_friction}", *stops
 
     @property
     def nv(self) -> int:

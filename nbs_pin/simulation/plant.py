@@ -1,13 +1,15 @@
 """The interface of all plants: the simulated arm on which a controller acts."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 
 from nbs_pin.base.arguments import a
 from nbs_pin.base.arrays import Vectors
+from nbs_pin.base.shown import Shown, joints_told
 from nbs_pin.robots.robot import Robot
 
 
-class Plant(ABC):
+class Plant(Shown, ABC):
     """A mechanical system driven by joint torques; it keeps no state between calls."""
 
     @property
@@ -19,6 +21,9 @@ class Plant(ABC):
     @abstractmethod
     def robot(self) -> Robot | None:
         """The simulated arm, or None for a plant without a URDF."""
+
+    def _facts(self) -> Iterable[str]:
+        return (joints_told(self.nv) if self.robot is None else self.robot.name,)
 
     @abstractmethod
     def step(self, q: Vectors, v: Vectors, tau: Vectors, duration: float) -> tuple[Vectors, Vectors]:

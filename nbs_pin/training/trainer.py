@@ -3,7 +3,7 @@
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -16,6 +16,7 @@ from nbs_pin.base.arguments import called
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.progress import tracked, waiting
+from nbs_pin.base.shown import Shown
 from nbs_pin.controllers.gain import Gain
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.simulation.costs import StageCost
@@ -32,8 +33,8 @@ SAVE_EVERY = 10
 """Epochs between two checkpoints."""
 
 
-@dataclass(frozen=True, eq=False)
-class Training:
+@dataclass(frozen=True, eq=False, repr=False)
+class Training(Shown):
     """Result of a training."""
 
     controller: Any
@@ -48,6 +49,11 @@ class Training:
     """Why the training ended."""
     seconds: float
     """Wall time, including that before a resume [s]."""
+
+    def _facts(self) -> Iterable[str]:
+        cost = self.held_out if len(self.held_out) else self.history
+        lowered = f"cost {cost[0]:.3g} to {cost[self.best_epoch]:.3g}" if len(cost) > self.best_epoch else "no epoch"
+        return type(self.controller).__name__, lowered, f"best epoch {self.best_epoch}", f"{self.seconds:.3g} s"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,103 @@
+"""`nbs-pin track` with several laws: each follows the same motion, one table and one picture of all."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from nbs_pin.base.units import measured, several
+from nbs_pin.cli.track import Track
+from nbs_pin.cli.values import SAVED, OptionError
+from nbs_pin.commands.following import Tracked, figures, not_simulated, track
+from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table, tell
+from nbs_pin.reports.law_charts import plot_laws
+from nbs_pin.robots.robot import Robot
+
+PICTURE = "comparison.png"
+
+
+def track_laws(
+    options: Track, robot: Robot, given: Mapping[str, Any], results: Results, console: Console, notes: Console
+) -> None:
+    """Track with every law, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
+    laws = _named(options.controller)
+    results.facts["settings"] |= {f"{name}_sha256": sha256_of(Path(law)) for name, law in laws.items() if law != name}
+    files = {name: f"run-{name}.npz" for name in laws}
+    results = results.check((*files.values(), PICTURE, SUMMARY), options.force, whole={"interrupted": False})
+    done: dict[str, Tracked] = {}
+    with results.made() as folder:
+        for name, law in laws.items():
+            try:
+                done[name] = track(robot, **{**given, "controller": law}, progress=True)
+            except KeyboardInterrupt:
+                if not done:
+                    raise
+                break
+            done[name].run.info.update(reference=options.reference, **results.facts)
+            if done[name].interrupted:
+                break
+        interrupted = len(done) < len(laws) or any(tracked.interrupted for tracked in done.values())
+        found: dict[str, Any] = {"laws": {name: figures(tracked.run, robot) for name, tracked in done.items()}}
+        found["not_simulated"] = not_simulated(robot, options.joint_friction)
+        earlier = [path.name for path in folder.glob("run-*.npz")]
+        with notes.status(f"writing runs and picture into {folder}"):
+            with results.replaced((*files.values(), *earlier, PICTURE), found, interrupted=interrupted) as draft:
+                for name, tracked in done.items():
+                    tracked.run.save(draft / files[name])
+            with drawing(folder / PICTURE) as path:
+                title = f"{robot.name} · {options.reference} · {1e3 * options.period:g} ms · {options.plant}"
+                plot_laws({name: tracked.run for name, tracked in done.items()}, path, title=title)
+    shown = [_table(found["laws"])]
+    left_out = [f"not simulated: {'; '.join(found['not_simulated'])}"] if found["not_simulated"] else []
+    tell(console, _verdict(robot.name, found["laws"]), left_out, shown, verbose=True)
+    results.show(console, (*files.values(), PICTURE, SUMMARY), "replay", folder / files[next(iter(done))], "--open")
+    if interrupted:
+        raise KeyboardInterrupt
+
+
+def _named(text: str) -> dict[str, str]:
+    """The laws by what they are called here: by name, or by the name of their file."""
+    laws = {Path(law).stem if law.endswith(SAVED) else law: law for law in text.split(",")}
+    if len(laws) < len(text.split(",")):
+        raise OptionError(f"--controller is '{text}', where two laws have one name; rename a file.")
+    return laws
+
+
+def _late(found: Mapping[str, Any]) -> tuple[float, str, str]:
+    """The largest RMS error of a joint in the last 30 %, with its unit, and the joint."""
+    of = zip(found["rms_error_last_30_percent_rad"], found["units"]["position"], found["joints"], strict=True)
+    return max(of)
+
+
+def _verdict(arm: str, found: Mapping[str, Mapping[str, Any]]) -> str:
+    """Which law is off the least in the end, beside the others that follow the motion."""
+    following = [name for name, of in found.items() if of["convergence_time_s"] is not None]
+    if not following:
+        return f"{arm}: none of {', '.join(found)} follows the motion"
+    least, *others = sorted(following, key=lambda name: _late(found[name]))
+    told = (
+        f"{arm}: {least} is off the least, {measured(*_late(found[least])[:2])} RMS in the last 30 % at its worst joint"
+    )
+    return "; ".join([told, *(f"{name} {measured(*_late(found[name])[:2])}" for name in others)])
+
+
+def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
+    """A row per law."""
+    force = several(next(iter(found.values()))["units"]["torque"])
+    shown = table(
+        "laws on one motion",
+        "near from",
+        "worst joint, RMS\nin the last 30 %",
+        f"peak\n[{force}]",
+        "saturated",
+        first="law",
+    )
+    for name, of in found.items():
+        error, unit, _ = _late(of)
+        near = "never" if of["convergence_time_s"] is None else f"{of['convergence_time_s']:.3f} s"
+        cells = near, measured(error, unit), f"{of['peak_torque_Nm']:.4g}", f"{of['saturated_fraction']:.2%}"
+        shown.add_row(Text(name), *cells)
+    return shown

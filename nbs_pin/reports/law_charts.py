@@ -1,0 +1,43 @@
+"""A picture of several laws on one motion."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nbs_pin.base.records import Run
+from nbs_pin.base.units import several
+from nbs_pin.reports.plotting import ACTUAL, ERROR, FAST, LIMIT, REFERENCE, TORQUE, picture, thin
+from nbs_pin.simulation.metrics import squared_error
+
+_COLOURS = (ACTUAL, REFERENCE, TORQUE, FAST, ERROR, "#8c564b", "#17a2b8", "#6c757d")
+_DASHES = ("solid", (0, (5, 2)), (0, (1, 1.2)))
+
+
+def plot_laws(runs: Mapping[str, Run], path: str | Path, *, title: str = "") -> Path:
+    """Plot the error and the torque of several laws on one motion and write the picture (PNG); returns its path.
+
+    Left: ‖z1‖ over time, logarithmic. Right: the largest |τ_i| over the joints, as a share of its effort limit, where
+    the arm has limits.
+    """
+    first = next(iter(runs.values()))
+    with picture(path, 11.0, 4.2) as figure:
+        errors, torques = figure.subplots(1, 2)
+        limited = bool(np.isfinite(first.effort_limit).any())
+        for k, (name, run) in enumerate(runs.items()):
+            style = {"color": _COLOURS[k % len(_COLOURS)], "linestyle": _DASHES[k // len(_COLOURS) % len(_DASHES)]}
+            error = np.sqrt(squared_error(run))
+            errors.semilogy(*thin(run.t, np.where(error > 0.0, error, np.nan)), label=name, linewidth=1.0, **style)
+            share = np.abs(run.tau) / (run.effort_limit if limited else 1.0)
+            torques.plot(*thin(run.t, share.max(axis=-1)), label=name, linewidth=1.0, **style)
+        if limited:
+            torques.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
+        force = several(of.torque for of in first.units)
+        told = "largest torque of a joint ÷ its effort limit" if limited else f"largest torque of a joint [{force}]"
+        torques.set_title(told, loc="left")
+        errors.set_title(f"‖error‖ [{several(of.position for of in first.units)}]", loc="left")
+        for axes in (errors, torques):
+            axes.set(xlabel="time [s]", xlim=(first.t[0], first.t[-1]))
+        errors.legend(frameon=False)
+        figure.suptitle(title.replace("$", r"\$"), x=0.008, ha="left", fontsize=12, fontweight="bold", color="#1d2733")
+    return Path(path)
