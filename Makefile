@@ -2,11 +2,14 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign bench-history clean
+.PHONY: help setup demo test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make test           the test suite"
 	@echo "make check          ruff, mypy and the architecture test"
+	@echo "make docs           the documentation as a site that works offline, in out/site"
+	@echo "make docs-check     run every command and every line of Python of the how-tos; some minutes"
+	@echo "make pictures       the pictures of README and docs again; half an hour, and Chromium"
 	@echo "make mutants        how many of 60 seeded faults the tests find; about half an hour"
 	@echo "make fuzz           the next three: every door of the package, broken at random; about half an hour"
 	@echo "make fuzz-calls     10,000 calls with hostile arguments at every public function"
@@ -21,7 +24,7 @@ help:
 setup: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,verify,xacro]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs,verify,xacro]'
 	touch $(READY)
 
 demo: $(READY)
@@ -35,6 +38,16 @@ check: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest tests/test_architecture.py
+
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	$(BIN)/python tools/check_site.py out/site
+
+docs-check: $(READY)
+	$(BIN)/python -m pytest tests/test_docs.py -m pages --dist load
+
+pictures: $(READY)
+	$(BIN)/python tools/pictures.py
 
 mutants: $(READY)
 	$(BIN)/python tools/mutants.py

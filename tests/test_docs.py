@@ -1,9 +1,11 @@
 """Documentation is read by tests: citations, links, examples and docstrings."""
 
 import ast
+import builtins
 import doctest
 import inspect
 import re
+import tomllib
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -11,9 +13,22 @@ from pathlib import Path
 import pytest
 
 import nbs_pin
+from nbs_pin import cli
+from nbs_pin.base import exceptions
+from tests.pages import blocks, commands, run_page, typed_by_hand
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+LONGER = sorted([ROOT / "docs" / "index.md", ROOT / "docs" / "mjcf.md", *(ROOT / "docs" / "howto").glob("[!i]*.md")])
+"""Pages with code that `make docs-check` runs; README and tutorial are part of the suite."""
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+CHEAP = {
+    "certify": ["--period", "0.002"],
+    "train": ["--epochs", "2"],
+    "collect": ["--samples", "200"],
+    "compare": ["--samples", "100", "--trajectories", "20"],
+}
+"""What shortens the commands of the README, added to them."""
 THEORY = ROOT / "docs" / "theory.md"
 HOME_OF = {
     alias.name: f"nbs_pin.{node.module}"
@@ -97,10 +112,8 @@ def test_relative_links_lead_somewhere(page):
             assert anchor in anchors(file), f"{page.name}: [{text}]({target})"
 
 
-def test_the_readmes_python_runs(tmp_path, monkeypatch):
-    """The blocks of the README one after another, as a reader would paste them; long simulations are cut short."""
-    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.M | re.S)
-    assert blocks
+def short_simulations(monkeypatch):
+    """What a page simulates is cut to `LONGEST_RUN`."""
     simulate = nbs_pin.simulate
 
     def short(plant, controller, reference, duration, period, **options):
@@ -108,10 +121,50 @@ def test_the_readmes_python_runs(tmp_path, monkeypatch):
         return simulate(plant, controller, reference, steps * period, period, **options)
 
     monkeypatch.setattr(nbs_pin, "simulate", short, raising=False)
-    monkeypatch.chdir(tmp_path)
-    namespace = {"__name__": "readme"}
-    for number, block in enumerate(blocks, 1):
-        exec(compile(block, f"README.md, block {number}", "exec"), namespace)
+
+
+def test_what_readme_and_tutorial_say_can_be_typed_in_order(tmp_path, monkeypatch):
+    """Their blocks one after another, as a reader would paste them; what takes long is cut short."""
+    short_simulations(monkeypatch)
+    for page, cheap in ((ROOT / "README.md", CHEAP), (ROOT / "docs" / "tutorial.md", {})):
+        folder = tmp_path / page.stem
+        folder.mkdir()
+        run_page(page, folder, cheap)
+
+
+@pytest.mark.pages
+@pytest.mark.parametrize("page", LONGER, ids=lambda page: page.relative_to(ROOT / "docs").as_posix())
+def test_what_a_page_says_can_be_typed_in_order(page, tmp_path):
+    run_page(page, tmp_path)
+
+
+def test_every_page_with_code_is_run():
+    run = {ROOT / "README.md", ROOT / "docs" / "tutorial.md", *LONGER}
+    kinds = {page: {kind for kind, *_ in blocks(page)} for page in PAGES}
+    assert {page for page, found in kinds.items() if found & {"sh", "python"}} == run
+    known = {"sh", "python", "shell", "text", "xml", "toml"}
+    assert {kind for found in kinds.values() for kind in found} <= known
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_that_a_page_shows_has_these_options(page):
+    for words in commands(page):
+        assert cli.parse(words) is not None
+
+
+def test_what_no_test_can_type_names_what_exists():
+    """Targets of make, extras of pip; nothing else stands in such blocks but a queue of a cluster."""
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.M))
+    extras = set(PROJECT["optional-dependencies"])
+    seen = [(page, words) for page in PAGES for words in typed_by_hand(page)]
+    assert len(seen) > 3
+    for page, words in seen:
+        assert words[0] in ("make", "pip", "sbatch") or words[0].startswith((".venv/bin/", "python")), (page, words)
+        if words[0] == "make":
+            assert set(words[1:]) <= targets, (page, words)
+        if words[0] == "pip":
+            named = re.search(r"\[(.*)\]", words[-1])
+            assert named is None or set(named[1].split(",")) <= extras, (page, words)
 
 
 EXAMPLES = sorted(file for file in ROOT.glob("nbs_pin/**/*.py") if ">>> " in file.read_text())
@@ -127,6 +180,34 @@ def test_the_example_of_a_docstring_runs_and_prints_what_it_says(file, tmp_path,
     for test in found:
         outcome = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test)
         assert outcome.failed == 0, f"{test.name}: see the output above"
+
+
+def example_of(name: str) -> bool:
+    """Whether its docstring, or that of one of its methods, has an example that runs."""
+    thing = getattr(nbs_pin, name)
+    members = vars(thing).values() if inspect.isclass(thing) else ()
+    texts = [thing.__doc__, *(getattr(getattr(member, "__func__", member), "__doc__", None) for member in members)]
+    return any(">>> " in text for text in texts if isinstance(text, str))
+
+
+def test_every_public_name_has_an_example():
+    assert {name for name in HOME_OF if not example_of(name)} == {"Proposal", "ROBOT_NAMES"}
+    assert "`propose`" in nbs_pin.Proposal.__doc__ and example_of("propose")
+
+
+def test_every_public_name_is_on_one_page_of_the_reference():
+    shown = [name for page in PAGES for name in re.findall(r"^::: nbs_pin\.(\w+)$", page.read_text(), flags=re.M)]
+    assert sorted(shown) == sorted([*HOME_OF, "metrics"])
+
+
+def test_the_page_of_errors_has_every_error_and_what_it_also_is():
+    table = re.findall(
+        r"^\| `(\w+)` \| `(\w+)` \|", (ROOT / "docs" / "reference" / "errors.md").read_text(), flags=re.M
+    )
+    errors = {name: error for name, error in vars(exceptions).items() if inspect.isclass(error)}
+    assert set(dict(table)) == set(errors) - {"NbsPinError"}
+    for name, builtin in table:
+        assert issubclass(errors[name], getattr(builtins, builtin)), name
 
 
 def assigned_docstrings(module: str) -> set[str]:

@@ -52,6 +52,14 @@ class Run(Shown):
 
     The torque in row k acts from t[k] to t[k+1]; the torque in the last row was computed but not applied.
     A batch of initial states adds axes between time and joint: q has shape (steps + 1, ..., nv).
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law, plant = nbs.NeuralBackstepping.for_robot(robot), nbs.DynamicsPlant.for_robot(robot)
+        >>> run = nbs.simulate(plant, law, nbs.Hold([0.3, 0.2]), 0.1, 0.001)
+        >>> run.joint_names, run.t.shape, run.tau.shape
+        (('joint1', 'joint2'), (101,), (101, 2))
     """
 
     t: Float[np.ndarray, " rows"]

@@ -51,6 +51,12 @@ class Certificate(Shown):
 
     They hold for every admissible disturbance and every reference, under `assumptions`; with a `mismatch`, for loops
     like those that it was measured on, over the length of these.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> bound = nbs.certify(nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link")), [5.0, 5.0])
+        >>> bound.joint_errors.round(3), round(bound.rate, 1), str(bound.label)
+        (array([0.017, 0.017]), 8.0, 'PROVED')
     """
 
     controller: LyapunovLaw

@@ -41,7 +41,17 @@ from nbs_pin.certificates.window_watch import UNEXPLAINED, WindowWatch
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Monitored(Shown):
-    """V and the errors along one motion, their certified bounds, the terms of V̇, and the assumptions that failed."""
+    """V and the errors along one motion, their certified bounds, the terms of V̇, and the assumptions that failed.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law, plant = nbs.NeuralBackstepping.for_robot(robot), nbs.DynamicsPlant.for_robot(robot)
+        >>> run = nbs.simulate(plant, law, nbs.Sinusoid.for_robot(robot), 0.2, 0.001)
+        >>> seen = nbs.monitor(run, nbs.certify(law, [5.0, 5.0]))
+        >>> seen.verdict, seen.is_wrong
+        ('promise kept', False)
+    """
 
     t: Float[np.ndarray, " rows"]
     """Time [s]."""

@@ -49,7 +49,7 @@ _SPARE = 1.0 - 1e-6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Proposal(Shown):
-    """An inertia-shaped law that certifies the wanted error."""
+    """An inertia-shaped law that certifies the wanted error; made by `propose`, with its example."""
 
     gains: Gains
     """ω, K = 2S and D₀; their `rate` is Λ = ωK⁻¹."""

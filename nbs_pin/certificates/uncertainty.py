@@ -18,6 +18,11 @@ class Payload:
 
     Raises:
         ArgumentError: If mass or radius is out of range.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.Payload(mass=2.0, radius=0.05)  # up to 2 kg within 5 cm of the arm's end
+        Payload(mass=2.0, radius=0.05, link=None)
     """
 
     mass: float

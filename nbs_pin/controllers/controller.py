@@ -19,7 +19,18 @@ from nbs_pin.kernels.layout import Packed
 
 
 class Controller(Shown, ABC):
-    """A tracking law, evaluated once per control period; its memory is a value that the caller keeps."""
+    """A tracking law, evaluated once per control period; its memory is a value that the caller keeps.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law, aim = nbs.PID.for_robot(robot), nbs.Hold([0.3, 0.2])(0.0)
+        >>> memory = law.initial_memory(aim.q)
+        >>> for _ in range(3):  # what `simulate` does, without an arm
+        ...     tau, memory = law.step(memory, aim.q, aim.v, aim, period=0.001)
+        >>> tau.shape
+        (2,)
+    """
 
     @property
     @abstractmethod
@@ -118,7 +129,17 @@ class Controller(Shown, ABC):
 
 
 class MemorylessController(Controller):
-    """A law whose torque depends only on the present state and reference."""
+    """A law whose torque depends only on the present state and reference.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> class Spring(nbs.MemorylessController):
+        ...     nv = 1
+        ...     def torque(self, q, v, q_ref, v_ref, a_ref):
+        ...         return -10.0 * (q - q_ref) - 2.0 * (v - v_ref)
+        >>> Spring().step(None, 0.1, 0.0, nbs.Reference(0.0, 0.0, 0.0), 0.001)
+        (-1.0, None)
+    """
 
     @abstractmethod
     def torque(self, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Vectors:

@@ -66,6 +66,14 @@ class Damping(nn.Module):
 
     Raises:
         ArgumentError: For an unknown form, a number out of range, or a floor or ceiling that is missing or superfluous.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> damping = nbs.Damping(2, floor=[[3.0, 0.0], [0.0, 1.0]])
+        >>> excess = damping.matrix(np.array([0.5, -2.0])) - np.diag([3.0, 1.0])
+        >>> bool(np.linalg.eigvalsh(excess)[0] > -1e-12)  # D ⪰ D₀
+        True
     """
 
     floor: Gain | None

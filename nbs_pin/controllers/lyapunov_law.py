@@ -65,6 +65,15 @@ class LyapunovLaw(ModelLaw):
 
     A subclass states its Φ, Λ, D, ω and ζ and how they are known; `certify`, `monitor` and `attack` need nothing else.
     Source: docs/theory.md §2, docs/certificates.md §2.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law = nbs.SlotineLi.for_robot(robot)
+        >>> aim = nbs.Hold([0.0, 0.0])(0.0)
+        >>> errors = law.errors([0.1, 0.0], [0.0, 0.0], *aim)
+        >>> errors.z1, bool(law.storage([0.1, 0.0], [0.0, 0.0], aim.q, aim.v) > 0.0)
+        (array([0.1, 0. ]), True)
     """
 
     inertial_rate: float = 0.0

@@ -25,6 +25,12 @@ class ModelLaw(MemorylessController, nn.Module):
 
     Raises:
         ArgumentError: If friction is for another number of joints.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> law = nbs.ComputedTorque.for_robot(nbs.load_robot("two_link"))
+        >>> isinstance(law, nbs.ModelLaw), law.nv, law.packable
+        (True, 2, True)
     """
 
     def __init__(self, dynamics: DynamicsProvider, friction: JointFriction | None) -> None:

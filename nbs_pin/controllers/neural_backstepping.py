@@ -259,6 +259,12 @@ def paper_controller(dynamics: DynamicsProvider, *, m: float = 0.001, seed: int 
     """The paper's controller as set up in its section V-A: S = I, Λ = I, three layers of 32 in ψ, D = TᵀT.
 
     Source: paper eqs. (9), (10); initial weights U(−0.1, 0.2) and U(−0.2, 0.2) as in docs/theory.md §8.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> dynamics = nbs.AnalyticDynamics()  # the paper's arm
+        >>> nbs.paper_controller(dynamics).torque([0.0, 0.0], [0.0, 0.0], *nbs.paper_reference(2)(0.0)).shape
+        (2,)
     """
     potential = Potential(np.eye(dynamics.nv), form="paper", seed=seed)
     return NeuralBackstepping(dynamics, potential, Damping(dynamics.nv, form="paper", m=m, seed=seed + 1))

@@ -71,6 +71,14 @@ class Potential(nn.Module):
 
     Raises:
         ArgumentError: For an unknown form or a number out of range.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> potential = nbs.Potential(stiffness=[[2.0, 0.0], [0.0, 1.0]])
+        >>> value, gradient, _ = potential.terms(np.array([0.1, 0.0]), np.zeros(2))
+        >>> bool(value >= 0.02), gradient.shape  # Φ(z) ≥ zᵀSz
+        (True, (2,))
     """
 
     scale: torch.Tensor

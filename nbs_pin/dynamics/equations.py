@@ -47,14 +47,26 @@ def forward_dynamics(dynamics: DynamicsProvider, q: Array, v: Array, tau: Array)
 
 @checked(dynamics=MODEL)
 def bias(dynamics: DynamicsProvider, q: Array, v: Array) -> Vectors:
-    """C(q, v) v + G(q) [N·m]: the torque that keeps the velocity constant."""
+    """C(q, v) v + G(q) [N·m]: the torque that keeps the velocity constant.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.bias(nbs.AnalyticDynamics(), q=[0.0, 0.0], v=[0.0, 0.0])  # two links held level
+        array([29.4,  9.8])
+    """
     q, v = as_vectors(dynamics.nv, q=q, v=v)
     return dynamics.reference_torque(q, v, v, 0.0 * v)
 
 
 @checked(dynamics=MODEL)
 def kinetic_energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
-    """½ vᵀM(q)v [J]."""
+    """½ vᵀM(q)v [J].
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> float(nbs.kinetic_energy(nbs.AnalyticDynamics(), q=[0.0, 0.0], v=[1.0, 0.0]))  # 1 kg at 1 m and at 2 m
+        2.5
+    """
     q, v = as_vectors(dynamics.nv, q=q, v=v)
     value = 0.5 * array_namespace(v).sum(v * matvec(dynamics.mass_matrix(q), v), axis=-1)
     return finite_result("the kinetic energy", value, q, v)
@@ -62,6 +74,13 @@ def kinetic_energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
 
 @checked(dynamics=MODEL)
 def energy(dynamics: DynamicsProvider, q: Array, v: Array) -> Scalars:
-    """E = ½ vᵀM(q)v + V(q) [J]; dE/dt = vᵀτ along every motion."""
+    """E = ½ vᵀM(q)v + V(q) [J]; dE/dt = vᵀτ along every motion.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> dynamics = nbs.AnalyticDynamics()
+        >>> float(nbs.energy(dynamics, q=[0.0, 0.0], v=[1.0, 0.0]) - dynamics.potential_energy([0.0, 0.0]))
+        2.5
+    """
     q, v = as_vectors(dynamics.nv, q=q, v=v)
     return kinetic_energy(dynamics, q, v) + dynamics.potential_energy(q)

@@ -40,6 +40,15 @@ class IdentifiedDynamics(PinocchioDynamics):
 
     Raises:
         ArgumentError: For a wrong number of joints, a body that is not physically consistent, or rotor inertia < 0.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> own = np.stack([body.toDynamicParameters() for body in list(robot.model.inertias)[1:]])
+        >>> model, truth = nbs.IdentifiedDynamics(robot, own), nbs.PinocchioDynamics(robot)
+        >>> np.allclose(model.mass_matrix([0.3, 0.2]), truth.mass_matrix([0.3, 0.2]))
+        True
     """
 
     @checked(robot=ARM)

@@ -40,6 +40,14 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
 
     Raises:
         ArgumentError: If robot or friction have another number of joints, or the network is not float64.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> from nbs_pin.dynamics.cholesky import CholeskyNetwork
+        >>> model = nbs.LagrangianDynamics(CholeskyNetwork([False, False], epsilon=0.1))  # `fit` makes trained ones
+        >>> bool(np.linalg.eigvalsh(model.mass_matrix([0.3, 0.2]))[0] >= 0.1)
+        True
     """
 
     network: LagrangianNetwork

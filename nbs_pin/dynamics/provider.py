@@ -17,6 +17,13 @@ class DynamicsProvider(Shown, ABC):
     Subclasses implement the abstract methods. Arrays may have leading batch axes; numpy arrays give numpy arrays, and
     torch tensors give differentiable tensors. `reference_torque` and `forward_dynamics` follow from these methods; a
     subclass overrides them only with a faster way to compute the same values.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> dynamics = nbs.PinocchioDynamics(nbs.load_robot("two_link"))
+        >>> isinstance(dynamics, nbs.DynamicsProvider), dynamics.mass_matrix(np.zeros((50, 2))).shape
+        (True, (50, 2, 2))
     """
 
     @property

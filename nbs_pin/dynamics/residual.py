@@ -148,6 +148,13 @@ class ResidualDynamics(LagrangianDynamics):
     """A nominal model corrected by a `ResidualNetwork`, which is copied and frozen with its nominal model.
 
     Arguments and errors as in `LagrangianDynamics`.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> data = nbs.collect(robot, "uniform", samples=50)
+        >>> nbs.fit(data, "residual", robot=robot, iterations=2).nominal.robot.name
+        'two_link'
     """
 
     def __init__(self, network: ResidualNetwork, friction: JointFriction | None = None, report: Any = None) -> None:

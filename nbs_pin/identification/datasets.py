@@ -157,6 +157,14 @@ def load_dataset(path: str | Path) -> Dataset:
     Raises:
         FileNotFoundError: If the file does not exist.
         FileFormatError: If it is damaged, of another format, lacks an array, or its arrays are not a valid dataset.
+
+    Example:
+        >>> import tempfile
+        >>> import nbs_pin as nbs
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     nbs.collect(nbs.load_robot("two_link"), "uniform", samples=50).save(f"{folder}/data.npz")
+        ...     nbs.load_dataset(f"{folder}/data.npz").q.shape
+        (50, 2)
     """
     data = read_npz(path, {entry.name for entry in fields(Dataset)} | {"format"})
     require(data, path, {"format": "U"})

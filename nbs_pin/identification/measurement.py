@@ -16,7 +16,14 @@ ORDER = 5
 
 @dataclass(frozen=True)
 class Noise:
-    """Sensor errors: quantised encoders, and white Gaussian noise of the torque measurement."""
+    """Sensor errors: quantised encoders, and white Gaussian noise of the torque measurement.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> noise = nbs.Noise(encoder=2**-16, torque=0.5)
+        >>> nbs.collect(nbs.load_robot("two_link"), samples=50, noise=noise)
+        Dataset(50 samples of two_link, 2 trajectories, 2 joints)
+    """
 
     encoder: float = 0.0
     """Encoder step as a share of a turn (of 1 m for a prismatic joint), such as 2**-16; 0 for none."""

@@ -43,7 +43,14 @@ class ConstantTorque:
 
 @dataclass(frozen=True, eq=False)
 class SinusoidalTorque:
-    """τ_d = amplitude·sin(frequency·t + phase), with amplitude [N·m], frequency [rad/s] and phase [rad]."""
+    """τ_d = amplitude·sin(frequency·t + phase), with amplitude [N·m], frequency [rad/s] and phase [rad].
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> nbs.SinusoidalTorque(5.0, frequency=np.pi)(0.5, q=np.zeros(2), v=np.zeros(2))
+        array([5., 5.])
+    """
 
     amplitude: PerJoint
     frequency: PerJoint
@@ -59,7 +66,14 @@ class SinusoidalTorque:
 
 @dataclass(frozen=True, eq=False)
 class SquareWave:
-    """τ_d = amplitude·sgn(sin(frequency·t + phase)), sgn 0 = 1: amplitude [N·m], frequency [rad/s], phase [rad]."""
+    """τ_d = amplitude·sgn(sin(frequency·t + phase)), sgn 0 = 1: amplitude [N·m], frequency [rad/s], phase [rad].
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> nbs.SquareWave([5.0, 2.0], frequency=2.0 * np.pi)(0.75, q=np.zeros(2), v=np.zeros(2))
+        array([-5., -2.])
+    """
 
     amplitude: PerJoint
     frequency: PerJoint
@@ -79,6 +93,13 @@ class TorqueNoise:
     """Gaussian noise of standard deviation `std` [N·m], held constant over each `period` [s].
 
     A pure function of time: the same seed gives the same torque at the same t, in any order of evaluation.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> noise = nbs.TorqueNoise(0.5, period=0.01, seed=1)
+        >>> bool((noise(0.2, np.zeros(2), np.zeros(2)) == noise(0.2, np.zeros(2), np.zeros(2))).all())
+        True
     """
 
     std: PerJoint

@@ -126,6 +126,17 @@ def load_reference(
         FileNotFoundError: If the file does not exist.
         FileFormatError: If it has any other fault; names file, row, column and remedy.
         ArgumentError: If the unit of time is unknown.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> t = np.linspace(0.0, 1.0, 21)
+        >>> rows = np.column_stack([t, t**2 * (3 - 2 * t), -(t**2) * (3 - 2 * t)])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savetxt(f"{folder}/m.csv", rows, delimiter=",", header="t,joint1,joint2", comments="")
+        ...     nbs.load_reference(f"{folder}/m.csv", nbs.load_robot("two_link"))(0.5).v.round(6)
+        array([ 1.5, -1.5])
     """
     path = Path(path)
     read = {".csv": _read_csv, ".npz": _read_npz}.get(path.suffix.lower())

@@ -141,7 +141,13 @@ def resting_posture(robot: Robot) -> np.ndarray:
 
 @checked(n=count(1, MOST_JOINTS, "joints"))
 def paper_reference(n: int) -> Sinusoid:
-    """The paper's q_d = [sin 0.1t, cos 0.1t, sin 0.1t, …] for n joints [rad]."""
+    """The paper's q_d = [sin 0.1t, cos 0.1t, sin 0.1t, …] for n joints [rad].
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.paper_reference(2)(0.0).q
+        array([0., 1.])
+    """
     return Sinusoid(amplitude=np.ones(n), frequency=0.1, phase=0.5 * np.pi * (np.arange(n) % 2))
 
 
@@ -243,6 +249,16 @@ def check_reference(
 
     Raises:
         ArgumentError: If a limit is exceeded; names the joint, the time, the value, the limit and the remedy.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> motion = nbs.Sinusoid.for_robot(robot)
+        >>> nbs.check_reference(motion, robot, duration=10.0)
+        >>> nbs.check_reference(motion, robot.with_effort_limit(1.0), duration=10.0)
+        Traceback (most recent call last):
+            ...
+        nbs_pin.base.exceptions.ArgumentError: ...
     """
     choice("drop", "keep")("check_reference: joint_friction", joint_friction)
     t = np.linspace(0.0, duration, samples)

@@ -35,6 +35,15 @@ class ToolMotion(Shown):
     """q(s(t)) of an arm whose frame follows a path; v = q'ṡ and a = q''ṡ² + q's̈ are its exact derivatives.
 
     It rests at the beginning before t = 0 and at the end after `duration`. Made by `tool_motion`.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("ur5")
+        >>> posture = nbs.tool_posture(robot, "tool0")
+        >>> line = nbs.ToolPath.line(robot.pose(posture, "tool0")[:3, 3], [0.0, 0.1, 0.0])
+        >>> motion = nbs.tool_motion(robot, line, "tool0", posture=posture, duration=2.0)
+        >>> motion.duration, motion(0.0).v.round(9).any(), motion.pose(1.0).shape
+        (2.0, ..., (4, 4))
     """
 
     frame: str

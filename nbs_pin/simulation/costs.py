@@ -20,7 +20,14 @@ during it [N·m], before the effort limits. Any differentiable callable is accep
 
 
 def squared_error(z1: Vectors, dz1: Vectors, tau: Vectors) -> Scalars:
-    """z1ᵀz1, the paper's cost: torque is free, so training uses much of it (docs/theory.md §7)."""
+    """z1ᵀz1, the paper's cost: torque is free, so training uses much of it (docs/theory.md §7).
+
+    Example:
+        >>> import torch
+        >>> import nbs_pin as nbs
+        >>> nbs.squared_error(torch.tensor([0.3, 0.4]), torch.zeros(2), torch.zeros(2))
+        tensor(0.2500)
+    """
     z1 = z1 if isinstance(z1, torch.Tensor) else floats("z1", z1)
     if z1.ndim == 0:
         raise ArgumentError(f"z1 is {told(z1)}, expected errors (..., n) [rad]; give one number per joint.")
@@ -39,6 +46,14 @@ class TorqueAware:
 
     Raises:
         ArgumentError: If a number is out of range.
+
+    Example:
+        >>> import torch
+        >>> import nbs_pin as nbs
+        >>> cost = nbs.TorqueAware.for_robot(nbs.load_robot("two_link"))  # 100 N·m
+        >>> inside, beyond = (cost(torch.zeros(2), torch.zeros(2), torch.tensor([x, 0.0])) for x in (50.0, 150.0))
+        >>> bool(beyond > inside)
+        True
     """
 
     limit: Float[torch.Tensor, " n"]
@@ -76,6 +91,13 @@ class TimeOutside:
 
     Raises:
         ArgumentError: If a number is out of range.
+
+    Example:
+        >>> import torch
+        >>> import nbs_pin as nbs
+        >>> cost = nbs.TimeOutside(threshold=0.01, pull=0.0)
+        >>> [round(float(cost(torch.tensor([x]), torch.zeros(1), torch.zeros(1))), 2) for x in (1.0, 0.1, 0.0)]
+        [0.99, 0.5, 0.0]
     """
 
     threshold: float = 0.01

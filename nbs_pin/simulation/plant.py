@@ -10,7 +10,15 @@ from nbs_pin.robots.robot import Robot
 
 
 class Plant(Shown, ABC):
-    """A mechanical system driven by joint torques; it keeps no state between calls."""
+    """A mechanical system driven by joint torques; it keeps no state between calls.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> plant = nbs.MujocoPlant(nbs.load_robot("two_link"))
+        >>> isinstance(plant, nbs.Plant), plant.nv
+        (True, 2)
+    """
 
     @property
     @abstractmethod

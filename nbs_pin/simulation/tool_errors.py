@@ -13,7 +13,16 @@ from nbs_pin.robots.robot import ARM, Robot
 
 
 class ToolErrors(NamedTuple):
-    """Errors of a frame at the control instants."""
+    """Errors of a frame at the control instants.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law, plant = nbs.NeuralBackstepping.for_robot(robot), nbs.DynamicsPlant.for_robot(robot)
+        >>> run = nbs.simulate(plant, law, nbs.Hold([0.3, 0.2]), 0.1, 0.001, q0=[0.4, 0.2])
+        >>> nbs.tool_errors(run, robot, robot.frames[-1]).position.shape  # m, one row per control instant
+        (101,)
+    """
 
     position: Float[np.ndarray, "rows *batch"]
     """Distance of its origin from where the reference puts it [m]."""

@@ -93,6 +93,17 @@ def load(path: str | Path, robot: Robot | None = None) -> Any:
         FileFormatError: If the file is damaged or not a checkpoint.
         ArgumentError: If robot is not the arm of the file or, if that has none, has another number of joints.
         RobotError: If the description of the arm has changed or, as RobotNotFound, no longer exists.
+
+    Example:
+        >>> import tempfile
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law, aim = nbs.NeuralBackstepping.for_robot(robot, seed=3), nbs.Hold([0.3, 0.2])(0.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     nbs.save(law, f"{folder}/law.nbs")
+        ...     again = nbs.load(f"{folder}/law.nbs")
+        >>> bool((again.torque(aim.q, aim.v, *aim) == law.torque(aim.q, aim.v, *aim)).all())
+        True
     """
     return read_checkpoint(path, robot).controller
 
@@ -108,7 +119,16 @@ def load_with(path: str | Path, robot: Robot) -> Any:
 
 @checked(path=readable)
 def about(path: str | Path) -> dict[str, Any]:
-    """`controller` (settings, arm), `versions` and `info` of a file, without building anything; raises as `load`."""
+    """`controller` (settings, arm), `versions` and `info` of a file, without building anything; raises as `load`.
+
+    Example:
+        >>> import tempfile
+        >>> import nbs_pin as nbs
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     nbs.save(nbs.PD.for_robot(nbs.load_robot("two_link")), f"{folder}/pd.nbs", info={"seed": 0})
+        ...     sorted(nbs.about(f"{folder}/pd.nbs")), nbs.about(f"{folder}/pd.nbs")["info"]
+        (['controller', 'info', 'versions'], {'seed': 0})
+    """
     return _document(path, read_archive(path, FORMAT))
 
 

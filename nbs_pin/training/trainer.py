@@ -35,7 +35,17 @@ SAVE_EVERY = 10
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Training(Shown):
-    """Result of a training."""
+    """Result of a training.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> law, plant = nbs.NeuralBackstepping.for_robot(robot, period=0.01), nbs.DynamicsPlant.for_robot(robot)
+        >>> motion = nbs.Sinusoid.for_robot(robot)
+        >>> training = nbs.train(law, plant, [motion], starts=4, duration=0.2, period=0.01, epochs=2)
+        >>> training.best_epoch <= 2 < len(training.held_out) + 1
+        True
+    """
 
     controller: Any
     """The controller of the best epoch; the one given to `train` is unchanged."""

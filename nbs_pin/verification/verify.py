@@ -24,7 +24,17 @@ BITS = 192
 
 @dataclass(frozen=True)
 class Verification:
-    """What a certificate file says that was checked again, and what was not."""
+    """What a certificate file says that was checked again, and what was not.
+
+    Example:
+        >>> import tempfile
+        >>> import nbs_pin as nbs
+        >>> bound = nbs.certify(nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link")), [5.0, 5.0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     found = nbs.verify(nbs.write_certificate(bound, f"{folder}/certificate.json"))
+        >>> found.label, found.confirmed, {check.status for check in found.checks} >= {"re-verified"}
+        ('PROVED', True, True)
+    """
 
     label: str
     """The label of the bounds in the file."""
@@ -49,6 +59,15 @@ def verify(path: str | Path, *, urdf: str | Path | None = None, robot: Arm | Non
         FileNotFoundError: If there is no such file.
         FileFormatError: If it is no certificate, or the URDF or the robot is not that of its arm.
         MissingExtra: If the extra `verify` is not installed.
+
+    Example:
+        >>> import tempfile
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> bound = nbs.certify(nbs.SlotineLi.for_robot(robot), [5.0, 5.0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     nbs.verify(nbs.write_certificate(bound, f"{folder}/certificate.json"), robot=robot).confirmed
+        True
     """
     for name, given in (("path", path), ("urdf", urdf)):
         if (given is not None or name == "path") and not isinstance(given, str | Path):
