@@ -38,7 +38,7 @@ HOMES = {
         "robots.mjcf_tree",
     },
     "matplotlib": {"reports"},
-    "meshcat": {"reports.replay"},
+    "meshcat": {"reports.live", "reports.live_server", "reports.replay"},
     "yourdfpy": {"robots.visuals"},
     "trimesh": {"robots.meshes", "robots.shape_inertia", "robots.visuals", "reports.replay"},
     "pink": {"motions.inverse_kinematics"},

@@ -57,7 +57,7 @@ class Approach:
             made = cls(motion, T, _quintic(*state, T))
             if length is not None or (np.abs(made._polynomial(T * grid)[1]) <= 1.0001 * limit).all():
                 return made
-        raise ArgumentError(f"no approach within 1000 s keeps {robot.name} below half its velocity limits; give length.")
+        raise ArgumentError("no approach within 1000 s stays below half the velocity limits; give a length.")
 
     @property
     def notes(self) -> dict[str, Any]:
@@ -83,12 +83,5 @@ def _quintic(p: JointArray, v: JointArray, a: JointArray, T: float) -> np.ndarra
     """Coefficients (6, n) of the quintic in t/T from (p, v, a) at 0 to rest at 0 at T."""
     v, a = v * T, a * T * T
     return np.array(
-        [
-            p,
-            v,
-            0.5 * a,
-            -10.0 * p - 6.0 * v - 1.5 * a,
-            15.0 * p + 8.0 * v + 1.5 * a,
-            -6.0 * p - 3.0 * v - 0.5 * a,
-        ]
+        [p, v, 0.5 * a, -10.0 * p - 6.0 * v - 1.5 * a, 15.0 * p + 8.0 * v + 1.5 * a, -6.0 * p - 3.0 * v - 0.5 * a]
     )

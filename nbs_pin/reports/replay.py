@@ -94,7 +94,7 @@ def replay(
         "name": robot.name,
         "notes": _notes(run),
         "joints": [{"name": joint.name, "unit": "m" if joint.prismatic else "rad"} for joint in robot.joints],
-        "bodies": [_body_node(body)[1] for body in range(robot.model.njoints)],
+        "bodies": [body_node(body)[1] for body in range(robot.model.njoints)],
         "links": {
             frame.name: (frame.parentJoint, frame.placement.homogeneous.T.ravel().tolist())
             for frame in robot.model.frames
@@ -103,7 +103,7 @@ def replay(
         "tip": {"body": joint, "point": point.tolist()},
         "path": "" if tool is None else _encoded(_path(robot, _one_start(run.q_ref, start), tool["frame"]), np.float32),
         "view": _view(robot, visuals, poses),
-        "commands": [base64.b64encode(umsgpack.packb(command)).decode() for command in _commands(robot, visuals)],
+        "commands": [base64.b64encode(umsgpack.packb(command)).decode() for command in scene_commands(robot, visuals)],
         "times": _encoded(run.t[rows], np.float64),
         "poses": _encoded(poses, np.float32),
         "position": _encoded(q, np.float32),
@@ -156,16 +156,17 @@ def _notes(run: Run) -> str:
     return " · ".join(str(run.info[key]) for key in ("controller", "plant", "reference") if run.info.get(key))
 
 
-def _body_node(body: int) -> tuple[str, str]:
+def body_node(body: int) -> tuple[str, str]:
+    """The node of the scene that a body of the arm has."""
     return "actual", f"body{body}"
 
 
-def _commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]:
+def scene_commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]:
     """The meshcat commands that build the arm: a node per body, under it a node per shape."""
-    commands = [SetTransform(np.eye(4), ScenePath(_body_node(body))) for body in range(robot.model.njoints)]
+    commands = [SetTransform(np.eye(4), ScenePath(body_node(body))) for body in range(robot.model.njoints)]
     for index, visual in enumerate(visuals):
         frame = robot.model.frames[robot.model.getFrameId(visual.link, pin.FrameType.BODY)]
-        node = ScenePath((*_body_node(frame.parentJoint), f"shape{index}"))
+        node = ScenePath((*body_node(frame.parentJoint), f"shape{index}"))
         geometry = TriangularMeshGeometry(visual.vertices.astype(np.float32), visual.faces.astype(np.uint32))
         commands += [
             SetObject(geometry, _material(visual), node),
