@@ -38,7 +38,7 @@ HOMES = {
         "robots.mjcf_tree",
     },
     "matplotlib": {"reports"},
-    "meshcat": {"reports.scene"},
+    "meshcat": {"reports.live", "reports.live_server", "reports.scene"},
     "yourdfpy": {"robots.visuals"},
     "trimesh": {"robots.meshes", "robots.shape_inertia", "robots.visuals"},
     "pink": {"motions.inverse_kinematics"},

@@ -1,7 +1,7 @@
 """One faulty loop: an arm in MuJoCo, its law behind the guard, and something that goes wrong between them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -201,3 +201,41 @@ def _run(trial: Trial) -> Outcome:
 def desired_at(rows: Reference, k: int) -> Reference:
     """Row k of a reference."""
     return Reference(rows.q[k], rows.v[k], rows.a[k])
+
+
+def burst(length: int) -> Callable[[int, Sample], Sample]:
+    """Samples that do not arrive from `STRIKE` on, so many in a row."""
+    return lambda k, sample: sample._replace(fresh=not STRIKE <= k < STRIKE + length)
+
+
+def frozen(length: int) -> Callable[[int, Sample], Sample]:
+    """Readings that stay while time goes on, from `STRIKE` on, for so many instants."""
+    last: list[Sample] = []
+
+    def sense(k: int, sample: Sample) -> Sample:
+        if not STRIKE <= k < STRIKE + length:
+            last[:] = [sample]
+            return sample
+        return last[0]._replace(t=sample.t)
+
+    return sense
+
+
+def spoilt(length: int, value: float, i: int) -> Callable[[int, Sample], Sample]:
+    """A position of joint i that is no number, from `STRIKE` on, for so many instants."""
+
+    def sense(k: int, sample: Sample) -> Sample:
+        if not STRIKE <= k < STRIKE + length:
+            return sample
+        q = sample.q.copy()
+        q[i] = value
+        return sample._replace(q=q)
+
+    return sense
+
+
+def in_gravity(arm: Arm, gravity: JointArray) -> NeuralBackstepping:
+    """A law that believes in another gravity [m/s²]."""
+    model = arm.robot.model.copy()
+    model.gravity.linear = gravity
+    return NeuralBackstepping.for_robot(replace(arm.robot, model=model, gravity_vector=gravity))

@@ -23,7 +23,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run `nbs-pin` with these arguments, or the shell's, and return the exit code.
 
     It is 0 for success, 2 for bad input (one sentence on stderr), 3 if `certify` gives no promise (refused, or a
-    condition fails) or `verify` does not confirm one, 130 after Ctrl-C, 143 after SIGTERM.
+    condition fails) or `verify` does not confirm one, 4 if the guard stopped `run` or a row of `faults` fails, 130
+    after Ctrl-C, 143 after SIGTERM.
     """
     arguments, alone = list(sys.argv[1:] if argv is None else argv), argv is None
     if threading.current_thread() is not threading.main_thread():  # only the main thread can handle signals

@@ -9,6 +9,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Union, cast
@@ -25,10 +26,12 @@ from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.exit_codes import BAD_INPUT, NO_PROMISE, SIGNALLED
 from nbs_pin.cli.export import Export
+from nbs_pin.cli.faults import Faults
 from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.reproduce import Reproduce
 from nbs_pin.cli.robots import Robots
+from nbs_pin.cli.run import Run
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.typed import flags, given, with_home
@@ -46,6 +49,8 @@ COMMANDS: dict[str, type] = {
     "export": Export,
     "replay": Replay,
     "reproduce": Reproduce,
+    "run": Run,
+    "faults": Faults,
     "bench": Bench,
     "robots": Robots,
 }
@@ -53,7 +58,7 @@ COMMANDS: dict[str, type] = {
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` lists the options of a command, "
     "`nbs-pin --version` prints the version. Exit codes: 0 success, 2 bad input, 3 no promise from certify or verify, "
-    "130 interrupted."
+    "4 stopped by the guard or a row of faults not passed, 130 interrupted."
 )
 
 
@@ -153,8 +158,8 @@ def parse(arguments: list[str]) -> Any:
             return None
         raise OptionError(f"{_first_paragraph(complaint.getvalue())}; see nbs-pin --help.") from None
     if unknown:
-        options = {**vars(command), **vars(getattr(command, "arm", command))}
-        known = [f"--{name.replace('_', '-')}" for name in options]
+        groups = [command, *(group for group in vars(command).values() if is_dataclass(group))]
+        known = [f"--{name.replace('_', '-')}" for group in groups for name in vars(group)]
         what = "has no option" if unknown[0].startswith("-") else "takes no argument"
         remedy = f"{_near(unknown[0], known)}see nbs-pin {arguments[0]} --help."
         raise OptionError(f"nbs-pin {arguments[0]} {what} '{unknown[0]}'; {remedy}")

@@ -169,7 +169,7 @@ def drawing(path: Path) -> Iterator[Path]:
 def settings_of(options: Any, **resolved: Any) -> dict[str, Any]:
     """Everything that determines a command's results, as JSON can store it; files by name and SHA-256."""
     settings = {name: value for name, value in dataclasses.asdict(options).items() if name not in _NO_SETTINGS}
-    for group in settings.keys() & {"arm", "tool"}:
+    for group in (name for name in settings if dataclasses.is_dataclass(getattr(options, name))):
         settings[group] = getattr(options, group).given()
     for name, value in list(settings.items()):
         if name not in resolved and isinstance(value, str | Path):

@@ -1,8 +1,8 @@
 """The guard of a control loop as a state machine over plain numbers (docs/runtime.md).
 
-`admit` looks at a sample and says what to compute, `release` turns a torque into one that may be sent; between two calls
-nothing is remembered but the state, which both replace. Configuration and state are numbers, then vectors (n,) laid end
-to end, in the order of the names below.
+`admit` looks at a sample and says what to compute, `release` turns a torque into one that may be sent; between two
+calls nothing is remembered but the state, which both replace. Configuration and state are numbers, then vectors (n,)
+laid end to end, in the order of the names below.
 """
 
 import math
@@ -25,8 +25,8 @@ COMPUTE, HOLD, BRAKE, RELEASE = range(4)
 """Numbers of the configuration, and how many."""
 EFFORT, STEP, REACH, SPEED, ERROR, PUSH, DAMPING, RESOLUTION, WRAPS, LOWER, UPPER, VECTORS = range(12)
 """Vectors of the configuration, and how many."""
-(MODE, CODE, ACTION, BEGUN, AT, BAD, UNFIT, CYCLES, LOST, QUIET, MEAN, SWINGS, FAR, PUSHED, TROUBLE, HELD, LATE, OVERRUN,
- CUT, SCALARS) = range(20)  # fmt: skip
+(MODE, CODE, ACTION, BEGUN, AT, BAD, UNFIT, CYCLES, LOST, QUIET, MEAN, SWINGS, FAR, PUSHED, TROUBLE, HELD, LATE,
+ OVERRUN, CUT, SCALARS) = range(20)  # fmt: skip
 """Numbers of the state, and how many: the last four count what has happened since the beginning."""
 (Q, V, Q_REF, V_REF, TAU, GRAVITY, STALE, MOVED, ALONG, SQUARE, SIDE, ROOM, PEAK, LIMP, ROWS) = range(15)  # fmt: skip
 """Vectors of the state, and how many."""
@@ -117,7 +117,7 @@ def _follows(q_ref: Vec, v_ref: Vec, s: Part, c: Part, passed: float) -> bool:
 
 @inlined
 def _sensed(q: Vec, v: Vec, v_ref: Vec, passed: float, s: Part, c: Part) -> int:
-    """JUMP where a velocity cannot be, FROZEN where a reading stays while the reference moves, SIGN where both differ."""
+    """JUMP: a velocity that cannot be. FROZEN: a reading that stays while the reference moves. SIGN: both differ."""
     found, floor, per = NONE, c.x[SIGN_SPEED] * c.x[SIGN_SPEED], 1.0 / passed
     for i in range(len(q)):
         if not abs(v[i]) <= c.rows[REACH, i]:

@@ -57,9 +57,7 @@ class Approach:
             made = cls(motion, T, _quintic(*state, T))
             if length is not None or (np.abs(made._polynomial(T * grid)[1]) <= 1.0001 * limit).all():
                 return made
-        raise ArgumentError(
-            f"no approach within 1000 s keeps {robot.name} below half its velocity limits; give length."
-        )
+        raise ArgumentError("no approach within 1000 s stays below half the velocity limits; give a length.")
 
     @property
     def notes(self) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def scene_of(run: Run, robot: Robot, package_dirs: Iterable[str | Path] = ()) ->
     poses = np.stack([body_poses(robot, q), body_poses(robot, q_ref)], axis=1)
     visuals = link_visuals(robot, package_dirs)
     return {
-        "bodies": [_body_node(body)[1] for body in range(robot.model.njoints)],
+        "bodies": [body_node(body)[1] for body in range(robot.model.njoints)],
         "links": {
             frame.name: (frame.parentJoint, frame.placement.homogeneous.T.ravel().tolist())
             for frame in robot.model.frames
@@ -59,7 +59,7 @@ def scene_of(run: Run, robot: Robot, package_dirs: Iterable[str | Path] = ()) ->
         "tips": [{"name": tip.name, "body": tip.joint, "point": tip.point.tolist()} for tip in tips_of(run, robot)],
         "path": "" if tool is None else encoded(_path(robot, run.q_ref, tool["frame"])),
         "view": _view(robot, visuals, poses),
-        "commands": [base64.b64encode(umsgpack.packb(command)).decode() for command in _commands(robot, visuals)],
+        "commands": [base64.b64encode(umsgpack.packb(command)).decode() for command in scene_commands(robot, visuals)],
         "times": encoded(run.t[rows], np.float64),
         "poses": encoded(poses),
     }
@@ -112,16 +112,17 @@ def _frame_rows(t: Float[np.ndarray, " rows"], least: int = 0) -> Int[np.ndarray
     return np.unique(np.minimum(after, len(t) - 1))
 
 
-def _body_node(body: int) -> tuple[str, str]:
+def body_node(body: int) -> tuple[str, str]:
+    """The node of the scene that a body of the arm has."""
     return "actual", f"body{body}"
 
 
-def _commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]:
+def scene_commands(robot: Robot, visuals: tuple[Visual, ...]) -> list[dict[str, Any]]:
     """The meshcat commands that build the arm: a node per body, under it a node per shape."""
-    commands = [SetTransform(np.eye(4), ScenePath(_body_node(body))) for body in range(robot.model.njoints)]
+    commands = [SetTransform(np.eye(4), ScenePath(body_node(body))) for body in range(robot.model.njoints)]
     for index, visual in enumerate(visuals):
         frame = robot.model.frames[robot.model.getFrameId(visual.link, pin.FrameType.BODY)]
-        node = ScenePath((*_body_node(frame.parentJoint), f"shape{index}"))
+        node = ScenePath((*body_node(frame.parentJoint), f"shape{index}"))
         geometry = TriangularMeshGeometry(visual.vertices.astype(np.float32), visual.faces.astype(np.uint32))
         commands += [
             SetObject(geometry, _material(visual), node),

@@ -21,10 +21,11 @@ from nbs_pin.motions.references import Sinusoid
 from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reports.plotting import ACTUAL, ERROR, picture
 from nbs_pin.reproduction import figure5, passive_data
-from nbs_pin.reproduction.study import NOISE, on_all_cores, write_records
+from nbs_pin.reproduction.study import NOISE, write_records
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.simulation import metrics
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
+from nbs_pin.simulation.processes import on_all_cores
 from nbs_pin.simulation.simulate import simulate
 
 FILES = ("learned_loop.csv", "learned_loop.png", *figure5.FILES, passive_data.FILE)

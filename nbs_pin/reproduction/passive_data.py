@@ -17,9 +17,10 @@ from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit import fit
 from nbs_pin.reports.markdown import Section, markdown_table
-from nbs_pin.reproduction.study import on_all_cores, spread, write_records
+from nbs_pin.reproduction.study import spread, write_records
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
+from nbs_pin.simulation.processes import on_all_cores
 
 FILE = "passive.csv"
 ACTUATED = 10

@@ -1,17 +1,14 @@
-"""What the studies share: records as CSV and JSON, spreads over the seeds, tasks on all cores, the noise."""
+"""What the studies share: records as CSV and JSON, spreads over the seeds, the noise."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import joblib
 import numpy as np
 
 from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.plain import plain
-from nbs_pin.base.progress import tracked
 from nbs_pin.identification.measurement import Noise
-from nbs_pin.kernels.threads import cores
 from nbs_pin.reports.markdown import short
 
 NOISE = Noise(encoder=2.0**-16, torque=0.5)
@@ -30,14 +27,3 @@ def spread(values: Sequence[float] | np.ndarray, form: Callable[[float], str] = 
         return form(float(values[0]))
     low, middle, high = (form(float(of(values))) for of in (np.min, np.median, np.max))
     return f"{low} – **{middle}** – {high}"
-
-
-def on_all_cores(
-    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], label: str, progress: bool
-) -> Iterator[Any]:
-    """function(*task) of every task in order, each in a process on one thread, with a progress bar."""
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        pool = joblib.Parallel(n_jobs=min(cores(), len(tasks)), return_as="generator")
-        results = iter(pool(joblib.delayed(function)(*task) for task in tasks))
-        for _ in tracked(tasks, label, progress):
-            yield next(results)

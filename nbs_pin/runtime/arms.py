@@ -6,13 +6,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from nbs_pin.base.arguments import PERIOD, checked, flag, function
+from nbs_pin.base.arguments import PERIOD, checked, flag, function, maybe
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import vector_of
 from nbs_pin.runtime.guarded import Sample
 from nbs_pin.simulation.plant import PLANT, Plant
 
 _SPIN = 2e-4  # the last stretch before an instant is waited for without sleep [s]
+
+_PUSH = function(3, "a disturbance, a function of t, q and v that returns torques, or None")
 
 
 class ArmInterface(Protocol):
@@ -65,7 +67,7 @@ class PlantArm:
 
     compensated = False
 
-    @checked(plant=PLANT, period=PERIOD, real_time=flag, disturbance=lambda name, x: x if x is None else _PUSH(name, x))
+    @checked(plant=PLANT, period=PERIOD, real_time=flag, disturbance=maybe(_PUSH))
     def __init__(
         self,
         plant: Plant,
@@ -119,6 +121,3 @@ class PlantArm:
             time.sleep(left - _SPIN)
         while time.perf_counter() < until:
             pass
-
-
-_PUSH = function(3, "a disturbance, a function of t, q and v that returns torques, or None")

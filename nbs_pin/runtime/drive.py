@@ -117,9 +117,7 @@ def drive(
         (True, True)
     """
     if arm.nv != robot.nv:
-        raise ArgumentError(
-            f"the arm has {arm.nv} joints and {robot.name} {robot.nv}; give the description of the arm."
-        )
+        raise ArgumentError(f"the arm has {arm.nv} joints and {robot.name} {robot.nv}; give its own description.")
     guard = Guard.for_robot(robot, arm.period, compensated=arm.compensated) if guard is None else guard
     if guard.compensated != arm.compensated or abs(guard.period - arm.period) > 1e-9:
         raise ArgumentError("the guard is for another period, or another treatment of gravity; build it for the arm.")

@@ -49,12 +49,11 @@ class FrankaArm:
         try:
             self._robot = self._franka.Robot(host, config.kEnforce if real_time else config.kIgnore)
         except Exception as error:  # the client's exceptions have no common base but Exception
-            raise ArgumentError(
-                f"no Franka arm answers at '{host}' ({error}); check address, cable and FCI."
-            ) from error
+            raise ArgumentError(f"no Franka arm answers at '{host}' ({error}); check address and FCI.") from error
         self._recover, self._fault = recover, ""
         self._control: Any = None
         self._last: Sample | None = None
+        self._sent = self._franka.Torques([0.0] * _JOINTS)
 
     def look(self) -> Sample:
         """Where the arm is, after it has left a reflex if it was in one."""
@@ -94,21 +93,21 @@ class FrankaArm:
         if self._fault:
             return
         try:
-            self._control.writeOnce(self._franka.Torques(tau.tolist()))
+            self._sent = self._franka.Torques(tau.tolist())
+            self._control.writeOnce(self._sent)
         except Exception as error:  # as above; the next read tells
             self._fault = str(error)
 
     def stop(self) -> None:
-        """End the motion with no torque but gravity's, and let the arm hold itself."""
+        """End the motion; the arm then holds itself."""
         control, self._control = self._control, None
         if control is None:
             return
         try:
             if not self._fault:
-                last = self._franka.Torques([0.0] * _JOINTS)
-                last.motion_finished = True
+                self._sent.motion_finished = True  # with the torque of the last period: a step would be a discontinuity
                 control.readOnce()
-                control.writeOnce(last)
+                control.writeOnce(self._sent)
             self._robot.stop()
         except Exception as error:  # the connection is lost, or the arm has already stopped
             self._fault = self._fault or str(error)

@@ -200,7 +200,7 @@ class Guarded:
         state, config, told = self.state, self.guard.config, sample.external
         external = self._nothing if told is None else told
         fault, trace = Fault.ARM if sample.fault else Fault.REQUESTED if stop else Fault.NONE, ""
-        seen = sample.q, sample.v, aim.q, aim.v, external
+        seen: tuple[Any, ...] = sample.q, sample.v, aim.q, aim.v, external
         try:
             action = at.admit(config, state, sample.t, sample.fresh, overrun, *seen)
         except NOT_TAKEN:  # not all contiguous float64 vectors

@@ -49,9 +49,7 @@ class URArm:
             self._receive = receive.RTDEReceiveInterface(host, _FREQUENCY)
             self._control = control.RTDEControlInterface(host, _FREQUENCY)
         except Exception as error:  # the client raises RuntimeError and errors of its sockets
-            raise ArgumentError(
-                f"no UR arm answers at '{host}' ({error}); check address and remote control."
-            ) from error
+            raise ArgumentError(f"no UR arm answers at '{host}' ({error}); check address and mode.") from error
         self._last: Sample | None = None
         self._tick: Any = None
         self._fault = ""

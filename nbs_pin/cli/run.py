@@ -1,0 +1,69 @@
+"""`nbs-pin run`: move an arm in real time behind the guard; write run, summary, figure and replay."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.tool_options import OfTool, ToolOptions
+from nbs_pin.cli.values import SAVED, OptionError, choice, default, number, text
+from nbs_pin.controllers.registry import LAWS
+
+KINDS = ("mujoco", "libfranka", "ur")
+"""Kinds of arms; all but the first have an address."""
+
+
+def _read_arm(words: list[str]) -> str:
+    kind, stated, host = words[0].partition(":")
+    if kind not in KINDS or (kind == "mujoco") != (not stated) or (stated and not host):
+        raise OptionError(f"--arm is '{words[0]}'; give mujoco, libfranka:HOST or ur:HOST.")
+    return words[0]
+
+
+@dataclass(frozen=True)
+class Run(FileUnits):
+    """Move an arm in real time behind the guard, a monitor and no safety function; from where it is, to the motion.
+
+    Example: nbs-pin run panda --arm mujoco --duration 10
+    """
+
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
+    """An arm by name (see nbs-pin robots) or a path to a .urdf, .xacro or MJCF file."""
+    at: Annotated[str, tyro.conf.arg(name="arm"), text("ARM", _read_arm)] = "mujoco"
+    """What to move: mujoco (a simulation in real time), libfranka:HOST, or ur:HOST (not tested on hardware)."""
+    controller: Annotated[str, choice("--controller", LAWS, SAVED)] = "nbs"
+    """A law by name, or a .nbs file with a controller and its gains."""
+    reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
+    """Motion to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints.
+    Paths of the tool: circle:RADIUS[@PLANE], line:DX,DY,DZ [m], or a .csv or .npz file with x, y, z."""
+    frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0
+    """Frequency of the sinusoid [rad/s]."""
+    duration: Annotated[
+        float | None,
+        number("--duration", above=0.0, most=100_000.0, unit="s"),
+        default("10, 5 for a path of the tool, or the file's"),
+    ] = None
+    """How long to move [s], a whole number of periods; the way to the motion is part of it."""
+    rate: Annotated[float, number("--rate", least=10.0, most=10_000.0, unit="Hz")] = 1000.0
+    """Rate of the loop [Hz]; a Franka arm has 1000, a UR arm 500."""
+    bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
+    """Rate at which errors decay [rad/s]; unused by .nbs files."""
+    certified: Annotated[
+        float | None, number("--certified", above=0.0, most=1e9, unit="N·m"), default("0.5 rad for every joint")
+    ] = None
+    """Stop where an error passes the certified bound for disturbances up to this on every joint [N·m]."""
+    live: bool = False
+    """Show the arm in the browser meanwhile, on this machine only."""
+    priority: bool = True
+    """Ask for a real-time priority, where the system grants it."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), default("out/run-ROBOT")] = None
+    """Folder for the results."""
+    force: bool = False
+    """Overwrite the results of another run in that folder."""
+    tool: OfTool = field(default_factory=ToolOptions)
+    """How a path of the tool is followed."""
+    arm: OfArm = field(default_factory=ArmOptions)
+    """How the arm is read."""
