@@ -1,5 +1,6 @@
 """Units of joints: rad and N·m where a joint turns, m and N where it slides; all that shows numbers asks here."""
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -50,6 +51,14 @@ def over_joints(unit: str, prismatic: Iterable[Any]) -> str:
     if unit not in TURNING:
         return unit
     return several(of[TURNING.index(unit)] for of in units_of(prismatic))
+
+
+def measured(value: float, unit: str) -> str:
+    """A number with its unit and what one pictures of an angle or a length: "0.0209 rad (1.2°)", "0.002 m (2 mm)"."""
+    text = f"{value:.3g} {unit}".rstrip()
+    if not math.isfinite(value) or unit not in (TURNING.position, SLIDING.position):
+        return text
+    return f"{text} ({math.degrees(value):.3g}°)" if unit == TURNING.position else f"{text} ({1e3 * value:.3g} mm)"
 
 
 def with_units(texts: Sequence[str], given: Sequence[str]) -> list[str]:

@@ -26,6 +26,7 @@ from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.exit_codes import BAD_INPUT, NO_PROMISE, SIGNALLED
 from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.replay import Replay
+from nbs_pin.cli.report import Report
 from nbs_pin.cli.reproduce import Reproduce
 from nbs_pin.cli.robots import Robots
 from nbs_pin.cli.track import Track
@@ -43,6 +44,7 @@ COMMANDS: dict[str, type] = {
     "certify": Certify,
     "verify": Verify,
     "replay": Replay,
+    "report": Report,
     "reproduce": Reproduce,
     "bench": Bench,
     "robots": Robots,
@@ -113,7 +115,7 @@ def _run(arguments: list[str], notes: Console, stops: list[int], begin: Callable
         begin()
         if stops:  # a library that is being imported may swallow the interrupt
             raise KeyboardInterrupt
-        with at_the_shell(flags(command), given(command)):
+        with at_the_shell(flags(command), given(command), ["nbs-pin", *arguments]):
             return body.run(command, console, notes) or 0
     return 0
 

@@ -9,6 +9,7 @@ import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import SAVED, choice, configuration, default, disturbance_text, integer, number
 from nbs_pin.controllers.registry import LAWS
@@ -16,7 +17,7 @@ from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
 
 
 @dataclass(frozen=True)
-class Track(FileUnits):
+class Track(FileUnits, Reported):
     """Simulate an arm that follows a motion, and write run.npz, summary.json, tracking.png and replay.html.
 
     Example: nbs-pin track panda --start-error 0.3 --disturbance square:5@8 --out out/panda
