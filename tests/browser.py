@@ -96,7 +96,9 @@ class Browser:
         self.events.clear()
         self.call("Page.navigate", url=Path(path).resolve().as_uri() + fragment)
         end = time.monotonic() + self.patience
-        while not self.evaluate("document.readyState === 'complete' && typeof window.replay === 'object'"):
+        while not self.evaluate(
+            "document.readyState === 'complete' && typeof (window.replay ?? window.report) === 'object'"
+        ):
             if time.monotonic() > end:
                 raise RuntimeError(f"the page did not come up: {self.complaints()}")
             time.sleep(0.05)

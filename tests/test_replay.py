@@ -328,7 +328,7 @@ def test_of_a_long_run_the_rows_of_largest_error_and_torque_are_kept():
     run = moving_run(load_robot("two_link"), duration=120.0)
     run.q[12345, 1] += 5.0
     run.tau_command[23456, 0] = 1e4
-    rows = _rows(run)
+    rows = _rows(run, MAX_ROWS)
     assert {0, 12345, 23456, len(run.t) - 1} <= set(rows.tolist())
     assert len(rows) <= MAX_ROWS + 3
     assert np.diff(rows).max() <= 3 * len(run.t) / MAX_ROWS + 1

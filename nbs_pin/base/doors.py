@@ -30,6 +30,8 @@ class _Shell(NamedTuple):
     """By the name of each option, how it is typed: --data, or ROBOT of what is given by its place."""
     given: Mapping[str, str]
     """By each text that was typed, the option that it was given to."""
+    command: str = ""
+    """All of it, as one line of the shell."""
 
 
 BLANK = _Blank("…")
@@ -95,6 +97,11 @@ def names_of(options: Iterable[str]) -> list[str]:
     return list(options) if shell is None else [shell.flags[name] for name in options if name in shell.flags]
 
 
+def typed_command() -> str:
+    """The command that was typed in the shell, empty in Python."""
+    return _doors[-1].command if _doors[-1] is not None else ""
+
+
 def argument(function: str, name: str, value: Any = None) -> str:
     """What a message calls an argument with that value.
 
@@ -112,14 +119,17 @@ def argument(function: str, name: str, value: Any = None) -> str:
 
 
 @contextmanager
-def at_the_shell(flags: Mapping[str, str] | None = None, given: Mapping[str, str] | None = None) -> Iterator[None]:
+def at_the_shell(
+    flags: Mapping[str, str] | None = None, given: Mapping[str, str] | None = None, command: Iterable[str] = ()
+) -> Iterator[None]:
     """Within this context, messages name flags of the shell.
 
     Args:
         flags: By the name of each option of the command, how it is typed.
         given: By each text that was typed, the option that it was given to.
+        command: All words that were typed.
     """
-    _doors.append(_Shell(flags or {}, given or {}))
+    _doors.append(_Shell(flags or {}, given or {}, shlex.join(command)))
     try:
         yield
     finally:

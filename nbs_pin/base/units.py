@@ -58,7 +58,7 @@ def measured(value: float, unit: str) -> str:
     text = f"{value:.3g} {unit}".rstrip()
     if not math.isfinite(value) or unit not in (TURNING.position, SLIDING.position):
         return text
-    return f"{text} ({math.degrees(value):.2g}°)" if unit == TURNING.position else f"{text} ({1e3 * value:.2g} mm)"
+    return f"{text} ({math.degrees(value):.3g}°)" if unit == TURNING.position else f"{text} ({1e3 * value:.3g} mm)"
 
 
 def with_units(texts: Sequence[str], given: Sequence[str]) -> list[str]:

@@ -6,11 +6,12 @@ from typing import Annotated
 
 import tyro
 
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import Verbose, integer
 
 
 @dataclass(frozen=True)
-class Bench:
+class Bench(Reported):
     """Time every law on the given arms, steps of the plants, and the cost against the number of joints.
 
     Example: nbs-pin bench --arms panda ur5 --out out/bench --compare old/summary.json

@@ -10,6 +10,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import (
     OptionError,
@@ -58,7 +59,7 @@ def friction_text() -> PrimitiveConstructorSpec[str]:
 
 
 @dataclass(frozen=True)
-class Certify(FileUnits):
+class Certify(FileUnits, Reported):
     """Certify a controller: bound its tracking error under any bounded disturbance, and say how each bound is known.
 
     Print the bound of the error with its label PROVED, VERIFIED, PROBABILISTIC or EMPIRICAL, with -v every constant and

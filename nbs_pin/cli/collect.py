@@ -7,11 +7,12 @@ from typing import Annotated, Literal
 import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import Verbose, default, integer, number
 
 
 @dataclass(frozen=True)
-class Collect:
+class Collect(Reported):
     """Record motions of an arm in MuJoCo for learning its dynamics; write data.npz, coverage.png and summary.json.
 
     Learn from the result: nbs-pin learn out/collect-panda/data.npz

@@ -9,6 +9,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import OptionError, Verbose, default, integer, number, text
 
 
@@ -25,7 +26,7 @@ def joint_pair() -> PrimitiveConstructorSpec[str]:
 
 
 @dataclass(frozen=True)
-class Compare:
+class Compare(Reported):
     """Compare a model of an arm with Pinocchio's, and write errors.png, errors.csv and summary.json.
 
     They show the errors of M, C v, G, torque and acceleration over a box of states, their growth with speed and outside

@@ -8,12 +8,13 @@ import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import Verbose, choice, default, integer, number
 from nbs_pin.identification.registry import MODELS
 
 
 @dataclass(frozen=True)
-class Learn(FileUnits):
+class Learn(FileUnits, Reported):
     """Learn a model of an arm from data, and write model.nbs, summary.json and learning.png.
 
     Ctrl-C ends the fit of a network early and keeps the best iteration. Compare the result with Pinocchio's model:

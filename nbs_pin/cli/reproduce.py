@@ -6,11 +6,12 @@ from typing import Annotated, Literal
 
 import tyro
 
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import integer
 
 
 @dataclass(frozen=True)
-class Reproduce:
+class Reproduce(Reported):
     """Reproduce the paper's experiments or run further studies; write report.md, summary.json, figures and CSV files.
 
     Ctrl-C keeps the sections that are done.

@@ -29,6 +29,7 @@ from nbs_pin.cli.export import Export
 from nbs_pin.cli.faults import Faults
 from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.replay import Replay
+from nbs_pin.cli.report import Report
 from nbs_pin.cli.reproduce import Reproduce
 from nbs_pin.cli.robots import Robots
 from nbs_pin.cli.run import Run
@@ -48,6 +49,7 @@ COMMANDS: dict[str, type] = {
     "verify": Verify,
     "export": Export,
     "replay": Replay,
+    "report": Report,
     "reproduce": Reproduce,
     "run": Run,
     "faults": Faults,
@@ -120,7 +122,7 @@ def _run(arguments: list[str], notes: Console, stops: list[int], begin: Callable
         begin()
         if stops:  # a library that is being imported may swallow the interrupt
             raise KeyboardInterrupt
-        with at_the_shell(flags(command), given(command)):
+        with at_the_shell(flags(command), given(command), ["nbs-pin", *arguments]):
             return body.run(command, console, notes) or 0
     return 0
 

@@ -9,6 +9,7 @@ import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import (
     SAVED,
@@ -26,7 +27,7 @@ from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
 
 
 @dataclass(frozen=True)
-class Track(FileUnits):
+class Track(FileUnits, Reported):
     """Simulate an arm that follows a motion, and write run.npz, summary.json, tracking.png and replay.html.
 
     With several laws, write a run of each, comparison.png and summary.json. Ctrl-C keeps what was simulated.

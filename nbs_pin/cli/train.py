@@ -8,12 +8,13 @@ from typing import Annotated, Literal
 import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import SAVED, Verbose, choice, default, integer, number, positive_list
 from nbs_pin.controllers.registry import LAWS
 
 
 @dataclass(frozen=True)
-class Train:
+class Train(Reported):
     """Train a controller through the closed loop, and write controller.nbs, summary.json and learning.png.
 
     Ctrl-C stops early and keeps the best epoch; --resume continues from there. Track with the result:

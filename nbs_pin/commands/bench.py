@@ -8,11 +8,13 @@ from rich.console import Console
 from rich.table import Table
 
 from nbs_pin.base.files import replaced_together
+from nbs_pin.base.summaries import REPORT, SUMMARY, summary_text
 from nbs_pin.benchmarks import bench
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import SUMMARY, drawing, summary_text, table, tell
+from nbs_pin.commands.results import drawing, table, tell
 from nbs_pin.reports.charts import plot_scaling
+from nbs_pin.reports.report import report
 
 _COLUMNS = {
     "control step": {
@@ -47,19 +49,22 @@ def run(options: Bench, console: Console, notes: Console) -> None:
             rows.append(row)
             status.update(f"measured {row.key}")
     picture = options.out / "joints.png"
-    with replaced_together(options.out, [SUMMARY, picture.name]) as draft:
+    with replaced_together(options.out, [SUMMARY, REPORT, picture.name]) as draft:
         (draft / SUMMARY).write_text(summary_text(bench.summary(rows)), encoding="utf-8")
     chain = [row.figures for row in rows if row.what == "joints"]
     lines = {"compiled law": "p50_us", "two RNEA": "two_rnea_us"}
     series = {name: [figures[key] for figures in chain] for name, key in lines.items()}
     with drawing(picture):
         plot_scaling([figures["joints"] for figures in chain], series, picture)
+    if options.report:
+        report([options.out], options.out / REPORT)
     kinds = [what for what in _COLUMNS if any(row.what == what for row in rows)]
     tables = [_shown(what, _COLUMNS[what], [row for row in rows if row.what == what]) for what in kinds]
     tell(console, _verdict(rows), (), tables, verbose=options.verbose)
     if known is not None:
         console.print(_moved(bench.compare(rows, known)))
-    console.print(str(options.out / SUMMARY), str(picture), sep="\n", highlight=False)
+    written = [str(options.out / SUMMARY), str(picture), *([str(options.out / REPORT)] if options.report else [])]
+    console.print(*written, sep="\n", highlight=False)
 
 
 def _verdict(rows: list[bench.Row]) -> str:

@@ -16,6 +16,7 @@ from nbs_pin.certificates.certificate_file import is_in_its_file, write_certific
 from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.loads import MARGIN
 from nbs_pin.certificates.model_structure import is_exact
+from nbs_pin.certificates.tip_bound import tip_bound
 from nbs_pin.certificates.uncertainty import Uncertainty
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.exit_codes import NO_PROMISE
@@ -26,7 +27,9 @@ from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.motions.by_name import motion_of
+from nbs_pin.reports.captions import chosen
 from nbs_pin.reports.certificate_charts import plot_certificate, plot_monitor
+from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.checkpoints import load, load_with, save
 
@@ -152,8 +155,12 @@ def _friction(text: str | None, robot: Robot) -> JointFriction | None:
 def figures(result: Certified) -> dict[str, Any]:
     """All results as JSON can store them, with units in the keys; None for numbers that are not finite."""
     certificate, found, proposal = result.certificate, result.attack, result.proposal
+    arm = certificate.robot
     numbers: dict[str, Any] = {
-        "arm": None if certificate.robot is None else certificate.robot.name,
+        "arm": None if arm is None else arm.name,
+        "tip_error_m": None
+        if arm is None or certificate.void
+        else tip_bound(arm, certificate.joint_errors, certificate.error),
         "certificate": certificate.summary(),
         "disturbance_label": str(certificate.admissible.label),
         "useless": list(certificate.useless),
@@ -219,11 +226,14 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
             robot = result.certificate.robot
             if robot is not None and not is_in_its_file(robot):
                 (draft / ARM).write_bytes(robot.urdf.without_geometry())
+    names = ("law", "controller", "bandwidth", "period", "friction", "unknown_payload", "delay", "encoder_bits", "seed")
+    settings = chosen(results.facts["settings"], *names)
     with drawing(folder / FILES[0]) as path:
-        plot_certificate(result.certificate, result.attack, path)
+        plot_certificate(result.certificate, result.attack, path, settings=settings, verdict=verdict_of(found))
     if result.watched is not None:
         with drawing(folder / MONITOR) as path:
-            plot_monitor(result.watched, path, units=result.certificate.joint_units)
+            title = f"{found['arm'] or 'a run'}: a run against its certificate"
+            plot_monitor(result.watched, path, units=result.certificate.joint_units, title=title, settings=settings)
     written = (FILES[0], FILES[1], MONITOR, DESIGNED, CERTIFICATE, ARM, SUMMARY)
     return found, [name for name in written if (folder / name).exists()]
 

@@ -15,7 +15,9 @@ from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import torque_limits
 from nbs_pin.identification.measurement import Noise
-from nbs_pin.reports.plotting import ACTUAL, LIMIT, TORQUE, picture
+from nbs_pin.reports.captions import chosen
+from nbs_pin.reports.plotting import ACTUAL, LIMIT, TORQUE, Heading, picture
+from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot, load_robot
 
 FILES = ("data.npz", "coverage.png", SUMMARY)
@@ -43,14 +45,17 @@ def run(options: Collect, console: Console, notes: Console) -> None:
             with results.replaced(FILES, found) as draft:
                 data.save(draft / FILES[0])
             with drawing(folder / FILES[1]) as path:
-                plot_coverage(data, path, robot)
+                settings = chosen(results.facts["settings"], "torque_noise", "encoder_bits", "friction", "seed")
+                plot_coverage(
+                    data, path, robot, Heading(f"{robot.name}: data, {options.recipe}", settings, verdict_of(found))
+                )
     _print(console, f"{robot.name}, {options.recipe}", found, verbose=options.verbose)
     results.show(console, FILES, "learn", results.folder / FILES[0])
 
 
 def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
     """The range of the samples per joint, as JSON can store it; units in the keys, m and N for prismatic joints."""
-    limit = torque_limits(robot)
+    limit, (low, high) = torque_limits(robot), robot.sampling_range
     return {
         "samples": len(data),
         "trajectories": data.trajectories,
@@ -58,6 +63,7 @@ def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
         "units": by_quantity(robot.prismatic),
         "q_least_rad": data.q.min(axis=0).tolist(),
         "q_most_rad": data.q.max(axis=0).tolist(),
+        "covered_range_fraction": (np.ptp(data.q, axis=0) / (high - low)).tolist(),
         "rms_velocity_rad_per_s": _rms(data.v),
         "peak_velocity_rad_per_s": np.abs(data.v).max(axis=0).tolist(),
         "rms_acceleration_rad_per_s2": _rms(data.a),
@@ -68,15 +74,15 @@ def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
     }
 
 
-def plot_coverage(data: Dataset, path: str | Path, robot: Robot) -> Path:
-    """Plot the states that the samples cover and write the picture (PNG); returns its path.
+def plot_coverage(data: Dataset, path: str | Path, robot: Robot, heading: Heading | None = None) -> Path:
+    """Plot the states that the samples cover and write the picture (`plotting.picture`); returns its path.
 
     Each column shows velocity against position with the range of a joint, and torque against acceleration with its
     limits if they are near. At most 4000 samples, evenly picked, are drawn.
     """
     shown = np.unique(np.linspace(0, len(data) - 1, _DOTS).astype(int))
     q, v, a, tau = (x[shown] for x in (data.q, data.v, data.a, data.tau))
-    with picture(path, 1.0 + 2.4 * data.nv, 4.8) as figure:
+    with picture(path, 1.0 + 2.4 * data.nv, 4.8, heading=heading) as figure:
         grid = figure.subplots(2, data.nv, squeeze=False)
         for joint, (states, torques) in enumerate(grid.T):
             info, limit = robot.joints[joint], robot.effort_limit[joint]
@@ -90,7 +96,13 @@ def plot_coverage(data: Dataset, path: str | Path, robot: Robot) -> Path:
                     torques.axhline(bound, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
             (of,) = units_of([info.prismatic])
             states.set_title(info.name, loc="left")
+            share = float(np.ptp(data.q[:, joint]) / (info.upper - info.lower))
+            if share > 0.0:
+                states.annotate(f"{share:.0%} of its range", (1.0, 1.0), xycoords="axes fraction", ha="right",
+                                va="bottom", fontsize=7, color=LIMIT)  # fmt: skip
             states.set(xlabel=f"q [{of.position}]", ylabel=f"v [{of.velocity}]")
+            torques.annotate(f"limit ±{limit:.4g}", (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom",
+                             fontsize=7, color=LIMIT)  # fmt: skip
             torques.set(xlabel=f"acceleration [{of.acceleration}]", ylabel=f"τ [{of.torque}]")
     return Path(path)
 

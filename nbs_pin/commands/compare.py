@@ -28,6 +28,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import load_dataset
 from nbs_pin.motions.references import Sinusoid
 from nbs_pin.reports.error_charts import plot_model_errors
+from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
@@ -232,7 +233,14 @@ def write_results(result: Comparison, robot: Robot, results: Results, title: str
     labels = [f"{name} [{unit.position}]" for name, unit in zip(robot.joint_names, of, strict=True)]
     why = result.missing or "no closed loop was run"
     with drawing(results.folder / FILES[0]) as path:
-        plot_model_errors(result.errors, result.heat, path, title=title, joints=labels, units=of, missing=why)
+        given: dict[str, Any] = {
+            "title": title,
+            "joints": labels,
+            "units": of,
+            "missing": why,
+            "verdict": verdict_of(found),
+        }
+        plot_model_errors(result.errors, result.heat, path, **given)
     return found
 
 

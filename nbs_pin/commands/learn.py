@@ -22,7 +22,9 @@ from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit import fit, split_data
 from nbs_pin.identification.fit_report import FitReport, torque_errors
 from nbs_pin.identification.logs import load_log
-from nbs_pin.reports.plotting import ACTUAL, LIMIT, REFERENCE, picture
+from nbs_pin.reports.captions import chosen
+from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, Heading, picture
+from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.named import load_named
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.checkpoints import save
@@ -55,7 +57,8 @@ def run(options: Learn, console: Console, notes: Console) -> None:
             with results.replaced(FILES, found, interrupted=interrupted) as draft:
                 save(result.model, draft / FILES[0], info={"learned": results.facts | {"interrupted": interrupted}})
             with drawing(folder / FILES[1]) as path:
-                plot_learning(result, path)
+                settings = chosen(results.facts["settings"], "loss", "optimiser", "held_out", "seed")
+                plot_learning(result, path, Heading(f"{name}: {options.model}, learned", settings, verdict_of(found)))
     _print(console, f"{name}, {options.model}", found, verbose=options.verbose)
     known = robot is not None and not interrupted
     results.show(console, FILES, *(("compare", results.folder / FILES[0]) if known else ()))
@@ -140,13 +143,13 @@ def figures(result: Learned) -> dict[str, Any]:
     )
 
 
-def plot_learning(result: Learned, path: str | Path) -> Path:
-    """Plot the course of the fit and write the picture (PNG); returns its path.
+def plot_learning(result: Learned, path: str | Path, heading: Heading | None = None) -> Path:
+    """Plot the course of the fit and write the picture (`plotting.picture`); returns its path.
 
     Left: normalised mean squared residual by iteration, on training and held-out data. Right: RMS torque error of each
-    joint on both, beside the standard deviation of its torque.
+    joint on both, between the standard deviation of its torque and the noise in the data, where that is known.
     """
-    with picture(path, 11.0, 4.2) as figure:
+    with picture(path, 11.0, 4.2, heading=heading) as figure:
         curve, bars = figure.subplots(1, 2)
         for name, values, colour in (
             ("training", result.report.history, ACTUAL),
@@ -166,11 +169,16 @@ def plot_learning(result: Learned, path: str | Path) -> Path:
 
 def _draw_errors(axes: Any, result: Learned) -> None:
     place = np.arange(len(result.joints))
-    axes.semilogy(place, result.train.tau.std(axis=0), "_", color=LIMIT, markersize=18, label="standard deviation")
+    noise = result.report.details.get("noise_Nm")
+    axes.semilogy(place, result.train.tau.std(axis=0), "_", color=LIMIT, markersize=26, label="standard deviation")
+    if noise is not None:
+        axes.semilogy(place, noise, "_", color=ERROR, markersize=26, label="noise in the data")
     parts = (("training", result.train, ACTUAL, -0.12), ("held out", result.test, REFERENCE, 0.12))
     for name, data, colour, shift in parts:
         if data is not None:
             axes.semilogy(place + shift, _errors(result, data), "o", color=colour, markersize=5, label=name)
+    low, high = axes.get_ylim()
+    axes.set_ylim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))  # so that two powers are written
     axes.set_xticks(
         place, result.joints, rotation=30 if len(place) > 4 else 0, ha="right" if len(place) > 4 else "center"
     )

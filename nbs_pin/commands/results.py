@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import hashlib
 import inspect
-import json
 import re
 import shlex
 import warnings
@@ -18,14 +17,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nbs_pin.base.doors import typed_command
 from nbs_pin.base.files import replaced_together
+from nbs_pin.base.summaries import REPORT, SUMMARY as SUMMARY, summary_in, summary_text as summary_text
 from nbs_pin.base.versions import versions
 from nbs_pin.cli.values import OptionError
 from nbs_pin.robots.robot import Robot
 
-SUMMARY = "summary.json"
 _MOST_FOLDERS = 1000
-_NO_SETTINGS = ("out", "resume", "force", "verbose")
+_NO_SETTINGS = ("out", "resume", "force", "verbose", "report")
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Results:
     """Settings, versions and the arm's fingerprint, which are equal for identical runs."""
     is_default: bool = False
     """Whether the folder was not given, so that another may be taken."""
+    report: bool = False
+    """Whether `show` is to write the page of `nbs_pin.reports.report` too."""
 
     @classmethod
     def of(cls, options: Any, name: str, robot: Robot | None, /, **resolved: Any) -> "Results":
@@ -52,7 +54,7 @@ class Results:
         folder = options.out or Path("out") / f"{command}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
         sha256 = {} if robot is None else {"robot_sha256": robot.sha256}
         facts = {"settings": settings_of(options, **resolved), "versions": versions(), **sha256}
-        return cls(folder, facts, options.out is None)
+        return cls(folder, facts, options.out is None, options.report)
 
     def check(
         self,
@@ -121,14 +123,22 @@ class Results:
         summary.json is added with the facts, the figures and further entries. Whenever the process ends, the files of
         those names in the folder belong to one run. Pictures are drawn afterwards, within `drawing`.
         """
-        with replaced_together(self.folder, [SUMMARY, *names]) as draft:
+        with replaced_together(self.folder, [SUMMARY, REPORT, *names]) as draft:
             yield draft
-            summary = summary_text(self.facts | more | {"figures": figures})
+            typed = {"command": typed_command()} if typed_command() else {}
+            summary = summary_text(self.facts | typed | more | {"figures": figures})
             (draft / SUMMARY).write_text(summary, encoding="utf-8")
 
     def show(self, console: Console, names: Iterable[str], *following: str | Path) -> None:
-        """Print the paths of the results that exist, one per line, and the arguments of a command to go on with."""
-        for name in names:
+        """Print the paths of the results that exist, one per line, and the arguments of a command to go on with.
+
+        The report is written before, if it is wanted.
+        """
+        if self.report:
+            from nbs_pin.reports.report import report  # which loads the drawing of arms
+
+            report([self.folder], self.folder / REPORT)
+        for name in (*names, REPORT):
             if (self.folder / name).exists():
                 console.print(str(self.folder / name), soft_wrap=True, highlight=False, markup=False)
         if following:
@@ -182,20 +192,6 @@ def settings_of(options: Any, **resolved: Any) -> dict[str, Any]:
 def sha256_of(file: Path) -> str:
     """SHA-256 of a file's bytes."""
     return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-def summary_text(summary: Mapping[str, Any]) -> str:
-    """A summary as the text of summary.json."""
-    return json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def summary_in(folder: Path) -> dict[str, Any]:
-    """The content of summary.json in the folder, empty if it cannot be read."""
-    try:
-        summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return summary if isinstance(summary, dict) else {}
 
 
 def keywords(options: Any, function: Callable[..., Any]) -> dict[str, Any]:

@@ -16,7 +16,10 @@ from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table,
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import Sinusoid, check_reference
+from nbs_pin.reports.captions import arm_in_words, chosen, law_in_words
 from nbs_pin.reports.charts import plot_training
+from nbs_pin.reports.plotting import Heading
+from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.costs import stage_cost
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
@@ -154,7 +157,9 @@ def write_results(result: Trained, results: Results, *, interrupted: bool) -> di
         save(training.controller, draft / FILES[0], info={"trained": results.facts | {"interrupted": interrupted}})
     shown = training.history, training.held_out, training.best_epoch, result.before, result.after
     with drawing(results.folder / FILES[1]) as path:
-        plot_training(*shown, path)
+        settings = chosen(results.facts["settings"], "bandwidth", "period", "start_error", "cost", "optimiser", "seed")
+        title = f"{arm_in_words(result.after)}: {law_in_words(result.after)}, trained"
+        plot_training(*shown, path, Heading(title, settings, verdict_of(numbers)))
     return numbers
 
 

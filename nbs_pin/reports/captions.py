@@ -1,7 +1,7 @@
 """What made a run, in words: the titles and settings of pictures and pages."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from nbs_pin.base.records import Run
@@ -22,17 +22,26 @@ _ENGINES = {
 }
 
 
-def law_of(run: Run) -> str:
+_PHRASES: dict[str, Callable[[Any], str]] = {
+    "bandwidth": "ω = {:g} rad/s".format,
+    "period": lambda value: f"control every {1e3 * value:g} ms",
+    "duration": "{:g} s".format,
+    "start_error": "start off by up to {:g} rad".format,
+    "torque_noise": "torque noise {:g} N·m".format,
+}
+
+
+def law_in_words(run: Run) -> str:
     """The control law of a run, as in "neural backstepping"."""
     return _words(str(run.info.get("controller") or "unnamed law"))
 
 
-def arm_of(run: Run) -> str:
+def arm_in_words(run: Run) -> str:
     """The arm of a run, without the folder of its file."""
     return re.sub(r"\.(urdf|xacro|xml)$", "", run.robot.rsplit("/", 1)[-1]) or f"{run.nv} joints"
 
 
-def settings_of(run: Run) -> list[str]:
+def settings_in_words(run: Run) -> list[str]:
     """What else determines a run, one phrase each: rate and period of the law, motion, disturbance, plant, seed."""
     given = run.info.get("settings")
     given = given if isinstance(given, Mapping) else {}
@@ -48,6 +57,18 @@ def settings_of(run: Run) -> list[str]:
         f"seed {given['seed']}" if "seed" in given else "",
     ]
     return [phrase for phrase in phrases if phrase]
+
+
+def chosen(settings: Mapping[str, Any], *names: str) -> list[str]:
+    """The settings of those names as phrases, without those that are off; the law's and the period in words."""
+    phrases = []
+    for name in names:
+        value = settings.get(name)
+        if value in (None, False, "", "none", {}, 0.0) and name != "seed":
+            continue
+        known = _PHRASES.get(name)
+        phrases.append(known(value) if known else f"{name.replace('_', ' ')} {_told(value)}")
+    return phrases
 
 
 def _motion(run: Run, given: Mapping[str, Any]) -> str:

@@ -1,6 +1,5 @@
 """Figures of certificates: bounds beside what happened, in the style of `plotting`."""
 
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
@@ -8,17 +7,31 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, SymmetricalLogLocator
 
-from nbs_pin.base.units import several
+from nbs_pin.base.units import measured, several
 from nbs_pin.certificates.attack import Attack
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.monitor import Monitored
-from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture, stretches, thin
+from nbs_pin.reports.plotting import (
+    ACTUAL,
+    ERROR,
+    INK,
+    LIMIT,
+    NOTE,
+    REFERENCE,
+    SATURATED,
+    TORQUE,
+    VIOLET,
+    Heading,
+    picture,
+    stretches,
+    thin,
+)  # fmt: skip
+from nbs_pin.reports.verdicts import BAD, GOOD, WARNING, Verdict
 from nbs_pin.robots.robot import configuration_difference
 
-_INK, _NOTE, _VIOLET = "#1d2733", "#5d6b7a", "#7a4fa3"
 _DASHED, _DOTTED = (0, (5, 3)), (0, (1, 2))
 _LEGEND: Any = {"frameon": False, "ncols": 6, "handlelength": 1.4, "columnspacing": 1.2, "borderaxespad": 0.1}
 _DECADES = 12  # of V that are drawn, at most
@@ -26,20 +39,29 @@ _TERMS = {
     "potential": ("−∇ΦᵀΛ∇Φ", TORQUE),
     "damping": ("−z2ᵀ(ωM + D)z2", ACTUAL),
     "disturbance": ("z2ᵀτ_d", REFERENCE),
-    "held": ("z2ᵀ(held − law)", _VIOLET),
+    "held": ("z2ᵀ(held − law)", VIOLET),
     "saturation": ("z2ᵀ(τ − τ_command)", SATURATED),
 }
 
 
-def plot_monitor(monitored: Monitored, path: str | Path, *, units: Sequence[str] = ("rad",)) -> Path:
-    """Plot a run against its certificate and write the picture (PNG); returns its path.
+def plot_monitor(
+    monitored: Monitored,
+    path: str | Path,
+    *,
+    units: Sequence[str] = ("rad",),
+    title: str = "A run against its certificate",
+    settings: Sequence[str] = (),
+) -> Path:
+    """Plot a run against its certificate and write the picture (`plotting.picture`); returns its path.
 
     V and its bound on a logarithmic scale; ‖z1‖ and its bound, with the |z1_i| that exceeds its own most; V̇ and each of
     its terms; and when each assumption failed. Saturated stretches are shaded, exceeded bounds are marked. units: of
-    every joint's error.
+    every joint's error; title and settings: above it, with the verdict.
     """
-    rows = max(len(monitored.failures), 1)
-    with picture(path, 11.0, 8.2 + 0.34 * rows) as figure:
+    rows, verdict = max(len(monitored.failures), 1), monitored.verdict
+    level = BAD if not monitored.is_kept else WARNING if monitored.broken else GOOD
+    heading = Heading(title, settings, Verdict(level, f"{verdict[0].upper()}{verdict[1:]}."))
+    with picture(path, 11.0, 8.6 + 0.34 * rows, heading=heading) as figure:
         heights = [2.6, 1.8, 3.0, 0.35 + 0.34 * rows]
         storage, error, terms, flags = figure.subplots(4, 1, sharex=True, height_ratios=heights)
         _draw_storage(storage, monitored)
@@ -49,39 +71,36 @@ def plot_monitor(monitored: Monitored, path: str | Path, *, units: Sequence[str]
         for axes in (storage, error, terms):
             _shade(axes, monitored)
         flags.set(xlabel="time [s]", xlim=(monitored.t[0], monitored.t[-1]))
-        colour = TORQUE if monitored.is_kept else ERROR
-        verdict = monitored.verdict
-        figure.suptitle(verdict[0].upper() + verdict[1:], x=0.008, ha="left", fontsize=10.5, color=colour, wrap=True)
     return Path(path)
 
 
-def plot_certificate(certificate: Certificate, attack: Attack | None, path: str | Path) -> Path:
-    """Plot the bounds and the worst motion found, and write the picture (PNG); returns its path.
+def plot_certificate(
+    certificate: Certificate,
+    attack: Attack | None,
+    path: str | Path,
+    *,
+    settings: Sequence[str] = (),
+    verdict: Verdict | None = None,
+) -> Path:
+    """Plot the bounds and the worst motion found, and write the picture (`plotting.picture`); returns its path.
 
     With an attack: ‖z1(t)‖ of its worst motion, the certified bound and the one that the paper prints. Always: the
-    bound of each joint, beside its largest error found. The title says how the bounds are known, or why they are void.
+    bound of each joint, beside its largest error found. The title says how the bounds are known, or why they are void;
+    settings and a verdict may stand below it.
     """
-    with picture(path, 11.0, 4.6) if attack is not None else picture(path, 6.4, 4.2) as figure:
+    if certificate.void:
+        verdict = Verdict(BAD, f"The bounds are void, as these conditions fail: {'; '.join(certificate.void)}.")
+    arm = "" if certificate.robot is None else f"{certificate.robot.name}, "
+    heading = Heading(f"{arm}{certificate.disturbance}: {certificate.label}", settings, verdict)
+    size = (6.4, 4.6) if attack is None else (11.0, 5.0)
+    with picture(path, *size, heading=heading) as figure:
         if attack is None:
             _draw_joints(figure.add_subplot(), certificate, None)
         else:
             motion, joints = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
             _draw_attack(motion, certificate, attack)
             _draw_joints(joints, certificate, attack)
-        colour = ERROR if certificate.void else _INK
-        title = _standing(certificate, 70 if attack is None else 120)
-        figure.suptitle(title, x=0.008, ha="left", fontsize=11, fontweight="bold", color=colour)
     return Path(path)
-
-
-def _standing(certificate: Certificate, width: int) -> str:
-    """The arm, the disturbance and how the bounds are known; below, wrapped to the width, why they are void."""
-    arm = "" if certificate.robot is None else _plain(certificate.robot.name) + ", "
-    title = f"{arm}{certificate.disturbance}: {certificate.label}"
-    if not certificate.void:
-        return title
-    failed = f"the bounds are void, as these conditions fail: {'; '.join(certificate.void)}"
-    return "\n".join([title, *textwrap.wrap(_plain(failed), width)])
 
 
 def _draw_storage(axes: Axes, seen: Monitored) -> None:
@@ -107,8 +126,8 @@ def _draw_error(axes: Axes, seen: Monitored, unit: str) -> None:
     names = [f"|z1| of {name}" for name in seen.joint_names]
     i = int((seen.joint_errors - seen.joint_bounds).max(axis=0).argmax())
     if names[i] in seen.excesses:
-        axes.plot(*thin(seen.t, seen.joint_errors[:, i]), color=_VIOLET, linewidth=1.0, label=_plain(names[i]))
-        axes.plot(*thin(seen.t, seen.joint_bounds[:, i]), color=_VIOLET, linewidth=1.0, linestyle=_DASHED)
+        axes.plot(*thin(seen.t, seen.joint_errors[:, i]), color=VIOLET, linewidth=1.0, label=_plain(names[i]))
+        axes.plot(*thin(seen.t, seen.joint_bounds[:, i]), color=VIOLET, linewidth=1.0, linestyle=_DASHED)
     axes.set_ylim(0.0, 1.15 * max(float(seen.error_bound.max()), float(seen.error.max()), 1e-12))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     _title(axes, f"tracking error [{unit}]")
@@ -120,9 +139,11 @@ def _draw_terms(axes: Axes, seen: Monitored) -> None:
         values = getattr(seen.balance, name)
         if values.any():
             axes.plot(*thin(middle, values), color=colour, linewidth=1.0, label=label)
-    axes.plot(*thin(middle, seen.balance.change), color=_INK, linewidth=1.0, linestyle=_DOTTED, label="V̇")
+    axes.plot(*thin(middle, seen.balance.change), color=INK, linewidth=1.0, linestyle=_DOTTED, label="V̇")
     axes.axhline(0.0, color=LIMIT, linewidth=0.7)
-    axes.yaxis.set_major_locator(MaxNLocator(5))
+    peak = max((float(np.abs(line.get_ydata()).max()) for line in axes.lines), default=0.0)
+    axes.set_yscale("symlog", linthresh=1e-4 * peak or 1.0)  # what comes after the first instants is far smaller
+    axes.yaxis.set_major_locator(SymmetricalLogLocator(base=100.0, linthresh=1e-4 * peak or 1.0))
     _title(axes, "rate of V and its terms [W]")
 
 
@@ -136,15 +157,18 @@ def _draw_flags(axes: Axes, seen: Monitored) -> None:
     axes.set_ylim(max(len(names), 1) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
     if not names:
-        axes.annotate("none", (0.5, 0.5), xycoords="axes fraction", ha="center", va="center", color=_NOTE)
-    axes.set_title("assumptions that failed", loc="left", color=_INK)
+        axes.annotate("none", (0.5, 0.5), xycoords="axes fraction", ha="center", va="center", color=NOTE)
+    axes.set_title("assumptions that failed", loc="left", color=INK)
 
 
 def _draw_attack(axes: Axes, certificate: Certificate, attack: Attack) -> None:
-    run = attack.run
+    run, unit = attack.run, several(certificate.joint_units)
     z1 = configuration_difference(run.q, run.q_ref, run.continuous)
-    axes.plot(*thin(run.t, np.linalg.norm(z1, axis=-1)), color=ERROR, label=f"worst found, {attack.error:.3g}")
-    bounds = [(certificate.error, _INK, _DASHED, f"certified, {certificate.error:.3g}")]
+    axes.plot(
+        *thin(run.t, np.linalg.norm(z1, axis=-1)), color=ERROR, label=f"worst found, {measured(attack.error, unit)}"
+    )
+    said = "void" if certificate.void else "certified"
+    bounds = [(certificate.error, INK, _DASHED, f"{said}, {measured(certificate.error, unit)}")]
     # For inertia-shaped gains it equals the certified one, and one line is enough.
     if abs(certificate.printed_error - certificate.error) > 0.01 * certificate.error:
         printed = f"printed in the paper, {certificate.printed_error:.3g}"
@@ -152,36 +176,35 @@ def _draw_attack(axes: Axes, certificate: Certificate, attack: Attack) -> None:
     for value, colour, style, label in bounds:
         axes.axhline(value, color=colour, linestyle=style, label=label)
     axes.set(xlabel="time [s]", xlim=(0.0, run.t[-1]), ylim=(0.0, 1.35 * max(certificate.error, attack.error)))
-    ratio = f": certified ÷ found = {certificate.error / attack.error:.2f}" if attack.error > 0.0 else ""
-    unit = several(certificate.joint_units)
-    axes.set_title(f"‖z1‖ [{unit}], {attack.found_by}{ratio}", loc="left", color=_INK)
+    has_ratio = attack.error > 0.0 and not certificate.void
+    ratio = f": certified ÷ found = {certificate.error / attack.error:.2f}" if has_ratio else ""
+    axes.set_title(f"all errors together, ‖z1‖ [{unit}], {attack.found_by}{ratio}", loc="left", color=INK)
     axes.legend(frameon=False, loc="upper left", ncols=1)
 
 
 def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) -> None:
     """A bar per joint up to its bound, with a bar inside up to the largest error found."""
     bounds, units = certificate.joint_errors, certificate.joint_units
-    at, mixed = np.arange(len(bounds)), len(set(units)) > 1
-    axes.barh(at, bounds, height=0.7, color=LIMIT, alpha=0.35, label="certified")
+    at = np.arange(len(bounds))
+    axes.barh(at, bounds, height=0.7, color=LIMIT, alpha=0.35, label="void" if certificate.void else "certified")
     found = np.zeros(len(at)) if attack is None else attack.joint_errors
     axes.barh(at, found, height=0.38, color=ERROR, label="worst found")
     for y, bound, end, unit in zip(at.tolist(), bounds.tolist(), np.maximum(bounds, found), units, strict=True):
-        text = f" {bound:.3g}{' ' + unit if mixed else ''}"
-        axes.annotate(text, (end, y), va="center", fontsize=7.5, color=_NOTE)
+        axes.annotate(f" {measured(bound, unit)}", (end, y), va="center", fontsize=7.5, color=NOTE)
     axes.set_yticks(at, [_plain(name) for name in certificate.joint_names])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
-    axes.set_xlim(0.0, 1.18 * float(max(bounds.max(), found.max())) or 1.0)
+    axes.set_xlim(0.0, 1.35 * float(max(bounds.max(), found.max())) or 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    title = f"|z1| of each joint [{several(units)}]"
+    title = f"error of each joint, |z1| [{several(units)}]"
     if attack is not None:
         _title(axes, title)
         return
-    axes.set_title(title, loc="left", color=_INK)
+    axes.set_title(title, loc="left", color=INK)
     if not bounds.any():
         axes.set_xticks([0.0])
         axes.annotate("every bound is 0: no disturbance", (0.5, 0.5), xycoords="axes fraction", ha="center",
-                      va="center", color=_NOTE)  # fmt: skip
+                      va="center", color=NOTE)  # fmt: skip
 
 
 def _shade(axes: Axes, seen: Monitored) -> None:
@@ -203,7 +226,7 @@ def _mark(axes: Axes, seen: Monitored, name: str, values: np.ndarray) -> None:
 
 
 def _title(axes: Axes, title: str) -> None:
-    axes.set_title(title, loc="left", color=_INK)
+    axes.set_title(title, loc="left", color=INK)
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), **_LEGEND)
 
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 
 from nbs_pin.base.records import Run
 from nbs_pin.base.units import several
-from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
+from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, Heading, picture
 from nbs_pin.simulation.metrics import PAPER_THRESHOLD, squared_error
 
 FAR = 1000.0
@@ -37,14 +37,15 @@ def plot_training(
     before: Run,
     after: Run,
     path: str | Path,
+    heading: Heading | None = None,
 ) -> Path:
-    """Plot the effect of training and write the picture (PNG); returns its path.
+    """Plot the effect of training and write the picture (`plotting.picture`); returns its path.
 
     Left: mean cost of the training and the held-out motions by epoch (`Training`), the best epoch marked. Right: ‖z1‖
     over time of the same motions before and after training, median and worst at each time. A line ends where ‖z1‖
     exceeds `FAR` or is not finite.
     """
-    with picture(path, 11.0, 4.2) as figure:
+    with picture(path, 11.0, 4.2, heading=heading) as figure:
         costs, errors = figure.subplots(1, 2)
         _draw_costs(costs, history, held_out, best_epoch)
         _draw_errors(errors, {"before": before, "after": after})
@@ -63,8 +64,9 @@ def _draw_costs(
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axes.yaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="epoch", xlim=(0, max(len(history) - 1, 1)))
-    axes.set_title("mean cost of a motion", loc="left")
+    axes.set_title("mean cost of a motion (no unit)", loc="left")
     axes.legend(frameon=False)
 
 

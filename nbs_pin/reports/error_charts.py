@@ -17,9 +17,21 @@ from nbs_pin.accuracy.energy_drift import FreeMotion
 from nbs_pin.accuracy.error_maps import ErrorMap
 from nbs_pin.accuracy.mismatch import Mismatch
 from nbs_pin.base.units import TURNING, JointUnits, several
-from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, picture
+from nbs_pin.reports.plotting import (
+    ACTUAL,
+    ERROR,
+    INK,
+    LIMIT,
+    NOTE,
+    REFERENCE,
+    SATURATED,
+    TORQUE,
+    VIOLET,
+    picture,
+)  # fmt: skip
+from nbs_pin.reports.verdicts import Verdict
 
-INK, NOTE, PALE, VIOLET = "#1d2733", "#5d6b7a", "#eef3f9", "#7a4fa3"
+PALE = "#eef3f9"
 LOOKS = {
     "mass_matrix": ("M", ACTUAL),
     "coriolis": ("C v", REFERENCE),
@@ -45,8 +57,9 @@ def plot_model_errors(
     joints: Sequence[str],
     units: Sequence[JointUnits] | None = None,
     missing: str = "no closed loop was run",
+    verdict: Verdict | None = None,
 ) -> Path:
-    """Plot the result of `compare` on one page and write the picture (PNG); returns its path.
+    """Plot the result of `compare` on one page and write the picture (`plotting.picture`); returns its path.
 
     The figures in a row; maps of the errors of M, C v and G over two joints (omitted without a map); errors against
     speed and against distance from the centre of the box, and the torque error of every joint; the errors of single
@@ -58,7 +71,7 @@ def plot_model_errors(
     with picture(path, 13.5, 1.4 + 3.3 * rows) as figure:
         heights = (1.4, *([3.3] if heat is not None else []), 6.6)
         parts = np.ravel(np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights)))
-        _draw_figures(parts[0], errors, title, several(of.velocity for of in units))
+        _draw_figures(parts[0], errors, title, several(of.velocity for of in units), verdict)
         if heat is not None:
             _draw_maps(parts[1], heat, joints)
         growth, last = parts[-1].subplots(2, 3)
@@ -110,13 +123,13 @@ def _draw_seeds(axes: Axes, curve: Mapping[int, Sequence[float]], colour: str, n
     axes.fill_between(sizes, low, high, color=colour, alpha=0.12, linewidth=0)
 
 
-def _draw_figures(head: SubFigure, errors: ModelErrors, title: str, unit: str) -> None:
-    """The title and a row of tiles, each with a name and a number."""
+def _draw_figures(head: SubFigure, errors: ModelErrors, title: str, unit: str, verdict: Verdict | None) -> None:
+    """The title, the verdict and a row of tiles, each with a name and a number."""
     low, high = errors.mass_ratio
     tiles = {f"error of {label}": number(getattr(errors, name)) for name, (label, _) in LOOKS.items()}
     tiles |= {
         "least eigenvalue of M̂": number(errors.eigenvalue_margin),
-        "M̂ is within ±… of M": number(max(1.0 - low, high - 1.0)),
+        "M̂ ÷ M is off 1 by": number(max(1.0 - low, high - 1.0)),
         "best common factor": f"{errors.scale.factor:.5g}",
         "energy drift": _drift(errors),
     }
@@ -125,7 +138,9 @@ def _draw_figures(head: SubFigure, errors: ModelErrors, title: str, unit: str) -
     speed = f"{fast[0]:.3g}" if np.ptp(fast) == 0.0 else f"{fast.min():.3g} to {fast.max():.3g}"
     where = f"{errors.samples} uniform states, |v| ≤ {speed} {unit}, seed {errors.seed}"
     head.text(0.988, 0.86, where, color=NOTE, ha="right", va="center")
-    axes = head.add_axes((0.0, 0.08, 1.0, 0.56))
+    if verdict is not None:
+        head.text(0.012, 0.67, verdict.text.replace("$", r"\$"), color=INK, va="center")
+    axes = head.add_axes((0.0, 0.04, 1.0, 0.52))
     axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
     axes.set_axis_off()
     width = 0.976 / len(tiles)
@@ -161,6 +176,7 @@ def _draw_maps(part: SubFigure, heat: ErrorMap, names: Sequence[str]) -> None:
         for ruler in (axes.xaxis, axes.yaxis):
             ruler.set_major_locator(MaxNLocator(5))
     bar = part.colorbar(mesh, ax=list(panels), pad=0.012, aspect=18)
+    bar.set_label("relative error")
     bar.outline.set_visible(False)
     bar.ax.tick_params(length=0)
     _log_ticks(bar.ax.yaxis, *bar.ax.get_ylim())

@@ -1,12 +1,13 @@
 """Figures of runs, and the style of every figure, without any global plotting state."""
 
 import io
+import textwrap
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,6 +15,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.base.arguments import checked, count, maybe, writable
@@ -21,10 +23,13 @@ from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import ROW_ARRAYS, RUN, Run
+from nbs_pin.base.units import by_quantity
+from nbs_pin.reports.captions import arm_in_words, law_in_words, settings_in_words
+from nbs_pin.reports.verdicts import BAD, GOOD, WARNING, Verdict, verdict_of
 from nbs_pin.robots.named import robot_of
 from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 from nbs_pin.robots.urdf import JointData
-from nbs_pin.simulation.metrics import saturated_fraction
+from nbs_pin.simulation.metrics import saturated_fraction, summary
 from nbs_pin.simulation.tool_errors import tool_errors, tool_of
 
 ACTUAL, REFERENCE, ERROR = "#1f5fbf", "#ff8c1a", "#b3261e"
@@ -36,32 +41,75 @@ _STYLE: Any = {
     "font.size": 8.5, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#9aa3ad",
     "axes.linewidth": 0.7, "axes.grid": True, "axes.axisbelow": True, "axes.formatter.useoffset": False,
     "grid.color": "#e6eaee", "grid.linewidth": 0.6, "lines.linewidth": 1.2, "lines.solid_capstyle": "round",
-    "xtick.color": "#4a5562", "ytick.color": "#4a5562",
+    "xtick.color": "#4a5562", "ytick.color": "#4a5562", "svg.hashsalt": "nbs_pin",
+    "svg.fonttype": "path",
 }  # fmt: skip
+INK, NOTE, VIOLET = "#1d2733", "#5d6b7a", "#7a4fa3"
+_COLOURS = {GOOD: TORQUE, WARNING: "#8a5a00", BAD: ERROR}
+_UNDATED: Any = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+_WIDE: Any = {"color": "#ffc891", "linewidth": 4.5}  # of the reference, so that it shows beside the curve on it
+_NARROWEST = 0.012  # share of the time axis that a marked stretch takes, at least
+
+
+class Heading(NamedTuple):
+    """What stands above a figure."""
+
+    title: str
+    """The arm and the law, or what was done."""
+    settings: Sequence[str] = ()
+    """What else determines the figure, one phrase each."""
+    verdict: Verdict | None = None
 
 
 @contextmanager
-def picture(path: str | Path, width: float, height: float, dpi: int = 120) -> Iterator[Figure]:
-    """An empty figure of that size [inch] in the common style, written to the path (PNG) when the block ends.
+def picture(
+    path: str | Path, width: float, height: float, dpi: int = 120, heading: Heading | None = None
+) -> Iterator[Figure]:
+    """An empty figure of that size [inch] in the common style, written to the path when the block ends.
 
-    It is written whole, or not at all if drawing fails. Raises OSError if it cannot be written.
+    A path that ends in .svg or .pdf gets that kind, any other a PNG. It is written whole, or not at all if drawing
+    fails. The heading takes its room from the figure. Raises OSError if it cannot be written.
     """
+    kind = Path(path).suffix.lower().removeprefix(".")
+    kind = kind if kind in ("svg", "pdf") else "png"
     with rc_context(_STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing")  # a name in another script; it stands in summary.json
         figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
         FigureCanvasAgg(figure)
+        if heading is not None:
+            _head(figure, heading)
         yield figure
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png")
+        figure.savefig(buffer, format=kind, metadata={} if kind == "png" else _UNDATED[kind])
     write_whole(path, buffer.getvalue())
+
+
+def _head(figure: Figure, heading: Heading) -> None:
+    """Write the heading at the top, and keep the layout below it."""
+    width, height = figure.get_size_inches()
+    lines = [(line, 11.5, "bold", INK) for line in textwrap.wrap(heading.title, int(9.5 * width))]
+    lines += [(line, 8.0, "normal", NOTE) for line in textwrap.wrap(" · ".join(heading.settings), int(15.0 * width))]
+    if heading.verdict is not None:
+        colour = _COLOURS.get(heading.verdict.level, INK)
+        lines += [(line, 8.5, "normal", colour) for line in textwrap.wrap(heading.verdict.text, int(14.0 * width))]
+    down = 0.06
+    for text, size, weight, colour in lines:
+        figure.text(0.1 / width, 1.0 - down / height, text.replace("$", r"\$"), fontsize=size, fontweight=weight,
+                    color=colour, va="top")  # fmt: skip
+        down += 1.42 * size / 72.0
+    engine = figure.get_layout_engine()
+    assert isinstance(engine, ConstrainedLayoutEngine)
+    engine.set(rect=(0.0, 0.0, 1.0, 1.0 - down / height))
 
 
 @checked(run=RUN, path=writable, start=count(0), robot=maybe(ARM))
 def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | None = None) -> Path:
-    """Plot how each joint follows its reference and write the picture (PNG); returns its path.
+    """Plot how each joint follows its reference and write the picture; returns its path.
 
-    Each row shows actual and desired position, |error| on a logarithmic scale (wrapped on continuous joints), and the
-    applied torque with the effort limits, saturated stretches shaded. `start` selects one start of a batched run. With
+    It is a PNG, or of the kind that the path ends in: .svg or .pdf. Each row shows actual and desired position, |error|
+    on a logarithmic scale that is the same for joints of one kind (wrapped on continuous joints), and the applied
+    torque with the disturbance, if there was one, and the effort limits where they are near; saturated stretches are
+    shaded. The heading has the law, its settings and a verdict. `start` selects one start of a batched run. With
     a `robot`, the arm that ran, position limits are drawn where the joint comes near them, and stretches are shaded in
     which it is outside them or faster than its velocity limit. A run along a path of the tool has a last row: its
     errors and the path, for which None loads the arm that the run names.
@@ -80,53 +128,55 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
         ...     print(nbs.plot_tracking(run, f"{folder}/tracking.png").name)
         tracking.png
     """
-    starts = int(np.prod(run.q.shape[1:-1], dtype=int))
-    if not 0 <= start < starts:
-        raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts - 1}.")
+    one = one_start(run, start)
     if robot is not None and robot.nv != run.nv:
         raise ArgumentError(f"the run has {run.nv} joints and {robot!r} {robot.nv}; give the robot of the run.")
-    q, v, q_ref, tau, asked = (
-        np.array(x.reshape(len(run.t), starts, run.nv)[:, start])
-        for x in (run.q, run.v, run.q_ref, run.tau, run.tau_command)
-    )
+    q, v, q_ref, tau = one.q, one.v, one.q_ref, one.tau
     error = np.abs(configuration_difference(q, q_ref, run.continuous))
-    cut = np.abs(asked) > run.effort_limit
+    cut = np.abs(one.tau_command) > run.effort_limit
     tau[-1], cut[-1] = np.nan, False  # commanded, but never applied
-    fraction = float(np.ravel(saturated_fraction(run))[start])
+    fraction = float(saturated_fraction(one))
+    decades = [_decades(error[:, [of is other for other in run.units]]) for of in run.units]
     tool = tool_of(run)
     rows = run.nv + (tool is not None)
-    with picture(path, 13.0, 1.15 + 1.5 * rows + (1.5 if tool else 0.0)) as figure:
+    with picture(path, 13.0, 1.15 + 1.5 * rows + (1.5 if tool else 0.0), heading=_heading(one)) as figure:
         heights = [1.0] * run.nv + [2.0] * (tool is not None)
         grid = figure.subplots(rows, 3, sharex=True, squeeze=False, height_ratios=heights)
         for joint, (position_axes, error_axes, torque_axes) in enumerate(grid[: run.nv]):
             _draw_position(position_axes, run.t, q[:, joint], q_ref[:, joint])
             if robot is not None:
                 _draw_stops(position_axes, run.t, q[:, joint], v[:, joint], robot.joints[joint])
-            _draw_error(error_axes, run.t, error[:, joint])
-            _draw_torque(torque_axes, run.t, tau[:, joint], float(run.effort_limit[joint]), cut[:, joint])
-            position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color="#1d2733")
+            _draw_error(error_axes, run.t, error[:, joint], decades[joint])
+            _draw_torque(torque_axes, one, joint, cut[:, joint])
+            position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color=INK)
             if len(set(run.units)) > 1:
                 of = run.units[joint]
                 for axes, unit in zip(grid[joint], (of.position, of.position, of.torque), strict=True):
                     axes.annotate(f"[{unit}]", (0.0, 1.0), xycoords="axes fraction", va="bottom", fontsize=7,
-                                  color="#5d6b7a")  # fmt: skip
+                                  color=NOTE)  # fmt: skip
         _dress(figure, grid, run, fraction)
         if tool is not None:
-            moved = replace(run, **{name: getattr(run, name).reshape(len(run.t), starts, run.nv)[:, start]
-                                    for name in ROW_ARRAYS})  # fmt: skip
-            _draw_tool(figure, grid[-1], moved, robot_of(run) if robot is None else robot, tool)
+            _draw_tool(figure, grid[-1], one, robot_of(run) if robot is None else robot, tool)
     return Path(path)
+
+
+def _heading(run: Run) -> Heading:
+    """Arm, law and settings, and what the errors of one start amount to, if they can be summed up."""
+    if len(run.t) < 3 or not np.isfinite(run.q).all():
+        return Heading(f"{arm_in_words(run)}: {law_in_words(run)}", settings_in_words(run))
+    figures = summary(run) | {"units": by_quantity(run.slides)}
+    return Heading(f"{arm_in_words(run)}: {law_in_words(run)}", settings_in_words(run), verdict_of(figures))
 
 
 def _draw_tool(figure: Figure, row: np.ndarray, run: Run, robot: Robot, tool: dict[str, Any]) -> None:
     """Errors of the tool's position and orientation, and its path, seen along the direction in which it is thinnest."""
     errors = tool_errors(run, robot)
-    row[0].set_ylabel(_short(tool["frame"]), fontweight="bold", color="#1d2733")
+    row[0].set_ylabel(_short(tool["frame"]), fontweight="bold", color=INK)
     titles = ["distance from the path [m]", "angle from its orientation [rad]"]
     shown = [errors.position, errors.orientation]
     for axes, title, error in zip(row, titles, shown if tool.get("orientation") == "hold" else shown[:1], strict=False):
-        _draw_error(axes, run.t, error)
-        axes.set_title(title, loc="left", fontsize=8.5, color="#1d2733")
+        _draw_error(axes, run.t, error, _decades(error))
+        axes.set_title(title, loc="left", fontsize=8.5, color=INK)
     if tool.get("orientation") != "hold":
         row[1].set_axis_off()
     place = row[2].get_subplotspec()
@@ -134,18 +184,18 @@ def _draw_tool(figure: Figure, row: np.ndarray, run: Run, robot: Robot, tool: di
     axes = figure.add_subplot(place)
     asked, actual = (robot.pose(q, tool["frame"])[:, :3, 3] for q in (run.q_ref, run.q))
     across, up = np.sort(np.argsort(np.ptp(asked, axis=0))[1:])
-    axes.plot(asked[:, across], asked[:, up], color=REFERENCE, linewidth=2.6, alpha=0.75)
+    axes.plot(asked[:, across], asked[:, up], **_WIDE)
     axes.plot(actual[:, across], actual[:, up], color=ACTUAL)
     axes.plot(*asked[0, [across, up]], "o", color=REFERENCE, markersize=4)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_title("path [m]", loc="left", fontsize=8.5, color="#1d2733")
+    axes.set_title("path [m]", loc="left", fontsize=8.5, color=INK)
     axes.set_xlabel("xyz"[across])
     axes.set_ylabel("xyz"[up])
 
 
 def _draw_position(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarray, " rows"],
                    q_ref: Float[np.ndarray, " rows"]) -> None:  # fmt: skip
-    axes.plot(*thin(t, q_ref), color=REFERENCE, linewidth=2.6, alpha=0.75)
+    axes.plot(*thin(t, q_ref), **_WIDE)
     axes.plot(*thin(t, q), color=ACTUAL)
     axes.yaxis.set_major_locator(MaxNLocator(4))
 
@@ -167,36 +217,45 @@ def _draw_stops(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarray, 
                   color=ERROR)  # fmt: skip
 
 
-def _draw_error(axes: Axes, t: Float[np.ndarray, " rows"], error: Float[np.ndarray, " rows"]) -> None:
-    """|error| over at most nine decades; exact zeros are not drawn."""
+def _decades(error: Float[np.ndarray, "*any"]) -> tuple[float, float]:
+    """The axis of |error|, at most nine decades."""
     finite = error[np.isfinite(error) & (error > 0.0)]
     top = 10.0 ** np.ceil(np.log10(finite.max())) if len(finite) else 1.0
     low = max(10.0 ** np.floor(np.log10(np.percentile(finite, 0.5))) if len(finite) else 0.1, 1e-9 * top)
+    return min(low, 0.1 * top), top
+
+
+def _draw_error(axes: Axes, t: Float[np.ndarray, " rows"], error: Float[np.ndarray, " rows"],
+                decades: tuple[float, float]) -> None:  # fmt: skip
+    """|error| on a logarithmic scale; exact zeros are not drawn."""
     axes.set_yscale("log")
-    axes.set_ylim(min(low, 0.1 * top), top)
+    axes.set_ylim(*decades)
     axes.plot(*thin(t, np.where(error > 0.0, error, np.nan)), color=ERROR, linewidth=1.0)
     axes.yaxis.set_major_locator(LogLocator(numticks=5))
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def _draw_torque(axes: Axes, t: Float[np.ndarray, " rows"], tau: Float[np.ndarray, " rows"], limit: float,
-                 cut: Bool[np.ndarray, " rows"]) -> None:  # fmt: skip
-    """Torque, its limits if it comes near them, and the stretches where it is saturated."""
-    bars = [(t[begin], t[min(end, len(t) - 1)] - t[begin]) for begin, end in stretches(cut)]
-    axes.broken_barh(bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=SATURATED, alpha=0.45, linewidth=0)
+def _draw_torque(axes: Axes, run: Run, joint: int, cut: Bool[np.ndarray, " rows"]) -> None:
+    """Torque of a joint and the disturbance, on an axis that fits both, and the stretches where it is saturated.
+
+    A limit is drawn where it is on that axis.
+    """
+    t, tau, limit = run.t, run.tau[:, joint], float(run.effort_limit[joint])
+    least = _NARROWEST * float(t[-1] - t[0])
+    bars = [(t[begin], max(t[min(end, len(t) - 1)] - t[begin], least)) for begin, end in stretches(cut)]
+    axes.broken_barh(bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=SATURATED, alpha=0.6, linewidth=0)
+    if run.disturbance.any():
+        axes.plot(*thin(t[:-1], run.disturbance[:-1, joint]), color=VIOLET, linewidth=0.9)
     axes.plot(*thin(t, tau), color=TORQUE, linewidth=1.0)
+    axes.autoscale_view()
+    low, high = axes.get_ylim()
+    for side in (-limit, limit) if np.isfinite(limit) else ():
+        axes.axhline(side, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
+    axes.set_ylim(low, high)
     axes.yaxis.set_major_locator(MaxNLocator(4))
     peak = np.nanmax(np.abs(tau), initial=0.0)
-    if not np.isfinite(limit):
-        note = "no limit"
-    elif peak > 0.25 * limit:
-        note = f"limit ±{limit:g}"
-        for side in (-limit, limit):
-            axes.axhline(side, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
-        axes.set_ylim(-1.15 * limit, 1.15 * limit)
-    else:
-        note = f"limit ±{limit:g} (peak {peak / limit:.0%})"
-    axes.annotate(note, (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color="#5d6b7a")
+    note = f"limit ±{limit:g} (peak {peak / limit:.0%})" if np.isfinite(limit) else "no limit"
+    axes.annotate(note, (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=NOTE)
 
 
 def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
@@ -206,19 +265,29 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
     for axes, title in zip(
         grid[0], map("".join, zip(("position", "|error|", "torque"), beside, strict=True)), strict=True
     ):
-        axes.set_title(title, loc="left", fontsize=9.5, color="#1d2733", pad=9)
+        axes.set_title(title, loc="left", fontsize=9.5, color=INK, pad=9)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
         axes.set_xlim(run.t[0], run.t[-1] if run.t[-1] > run.t[0] else run.t[0] + 1.0)
-    named = [str(run.info[key]).partition("(")[0] for key in ("controller", "plant") if run.info.get(key)]
-    title = " · ".join([_short(run.robot.rsplit("/", 1)[-1]) or f"{run.nv} joints", *map(_short, named)])
-    figure.suptitle(title, x=0.008, ha="left", fontsize=12, fontweight="bold", color="#1d2733")
     handles = [
         figure.axes[0].plot([], [], color=ACTUAL, label="actual")[0],
-        figure.axes[0].plot([], [], color=REFERENCE, linewidth=2.6, alpha=0.75, label="reference")[0],
-        figure.axes[2].axvspan(np.nan, np.nan, color=SATURATED, alpha=0.45, label=f"saturated ({cut:.2%} of the time)"),
+        figure.axes[0].plot([], [], **_WIDE, label="reference")[0],
+        figure.axes[2].axvspan(np.nan, np.nan, color=SATURATED, alpha=0.6, label=f"saturated ({cut:.2%} of the time)"),
     ]
-    figure.legend(handles=handles, loc="outside upper right", ncols=3, frameon=False)
+    if run.disturbance.any():
+        handles.append(figure.axes[2].plot([], [], color=VIOLET, label="disturbance")[0])
+    shown = handles if cut else [*handles[:2], *handles[3:]]
+    figure.legend(handles=shown, loc="upper right", ncols=4, frameon=False)
+
+
+def one_start(run: Run, start: int) -> Run:
+    """The run with one start alone; raises ArgumentError if it has no such start."""
+    arrays: dict[str, Any] = {name: getattr(run, name).reshape(len(run.t), -1, run.nv) for name in ROW_ARRAYS}
+    starts = arrays["q"].shape[1]
+    if not 0 <= start < starts:
+        raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts - 1}.")
+    only: dict[str, Any] = {name: np.array(values[:, start]) for name, values in arrays.items()}
+    return replace(run, **only)
 
 
 def thin(t: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tuple[np.ndarray, np.ndarray]:

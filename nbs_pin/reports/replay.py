@@ -6,19 +6,18 @@ content security policy forbids every connection. Without WebGL it has the chart
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from nbs_pin.base.arguments import checked, count, maybe, paths, writable
-from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
-from nbs_pin.base.records import ROW_ARRAYS, RUN, Run
-from nbs_pin.reports.captions import law_of, settings_of
+from nbs_pin.base.records import RUN, Run
+from nbs_pin.reports.captions import law_in_words, settings_in_words
 from nbs_pin.reports.pages import page
+from nbs_pin.reports.plotting import one_start
 from nbs_pin.reports.scene import scene_of
-from nbs_pin.reports.signals import signals_of
+from nbs_pin.reports.signals import MAX_ROWS, signals_of
 from nbs_pin.robots.named import robot_of
 from nbs_pin.robots.robot import ARM, Robot
 
@@ -53,11 +52,13 @@ def replay(
     """
     robot = robot_of(run) if robot is None else robot
     shown = shown_run(run, robot, start, package_dirs)
-    return write_whole(path, page("replay.html", f"{robot.name}: {law_of(run)}, replay", {"runs": [shown]}))
+    return write_whole(path, page("replay.html", f"{robot.name}: {law_in_words(run)}, replay", {"runs": [shown]}))
 
 
-def shown_run(run: Run, robot: Robot, start: int = 0, package_dirs: Iterable[str | Path] = ()) -> dict[str, Any]:
-    """What a page shows of one start of a run; raises ArgumentError as `replay` does."""
+def shown_run(
+    run: Run, robot: Robot, start: int = 0, package_dirs: Iterable[str | Path] = (), most: int = MAX_ROWS
+) -> dict[str, Any]:
+    """What a page shows of one start of a run, with about `most` rows; raises ArgumentError as `replay` does."""
     if robot.joint_names != run.joint_names:
         raise ArgumentError(
             f"the run moves joints {', '.join(run.joint_names)} but {robot.name} has {', '.join(robot.joint_names)}: "
@@ -67,21 +68,12 @@ def shown_run(run: Run, robot: Robot, start: int = 0, package_dirs: Iterable[str
     limits = [None if limit == float("inf") else limit for limit in run.effort_limit.tolist()]
     return {
         "name": robot.name,
-        "law": law_of(run),
-        "notes": settings_of(run),
+        "law": law_in_words(run),
+        "notes": settings_in_words(run),
         "joints": [
             {"name": name, **of._asdict(), "limit": limit}
             for name, of, limit in zip(run.joint_names, run.units, limits, strict=True)
         ],
         "scene": scene_of(one, robot, package_dirs),
-        "signals": signals_of(one, robot),
+        "signals": signals_of(one, robot, most),
     }
-
-
-def one_start(run: Run, start: int) -> Run:
-    """The run with one start alone; raises ArgumentError if it has no such start."""
-    arrays = {name: getattr(run, name).reshape(len(run.t), -1, run.nv) for name in ROW_ARRAYS}
-    starts = arrays["q"].shape[1]
-    if not 0 <= start < starts:
-        raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts - 1}.")
-    return replace(run, **{name: values[:, start] for name, values in arrays.items()})

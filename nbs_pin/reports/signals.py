@@ -15,9 +15,9 @@ MAX_ROWS = 10_001
 """Of longer runs, the page has the first row of every stretch, and those of its largest error and largest torque."""
 
 
-def signals_of(run: Run, robot: Robot) -> dict[str, Any]:
+def signals_of(run: Run, robot: Robot, most: int = MAX_ROWS) -> dict[str, Any]:
     """The signals of a run with one start: numbers per row and joint [rad, N·m], of tips per row and tip [m]."""
-    rows = _rows(run)
+    rows = _rows(run, most)
     error = configuration_difference(run.q, run.q_ref, run.continuous)
     picked = {name: np.array(getattr(run, name)[rows]) for name in ("q", "q_ref", "v", "v_ref", "tau", "disturbance")}
     asked = run.tau_command[rows]
@@ -40,11 +40,11 @@ def signals_of(run: Run, robot: Robot) -> dict[str, Any]:
     }
 
 
-def _rows(run: Run) -> Int[np.ndarray, " rows"]:
+def _rows(run: Run, most: int) -> Int[np.ndarray, " rows"]:
     count = len(run.t)
-    if count <= MAX_ROWS:
+    if count <= most:
         return np.arange(count)
-    width = -(-3 * count // MAX_ROWS)
+    width = -(-3 * count // most)
     error = np.abs(configuration_difference(run.q, run.q_ref, run.continuous)).max(axis=-1)
     share = (np.abs(run.tau_command) / np.where(np.isfinite(run.effort_limit), run.effort_limit, 1.0)).max(axis=-1)
     begins = np.arange(0, count, width)

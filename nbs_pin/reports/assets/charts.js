@@ -25,7 +25,9 @@ function createCharts(root, runs, clock, shown, height) {
     };
   }
   const joints = runs[0].joints, tips = runs[0].signals.tips;
-  const chosen = new Set(several ? [0] : joints.map((_, k) => k));
+  const sizeOf = (k) => Math.max(...runs.map((run) => (run.joints[k] ? Math.hypot(...run.column("error", k)) : 0)));
+  const worst = () => joints.reduce((most, _, k) => (sizeOf(k) > sizeOf(most) ? k : most), 0);
+  const chosen = new Set(several ? [worst()] : joints.map((_, k) => k));
   let tip = 0, plots = [], zooming = false;
   const names = Object.keys(SIGNALS).filter((name) => name !== "disturbance" || runs.some((run) => run.signals.disturbed));
 
@@ -51,6 +53,14 @@ function createCharts(root, runs, clock, shown, height) {
     chip(signalChips, "−", "", null, () => zoom(2)).title = "zoom out";
     chip(signalChips, "whole run", "", null, () => setRange(clock.start, clock.end)).title = "show all of the time (or double-click a chart)";
     jointChips.replaceChildren();
+    if (several) {
+      runs.forEach((run, k) => {
+        const legend = jointChips.appendChild(document.createElement("span"));
+        Object.assign(legend.appendChild(document.createElement("span")), {className: "swatch"}).style.background = colour(k);
+        legend.append(run.label);
+        legend.style.marginRight = "8px";
+      });
+    }
     const toggle = (k) => {
       if (several) { chosen.clear(); chosen.add(k); } else if (!chosen.delete(k)) chosen.add(k);
       draw();
