@@ -27,7 +27,7 @@ PNG = b"\x89PNG"
 
 
 def run(folder, controller, *options):
-    return cli.main(["certify", controller, "--out", str(folder), *options])
+    return cli.main(["certify", controller, "-v", "--out", str(folder), *options])
 
 
 def summary(folder):

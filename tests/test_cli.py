@@ -40,7 +40,7 @@ def nbs_pin(*arguments, **options):
 def tracked(request, tmp_path_factory):
     """An arm's name, the folder it was tracked in, and what was printed."""
     cwd = tmp_path_factory.mktemp(request.param)
-    done = nbs_pin("track", request.param, *TRACKS[request.param].split(), cwd=cwd)
+    done = nbs_pin("track", request.param, "-v", *TRACKS[request.param].split(), cwd=cwd)
     assert (done.returncode, done.stderr) == (0, "")
     return request.param, cwd / "out" / f"track-{request.param}", done.stdout
 
@@ -92,7 +92,9 @@ def test_track_prints_the_figures_it_stores(tracked):
         assert rows[joint] == [*(f"{e:.2e}" for e in errors), *(f"{x:.4g}" for x in torques)]
     assert f"{figures['saturated_fraction']:.2%} of the time" in printed
     assert f"{figures['convergence_time_s']:.3f} s" in printed
-    assert printed.splitlines()[-4:] == [f"out/{folder.name}/{name}" for name in tracking.FILES]
+    *_, following = lines = printed.splitlines()
+    assert lines[-5:-1] == [f"out/{folder.name}/{name}" for name in tracking.FILES]
+    assert following == f"next: nbs-pin replay out/{folder.name} --open"
 
 
 def test_the_options_reach_the_run(tracked):

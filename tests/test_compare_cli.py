@@ -34,11 +34,11 @@ def wrong(tmp_path_factory):
 def compared(wrong, tmp_path_factory):
     """Where it was compared, and what was printed."""
     folder = tmp_path_factory.mktemp("compared") / "three_link"
-    return folder, printed_by("compare", wrong, *QUICK, "--out", folder, "--against", "three_link")
+    return folder, printed_by("compare", wrong, *QUICK, "-v", "--out", folder, "--against", "three_link")
 
 
 def run(folder, model, *options):
-    return cli.main(["compare", str(model), *QUICK, "--out", str(folder), *options])
+    return cli.main(["compare", str(model), *QUICK, "-v", "--out", str(folder), *options])
 
 
 def test_the_summary_is_what_compare_finds(compared, wrong):

@@ -37,7 +37,7 @@ def path(tmp_path_factory):
 
 
 def run(path, folder, *options):
-    return cli.main(["learn", str(path), "--out", str(folder), *options])
+    return cli.main(["learn", str(path), "-v", "--out", str(folder), *options])
 
 
 @pytest.fixture(scope="module")

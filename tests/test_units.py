@@ -33,7 +33,7 @@ def check_rows(printed):
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gantry") / "run"
-    return folder, printed_by("track", GANTRY, "--duration", "0.05", "--start-error", "0.05", "--out", folder)
+    return folder, printed_by("track", GANTRY, "-v", "--duration", "0.05", "--start-error", "0.05", "--out", folder)
 
 
 def test_units_are_those_of_the_quantities():
@@ -78,7 +78,7 @@ def test_a_run_of_an_earlier_version_is_taken_to_turn(tracked, tmp_path):
 def test_collect_prints_the_units_of_each_joint(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
     folder = tmp_path / "data"
-    check_rows(printed_by("collect", GANTRY, "--samples", "60", "--recipe", "uniform", "--out", folder))
+    check_rows(printed_by("collect", GANTRY, "-v", "--samples", "60", "--recipe", "uniform", "--out", folder))
     assert summary(folder)["figures"]["units"]["acceleration"] == ["m/s²", "rad/s²", "rad/s²"]
 
 

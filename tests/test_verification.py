@@ -754,7 +754,7 @@ def test_the_shell_writes_and_verifies(tmp_path, capsys, monkeypatch):
     assert "‖z1‖ with held torques" in capsys.readouterr().out
     assert cli.main([*certify, "--json", "--force", "--period", "0.005"]) == 0
     capsys.readouterr()
-    assert cli.main(["verify", str(file)]) == 0
+    assert cli.main(["verify", str(file), "-v"]) == 0
     printed = capsys.readouterr().out
     assert "PROVED, and re-verified in 19 checks" in printed
     assert "not checked" in printed

@@ -116,6 +116,7 @@ def _run(arguments: list[str], notes: Console, stops: list[int], begin: Callable
         return 0
     command = parse(arguments)
     _check_surroundings()
+    os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is rendered by MuJoCo, which would look for a window system
     if command is not None:
         with notes.status("loading"):
             body = import_module(f"nbs_pin.commands.{arguments[0]}")

@@ -74,7 +74,7 @@ def _verdict(rows: list[bench.Row]) -> str:
         if row.what == "control step":
             steps.setdefault(row.arm, row)
     told = (f"{arm} {row.figures['p50_us']:.3g} µs ({row.how})" for arm, row in steps.items())
-    return f"one control step, median: {', '.join(told)}"
+    return f"one control step, median: {', '.join(told)}" if steps else f"{len(rows)} rows measured"
 
 
 def _read(path: Path) -> Any:

@@ -90,9 +90,9 @@ def verdict(arm: str, title: str, figures: dict[str, Any]) -> str:
     """Whether the arm follows its motion, since when, and how far the worst joint is off in the end."""
     errors, units = figures["rms_error_last_30_percent_rad"], figures["units"]["position"]
     worst = max(range(len(errors)), key=errors.__getitem__)
-    time, norm = figures["convergence_time_s"], f"‖error‖ < 0.1 {several(units)}"
+    time, norm = figures["convergence_time_s"], f"‖error‖ < 0.1 {several(units)} to the end"
     follows = "does NOT follow the motion" if time is None else "follows the motion"
-    since = f"{norm} not to the end" if time is None else f"{norm} from {time:.3f} s on"
+    since = f"nowhere {norm}" if time is None else f"{norm} from {time:.3f} s on"
     off = f"{figures['joints'][worst]}, the worst joint, is off by {measured(errors[worst], units[worst])} RMS"
     return f"{arm} {follows} ({title}): {since}; in the last 30 % {off}"
 

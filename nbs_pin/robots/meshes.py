@@ -111,7 +111,7 @@ def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
 
 
 def _read(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
-    scene = trimesh.load_scene(path, resolver=_Beside(str(path)))
+    scene = trimesh.load_scene(path, resolver=_Beside(str(path)), process=False)  # `shaded` merges vertices
     _check_scene(path, scene)
     meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
     if not any(len(mesh.faces) for mesh in meshes):

@@ -69,6 +69,8 @@ class Packages:
             own = [folder] if folder.name == name else []
             yield from (*own, *self._named(name, folder, links=True), *_folder(folder / name))
         yield from (folder for folder in self.file.parents if _package_name(folder) == name)
+        # Descriptions of example-robot-data call their package by its folder, not by the name in its package.xml.
+        yield from (folder for folder in _folder(example_robot_share() / name) if folder.resolve() in self.file.parents)
         for above in self._near:
             yield from self._named(name, above)
         for variable, inner in (("ROS_PACKAGE_PATH", ""), ("AMENT_PREFIX_PATH", "share")):
