@@ -1,6 +1,6 @@
 """The blocks of README and docs, run as a reader would type them: in order, in one folder, in one Python session.
 
-* ```sh: lines that begin with nbs-pin or python are run; `cheap` adds options that shorten the long ones.
+* ```sh: lines that begin with nbs-pin or python are run.
 * ```python: executed; the names of earlier blocks stay.
 * any block with a title="NAME" is written to that file.
 * ```shell: what a test cannot do (make, pip, a queue); `typed_by_hand` lists the lines, which are checked otherwise.
@@ -10,8 +10,10 @@ import contextlib
 import re
 import runpy
 import shlex
+import sys
 import textwrap
 from pathlib import Path
+from unittest.mock import patch
 
 from nbs_pin import cli
 
@@ -41,8 +43,8 @@ def typed_by_hand(page):
     return [words for kind, _, text in blocks(page) if kind == "shell" for words in lines(text)]
 
 
-def run_page(page, folder, cheap=None):
-    """Runs the page in the folder; a failure names the block or the command. `cheap`: {command: more options}."""
+def run_page(page, folder):
+    """Runs the page in the folder; a failure names the block or the command."""
     namespace = {"__name__": "page"}
     with contextlib.chdir(folder):
         for number, (kind, title, text) in enumerate(blocks(page), 1):
@@ -53,13 +55,14 @@ def run_page(page, folder, cheap=None):
                 exec(compile(text, f"{page.name}, block {number}", "exec"), namespace)
             elif kind == "sh":
                 for words in lines(text):
-                    _run(words, (cheap or {}).get(words[1] if len(words) > 1 else "", []), page)
+                    _run(words, page)
 
 
-def _run(words, more, page):
+def _run(words, page):
     if words[0] == "python":
-        runpy.run_path(words[1], run_name="__main__")
+        with patch.object(sys, "argv", words[1:]):
+            runpy.run_path(words[1], run_name="__main__")
         return
     assert words[0] == "nbs-pin", f"{page.name}: '{words[0]}' is not run by a test; put it in a ```shell block"
-    code = cli.main([*words[1:], *more])
+    code = cli.main(words[1:])
     assert code == 0, f"{page.name}: {' '.join(words)} ended with {code}"

@@ -1,4 +1,4 @@
-"""Checks a built site: python tools/check_site.py FOLDER. It asks no other machine for anything, and no link is dead."""
+"""Checks that a built site loads nothing from elsewhere and has no dead link: python tools/check_site.py FOLDER."""
 
 import sys
 from html.parser import HTMLParser

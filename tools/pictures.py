@@ -90,6 +90,8 @@ def main(folder: Path) -> None:
         picture = Image.open(folders[command] / f"{chart}.png").convert("RGB")
         picture.thumbnail((1000, 1000), Image.Resampling.LANCZOS)
         picture.save(IMAGES / f"{name}.webp", quality=88, method=6)
+    with Image.open(IMAGES / "errors.webp") as picture:
+        picture.crop((0, 0, picture.width, 3 * picture.height // 7)).save(IMAGES / "errors-of-a-model.webp", method=6)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What MkDocs does besides: links to the repository's other files become their paths, and the commands document themselves."""
+"""What MkDocs does besides: links to other files of the repository become their paths, commands show their help."""
 
 import contextlib
 import io
