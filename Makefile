@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign bench-history clean
+.PHONY: help setup demo test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign export-check bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make test           the test suite"
@@ -18,6 +18,7 @@ help:
 	@echo "make random-arms    50 random arms with rotors and friction, untuned; about five minutes"
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
+	@echo "make export-check   exported C under gcc, clang, sanitizers, qemu and frama-c, as far as they are here; about ten minutes"
 	@echo "make bench-history  append this machine's figures to bench-history.jsonl; leave it alone meanwhile"
 	@echo "make clean          remove .venv and out/"
 
@@ -72,6 +73,9 @@ monitor-campaign: $(READY)
 
 certificate-campaign: $(READY)
 	$(BIN)/python tools/certificate_campaign.py
+
+export-check: $(READY)
+	$(BIN)/python tools/export_check.py
 
 bench-history: $(READY)
 	$(BIN)/python tools/bench_history.py

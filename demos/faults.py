@@ -23,9 +23,7 @@ def main(duration: float = 2.0) -> dict[str, str]:
     def run(arm: nbs.Robot = robot, torque: float = LARGEST, limit: float = np.inf) -> nbs.Run:
         plant = nbs.DynamicsPlant.for_robot(arm)
         wave = nbs.SquareWave(np.full(2, torque), frequency=3.0)
-        return nbs.simulate(
-            plant, law, reference, duration, 0.001, disturbance=wave, effort_limit=limit, check=False
-        )
+        return nbs.simulate(plant, law, reference, duration, 0.001, disturbance=wave, effort_limit=limit, check=False)
 
     cases = {
         "honest": run(),

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import nbs_pin as nbs
@@ -21,14 +21,16 @@ STRICT = (
     "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow",
     "-Wstrict-prototypes", "-Werror",
 )  # fmt: skip
-LIBM = {f"{name}{kind}" for name in ("sin", "cos", "sqrt", "tanh", "ceil", "fabs") for kind in ("", "f")}
+LIBM = {f"{name}{kind}" for name in ("sin", "cos", "sincos", "sqrt", "tanh", "ceil", "fabs") for kind in ("", "f")}
+"""sincos is what gcc makes of a sine and a cosine of one angle."""
 MOST_STACK, MOST_BYTES = 16 * 1024, 192 * 1024
 RANGES = {"q": 7.0, "v": 10.0, "q_ref": 7.0, "v_ref": 10.0, "a_ref": 100.0, "last": 1000.0}
 """Sizes of what a step is given, for which no operation may overflow or divide by 0 [rad, rad/s, rad/s², N·m]."""
+SANITIZED = "ASan and UBSan"
 FLAGS = {
     "-O0": ["-O0"],
     "-O3": ["-O3", "-march=native", "-fno-math-errno"],
-    "ASan and UBSan": ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"],
+    SANITIZED: ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"],
 }
 AARCH64_GCC, M7_GCC = "aarch64-linux-gnu-gcc", "arm-none-eabi-gcc"
 M7 = ("-mcpu=cortex-m7", "-mfpu=fpv5-d16", "-mfloat-abi=hard", "-mthumb", "--specs=rdimon.specs")
@@ -49,6 +51,19 @@ int main(void)
 
 class Failed(Exception):
     """What was promised does not hold; the text says what."""
+
+
+@cache
+def is_here(program: str) -> bool:
+    """Whether this machine has a program, or the sanitizers of a compiler."""
+    compiler, _, sanitizers = program.partition("'s ")
+    if not sanitizers or shutil.which(compiler) is None:
+        return shutil.which(program) is not None
+    with tempfile.TemporaryDirectory() as made:
+        source = Path(made) / "nothing.c"
+        source.write_text("int main(void) { return 0; }\n")
+        command = [compiler, *FLAGS[SANITIZED], source, "-o", f"{made}/nothing"]
+        return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def self_test(
@@ -127,7 +142,8 @@ def checks(folders: dict[str, Path]) -> Iterator[tuple[str, tuple[str, ...], Cal
     for name, folder in folders.items():
         for compiler in ("gcc", "clang"):
             for what, flags in FLAGS.items():
-                yield f"{name}, {compiler} {what}", (compiler,), partial(self_test, folder, compiler, flags)
+                needed = (compiler, f"{compiler}'s sanitizers") if what == SANITIZED else (compiler,)
+                yield f"{name}, {compiler} {what}", needed, partial(self_test, folder, compiler, flags)
         yield f"{name}, symbols", ("gcc", "nm"), partial(symbols, folder)
         yield f"{name}, size", ("gcc", "size"), partial(_size, folder)
     for name in ("panda, nbs, double", "panda, nbs, float", "kinova, pid, double"):
@@ -148,7 +164,7 @@ def main() -> int:
     absent, failed, done = set(), 0, 0
     with tempfile.TemporaryDirectory() as place:
         for name, programs, check in checks(_exported(Path(place))):
-            missing = [program for program in programs if shutil.which(program) is None]
+            missing = [program for program in programs if not is_here(program)]
             absent |= set(missing)
             if missing or not name.startswith(options.only):
                 continue

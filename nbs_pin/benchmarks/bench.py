@@ -18,6 +18,7 @@ from torch import nn
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
+from nbs_pin.benchmarks.exported import can_compile, step_times
 from nbs_pin.benchmarks.serial_chains import serial_chain
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping, paper_controller
@@ -82,12 +83,14 @@ def bench(
         robot = load_robot(arm)
         for law in LAWS:
             yield control_row(robot, law, calls, against_torch=law == "nbs")
+        yield from exported_rows(robot, calls)
         yield from plant_rows(robot)
         yield simulation_row(robot)
     for arm in MODELS:
         yield from model_rows(load_robot(arm))
     for joints in chains:
         yield control_row(serial_chain(joints), "nbs", max(1000, calls // 4), what="joints")
+        yield from exported_rows(serial_chain(joints), max(1000, calls // 4), laws=("slotine-li",), what="joints in C")
     yield from training_rows()
     if long:
         yield endurance_row(load_robot("panda"))
@@ -122,6 +125,40 @@ def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step
             without = _median(eager.torque, tensors, 200)
         figures |= {"torch_us": without, "torch_graph_us": with_graph, "torch_over_compiled": without / p50}
     return Row(what, robot.name, law, figures)
+
+
+def exported_rows(
+    robot: Robot, calls: int, laws: tuple[str, ...] = ("nbs", "slotine-li"), *, what: str = "step in C"
+) -> Iterator[Row]:
+    """A step of laws in C [µs] with bytes of code and data, and how much longer the compiled law takes in Python.
+
+    "nbs, no networks" is the law with ψ = T = 0. Nothing where there is no compiler.
+    """
+    if not can_compile():
+        return
+    states = _states(robot)
+    for name in laws:
+        law: Any = build_law(name, robot, period=PERIOD)
+        cases = {name: law}
+        if isinstance(law, NeuralBackstepping):
+            cases["nbs, no networks"] = _without_networks(robot)
+        for how, each in cases.items():
+            times, size = step_times(each, np.array(states), calls)
+            p50, p99 = np.percentile(times, [50.0, 99.0]).tolist()
+            python = _median(each.compile().torque, states, calls)
+            figures = {"joints": float(robot.nv), "p50_us": p50, "p99_us": p99, "python_us": python,
+                       "python_over_c": python / p50, "bytes": float(size)}  # fmt: skip
+            yield Row(what, robot.name, how, figures)
+
+
+def _without_networks(robot: Robot) -> NeuralBackstepping:
+    """The law with ψ = 0 and T = 0."""
+    law = NeuralBackstepping.for_robot(robot, period=PERIOD)
+    with torch.no_grad():
+        for network in (law.potential.network, law.damping.diagonal, law.damping.lower):
+            for parameter in network.parameters():
+                parameter.zero_()
+    return law
 
 
 def plant_rows(robot: Robot) -> Iterator[Row]:

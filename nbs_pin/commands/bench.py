@@ -25,10 +25,18 @@ _COLUMNS = {
         "÷ two\nRNEA": "over_two_rnea",
         "torch\n÷ it": "torch_over_compiled",
     },
+    "step in C": {
+        "p50\n[µs]": "p50_us",
+        "p99\n[µs]": "p99_us",
+        "python\n[µs]": "python_us",
+        "python\n÷ it": "python_over_c",
+        "code, data\n[B]": "bytes",
+    },
     "plant step": {"p50\n[µs]": "p50_us"},
     "simulate": {"steps\nper s": "steps_per_s", "recorded\n[MB]": "recorded_MB"},
     "model torque": {"p50\n[µs]": "p50_us", "÷ pinocchio": "over_pinocchio"},
     "joints": {"joints": "joints", "p50\n[µs]": "p50_us", "÷ two\nRNEA": "over_two_rnea"},
+    "joints in C": {"joints": "joints", "p50\n[µs]": "p50_us", "code, data\n[B]": "bytes"},
     "training epoch": {"p50\n[ms]": "p50_ms", "torch\n÷ it": "torch_over_kernels"},
     "endurance": {
         "motion\n[s]": "duration_s",

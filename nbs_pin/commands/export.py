@@ -22,7 +22,8 @@ def run(options: Export, console: Console, notes: Console) -> None:
     """Export, write and print; raises NbsPinError or OSError."""
     with notes.status(f"loading {options.controller}"):
         controller = _controller(options)
-    robot: Robot | None = getattr(controller, "dynamics", controller).robot  # type: ignore[attr-defined]
+    model: Any = getattr(controller, "dynamics", controller)
+    robot: Robot | None = model.robot
     name = Path(options.controller).stem if robot is None else robot.name
     results = Results.of(options, name, robot).check((SUMMARY,), options.force, whose="another law")
     with results.made() as folder:

@@ -36,6 +36,9 @@ def potential_c(part: Packed, real: Real) -> str:
     """The tables and functions of a potential (`layout.pack_potential`)."""
     phi = _potential(part)
     layers, n = [_layer(part, k) for k in range(phi.depth)], int(phi.n)
+    size, length, last = layers[-1]
+    if not np.delete(last.reshape(size, length), n, axis=1).any():  # but for its bias: f is constant
+        return "\n".join([real.table("stiffness", phi.stiffness), filled("quadratic.c", {"N": n})])
     sizes = [int(size) for size, _, _ in layers]
     tables = [
         real.table("potential_scale", phi.scale),
@@ -82,6 +85,9 @@ def damping_c(part: Packed, real: Real) -> str:
     d = _damping(part)
     n, depth = int(d.n), int(d.depth)
     layers = [_layer(part, k) for k in range(2 * depth)]
+    last = (layers[depth - 1][2], layers[2 * depth - 1][2])
+    if DampingCode(int(d.code)) is DampingCode.BOUNDED and not any(matrix.any() for matrix in last):
+        return "\n".join([real.table("damping_floor", d.floor), filled("constant.c", {"N": n})])
     tables = [real.table("damping_scale", d.scale), real.table("damping_floor", d.floor)]
     calls: dict[str, list[str]] = {"diagonal": [], "lower": []}
     for name, first in (("diagonal", 0), ("lower", depth)):

@@ -3,6 +3,7 @@
 
 extern void _start(void);
 extern uint32_t __stack;
+void reset(void);
 
 void reset(void)
 {
@@ -17,5 +18,7 @@ static void fault(void)
     }
 }
 
-__attribute__((section(".vectors"), used)) static void (*const vectors[])(void) = {
-    (void (*)(void))&__stack, reset, fault, fault, fault, fault, fault};
+__attribute__((section(".vectors"), used)) static const struct {
+    uint32_t *stack;
+    void (*handlers[6])(void);
+} vectors = {&__stack, {reset, fault, fault, fault, fault, fault}};
