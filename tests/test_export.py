@@ -102,6 +102,7 @@ def test_what_has_no_c_form_is_refused(tmp_path):
         (learned, {}, "LagrangianDynamics, which is no rigid tree"),
         (nbs.PID.for_robot(TWO_LINK), {"gravity": False}, "a PID has no model"),
         (nbs.PD.for_robot(TWO_LINK), {"rate_limit": [1.0, 2.0, 3.0]}, "rate_limit has 3 numbers, expected 2"),
+        (nbs.PD.for_robot(TWO_LINK), {"certificate": "certificate.json"}, "give a Certificate, as certify returns it"),
         (nbs.PD.for_robot(TWO_LINK), {"rate_limit": 0.0}, "rate_limit is 0.0"),
         (nbs.PD.for_robot(TWO_LINK), {"precision": "half"}, "precision 'half' is unknown"),
     ):

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arguments import writable
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.checks import told
 from nbs_pin.base.doors import where_printed
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
@@ -53,7 +54,7 @@ def export_law(
     if rate_limit.shape not in ((), (n,)):
         raise ArgumentError(f"rate_limit has {rate_limit.size} numbers, expected {n}; give one per joint.")
     if certificate is not None:
-        _check_same(certificate.controller, law)
+        _check_certificate(certificate, law)
     exported = Exported(
         name=_identifier(folder),
         law=law,
@@ -89,10 +90,11 @@ def _tree(law: Packed, dynamics: Any, gravity: bool) -> Packed | None:
     return tree
 
 
-def _check_same(certified: Any, law: Packed) -> None:
-    """Raise ArgumentError unless the certified law is this one."""
-    own = certified.packed_law()
-    if not all(np.array_equal(x, y) for x, y in zip(own, law, strict=True)):
+def _check_certificate(certificate: Any, law: Packed) -> None:
+    """Raise ArgumentError unless it is a certificate, whose class lies above this module, of this law."""
+    if not (hasattr(certificate, "controller") and callable(getattr(certificate, "summary", None))):
+        raise ArgumentError(f"certificate is {told(certificate)}; give a Certificate, as certify returns it.")
+    if not all(np.array_equal(x, y) for x, y in zip(certificate.controller.packed_law(), law, strict=True)):
         raise ArgumentError("certificate is for a law with other numbers; certify the one that is exported.")
 
 

@@ -133,7 +133,7 @@ def _common(s: Stock) -> dict[str, Any]:
         "z1": Q, "z2": V, "dz": V, "dz1": V, "x": Q, "tau_d": V, "direction": V, "radius": 0.5, "radii": np.ones(2),
         "weights": np.ones(2), "nv": 2, "n": 2, "gain": 3.0, "rate": 2.0, "kp": 9.0, "ki": 1.0, "kd": 3.0, "limit": 5.0,
         "metric": np.eye(2), "initial": 0.5, "share": 0.3, "rows": slice(0, 10), "start": 0, "samples": 50,
-        "progress": False,
+        "progress": False, "folder": s.folder / "law",
     }  # fmt: skip
 
 
