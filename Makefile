@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign bench-history clean
+.PHONY: help setup demo test check mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign faults hostile-samples bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make test           the test suite"
@@ -15,13 +15,15 @@ help:
 	@echo "make random-arms    50 random arms with rotors and friction, untuned; about five minutes"
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
+	@echo "make faults         the fault matrix of docs/runtime.md, 5 trials a row; up to 10 minutes"
+	@echo "make hostile-samples  ten million hostile samples through the guard; about 3 minutes"
 	@echo "make bench-history  append this machine's figures to bench-history.jsonl; leave it alone meanwhile"
 	@echo "make clean          remove .venv and out/"
 
 setup: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,verify,xacro]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,franka,verify,xacro]'
 	touch $(READY)
 
 demo: $(READY)
@@ -59,6 +61,12 @@ monitor-campaign: $(READY)
 
 certificate-campaign: $(READY)
 	$(BIN)/python tools/certificate_campaign.py
+
+faults: $(READY)
+	$(BIN)/nbs-pin faults
+
+hostile-samples: $(READY)
+	$(BIN)/python tools/hostile_samples.py
 
 bench-history: $(READY)
 	$(BIN)/python tools/bench_history.py
