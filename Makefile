@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign export-check bench-history clean
+.PHONY: help setup demo test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign export-check faults hostile-samples bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make test           the test suite"
@@ -19,13 +19,15 @@ help:
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
 	@echo "make export-check   exported C under gcc, clang, sanitizers, qemu and frama-c, as far as they are here; about ten minutes"
+	@echo "make faults         the fault matrix of docs/runtime.md, 5 trials a row; up to 10 minutes"
+	@echo "make hostile-samples  ten million hostile samples through the guard; about 3 minutes"
 	@echo "make bench-history  append this machine's figures to bench-history.jsonl; leave it alone meanwhile"
 	@echo "make clean          remove .venv and out/"
 
 setup: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs,verify,xacro]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs,franka,verify,xacro]'
 	touch $(READY)
 
 demo: $(READY)
@@ -76,6 +78,12 @@ certificate-campaign: $(READY)
 
 export-check: $(READY)
 	$(BIN)/python tools/export_check.py
+
+faults: $(READY)
+	$(BIN)/nbs-pin faults
+
+hostile-samples: $(READY)
+	$(BIN)/python tools/hostile_samples.py
 
 bench-history: $(READY)
 	$(BIN)/python tools/bench_history.py

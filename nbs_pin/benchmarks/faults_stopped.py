@@ -1,4 +1,4 @@
-"""Faults that the guard must see: it stops, for a reason that it names, in a time that is stated."""
+"""Faults that the guard must see: it bears as much as is stated, then stops for a reason that it names, in time."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.records import Reference
-from nbs_pin.benchmarks.fault_rows import Verdict, case, rows, stopped
+from nbs_pin.benchmarks.fault_rows import Verdict, below, case, rows, stopped
 from nbs_pin.benchmarks.fault_trial import PERIOD, STRIKE, Arm, Trial, burst, frozen, in_gravity, spoilt
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -29,13 +29,13 @@ def wrong_rate(arm: Arm, rng: np.random.Generator, every: int) -> Verdict:
 
 
 @case("F16 samples lost in a row", "19 ms", "RMS ≤ 0.002, no stop")
-def shortburst(arm: Arm, rng: np.random.Generator) -> Verdict:
+def short_burst(arm: Arm, rng: np.random.Generator) -> Verdict:
     """Fewer than the guard's patience."""
     return below(Trial(arm, sense=burst(19)).run(), 0.002)
 
 
 @rows("F16 samples lost in a row", "MISSED at the 20th", ("20 ms", 20), ("100 ms", 100))
-def longburst(arm: Arm, rng: np.random.Generator, length: int) -> Verdict:
+def long_burst(arm: Arm, rng: np.random.Generator, length: int) -> Verdict:
     """As many as the guard's patience, or more."""
     outcome = Trial(arm, sense=burst(length)).run()
     verdict = stopped(outcome, "MISSED", within=19 * PERIOD)
@@ -112,11 +112,11 @@ class _Raises(MemorylessController):
     """A law that raises after a number of calls."""
 
     def __init__(self, law: NeuralBackstepping, calls: int) -> None:
-        self.inner, self.left = law.compile(), calls
+        self.inner, self.left = law, calls
 
     @property
     def nv(self) -> int:
-        return self.inner.nv  # type: ignore[no-any-return]
+        return self.inner.nv
 
     def torque(self, *state: Any) -> Any:
         self.left -= 1

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from nbs_pin.base.arguments import DURATION, checked, maybe
+from nbs_pin.base.arguments import DURATION, check_fields, checked, maybe, numbers
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import vector_of
 from nbs_pin.base.exceptions import ArgumentError
@@ -29,6 +29,9 @@ class Approach:
     """How long it takes [s]."""
     coefficients: np.ndarray
     """(6, n), of the powers of t/length."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, motion=MOTION, length=DURATION, coefficients=numbers(6, None))
 
     @classmethod
     @checked(motion=MOTION, robot=ARM, length=maybe(DURATION))

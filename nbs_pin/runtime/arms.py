@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -17,6 +17,7 @@ _SPIN = 2e-4  # the last stretch before an instant is waited for without sleep [
 _PUSH = function(3, "a disturbance, a function of t, q and v that returns torques, or None")
 
 
+@runtime_checkable
 class ArmInterface(Protocol):
     """An arm that is read and driven once per period.
 

@@ -70,6 +70,7 @@ class Live(NamedTuple):
 
 
 @checked(
+    arm=a(ArmInterface, "an arm, such as PlantArm or FrankaArm"),
     law=CONTROLLER,
     robot=ARM,
     motion=MOTION,
@@ -101,7 +102,8 @@ def drive(
         duration: How long [s], a whole number of periods.
         guard: Limits; None takes those of `Guard.for_robot` for this arm and period.
         approach: Whether to lead from where the arm is to the motion (`Approach`).
-        watch: Called at every instant, with what must not take long; an exception of it stops the arm.
+        watch: Called at every instant, with what must not take long; an exception of it stops the arm and is
+            told in the run's `info`.
         priority: Ask the system for a real-time priority, which needs the right to have one.
 
     Raises:
@@ -151,7 +153,7 @@ class _Loop:
         self.target = at_times(motion, times + guarded.lead, arm.nv)
         self.rows: list[tuple[int, Sample, np.ndarray]] = []
         self.work = np.zeros(steps + 1)
-        self.missed, self.done = 0, 0
+        self.missed, self.trouble = 0, ""
 
     def aim(self, row: int) -> Reference:
         """The reference for which the law is evaluated in a row."""
@@ -179,17 +181,28 @@ class _Loop:
             overrun = spent > h
             if guarded.report is not None:
                 left = 0 if sample.fault else left - 1  # an arm with a fault takes no torque
+            stop = self.watched(Live(sample, aim, tau, guarded.mode, guarded.counters)) or stop
             try:
-                if self.watch is not None:
-                    self.watch(Live(sample, aim, tau, guarded.mode, guarded.counters))
                 sample = arm.read()
             except KeyboardInterrupt:
                 stop, sample = True, sample._replace(fresh=False)
-            except Exception as error:  # a watcher or an arm may raise anything: the arm is braked first
-                stop, sample = True, sample._replace(fresh=False, fault=f"{type(error).__name__}: {error}")
+            except Exception as error:  # a plant may raise anything: nothing more is sent to it
+                sample = sample._replace(fresh=False, fault=f"{type(error).__name__}: {error}")
             passed = round((sample.t - self.first.t) / h) - row if sample.fresh else 1
             self.missed += max(passed - 1, 0)
             row += max(passed, 0 if sample.fresh else 1)
+
+    def watched(self, seen: Live) -> bool:
+        """Show an instant to the watcher; whether the arm is to stop for what it raises, after which it sees no more."""
+        try:
+            if self.watch is not None:
+                self.watch(seen)
+        except KeyboardInterrupt:
+            return True
+        except Exception as error:  # a watcher may raise anything: the arm is braked, and the run says why
+            self.watch, self.trouble = None, f"{type(error).__name__}: {error}"
+            return True
+        return False
 
     def driven(self, robot: Robot, law: str, granted: bool) -> Driven:
         """What was recorded, on the raster of the periods."""
@@ -216,7 +229,7 @@ class _Loop:
             robot_sha256=robot.sha256,
             robot_options=robot.options,
             prismatic=robot.prismatic,
-            info={"controller": law, "arm": type(self.arm).__name__},
+            info={"controller": law, "arm": type(self.arm).__name__, "watcher": self.trouble},
         )
         times = Times(self.arm.period, self.work[: len(self.rows)], self.missed, granted)
         return Driven(run, self.guarded.report, self.guarded.mode, self.guarded.counters, times)

@@ -7,13 +7,13 @@ function: nothing here replaces the brakes, the limits and the emergency stop of
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nbs_pin.base.arguments import PERIOD, check_fields, checked, count, flag, joints, maybe, number
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.checks import PerJoint
+from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.certificate import CERTIFICATE, Certificate
 from nbs_pin.controllers.gains import gains_for_robot
@@ -108,6 +108,14 @@ class Counters(NamedTuple):
     """Instants at which the law asked for more than the arm gives."""
 
 
+def _bound(name: str, value: Any) -> np.ndarray:
+    """A bound of positions per joint, which may be infinite."""
+    array = floats(name, value)
+    if array.ndim > 1 or array.size == 0 or np.isnan(array).any():
+        raise ArgumentError(f"{name} is {told(value)}; give one number, or one per joint, ±inf for none.")
+    return array
+
+
 @dataclass(frozen=True, eq=False)
 class Guard:
     """The limits of a guard; `Guarded` applies them to a law, and `begin`, `admit`, `release` are one step of it.
@@ -163,6 +171,8 @@ class Guard:
             **positive,
             external_limit=joints(above=0.0, unit="N·m", infinite=True),
             **{name: joints(least=0.0, unit=unit) for name, unit in least.items()},
+            lower=_bound,
+            upper=_bound,
             compensated=flag,
             patience=count(2, 1000, "samples"),
             longest=number(above=1.2, most=100.0),
@@ -256,8 +266,7 @@ class Guard:
         """A view of one vector of a state, such as `guarding.TAU`."""
         return state[at.SCALARS + which * self.nv : at.SCALARS + (which + 1) * self.nv]
 
-    @staticmethod
-    def counters(state: np.ndarray) -> Counters:
+    def counters(self, state: np.ndarray) -> Counters:
         """What a state has counted."""
         return Counters(*(int(state[k]) for k in (at.HELD, at.LATE, at.OVERRUN, at.CUT)))
 

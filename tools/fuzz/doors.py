@@ -17,11 +17,14 @@ import nbs_pin as nbs
 RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
-    "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge",
+    "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
+    "FaultReport", "Mode", "Sample",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
 """Abstract classes: their methods are called on what derives from them."""
+OUTSIDE = ["ArmInterface", "FrankaArm", "URArm"]
+"""What reaches out of the process, to any address that it is given, and the protocol of such classes."""
 INFINITE = (
     "extra_stiffness", "extra_damping", "damping_share", "damping_slope", "stiffness_range", "stiffness_rate",
     "Admissible", "convergence_time", "slope", "share", "packed", "packed_law", "lyapunov", "structure_claims",
@@ -71,6 +74,9 @@ class Stock:
 
     def _motion(self) -> Any:
         return nbs.Sinusoid.for_robot(self.robot)
+
+    def _arm(self) -> Any:
+        return nbs.PlantArm(self.plant, Q, real_time=False)
 
     def _run(self) -> Any:
         return nbs.simulate(self.plant, self.law, self.motion, 0.02, 0.001)
@@ -165,6 +171,13 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "SlidingMode": {"switching": 1.0, "boundary": 0.1},
         "Encoders": {"step": 1e-4},
         "Encoders.of_bits": {"bits": 16},
+        "Guard": {"effort_limit": [9.0, 9.0], "velocity_limit": 2.0, "lower": -1.0, "upper": 1.0, "damping": 1.0},
+        "Guard.for_robot": {"torque_rate": 500.0, "certificate": None},
+        "Guarded": {"law": s.law, "lookahead": 0.001},
+        "Approach": {"motion": s.motion, "length": 1.0, "coefficients": np.zeros((6, 2))},
+        "Approach.from_state": {"motion": s.motion, "length": None},
+        "PlantArm": {"real_time": False, "disturbance": None},
+        "drive": {"arm": s.arm, "law": s.law, "motion": s.motion, "guard": None},
         "Hold": {"q": Q},
         "MinimumJerk": {"waypoints": np.array([[0.0, 0.0], [1.0, 1.0]]), "times": np.array([0.0, 2.0])},
         "Sampled": {"t": np.arange(5.0), "q": np.zeros((5, 2))},
@@ -266,7 +279,7 @@ def doors() -> list[Door]:
             functions = [f for f in vars(thing).values() if inspect.isfunction(f) and f.__module__ == thing.__name__]
             found += [(f"metrics.{f.__name__}", f) for f in functions if not f.__name__.startswith("_")]
         elif inspect.isclass(thing):
-            found += [] if name in (*RESULTS, *INTERFACES) else [(name, thing)]
+            found += [] if name in (*RESULTS, *INTERFACES, *OUTSIDE) else [(name, thing)]
             found += [(f"{name}.{m}", getattr(subjects.get(name, thing), m)) for m in _methods(thing, subjects)]
         elif callable(thing):
             found.append((name, thing))

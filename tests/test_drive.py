@@ -1,0 +1,252 @@
+"""The loop over arms: approach, simulated, UR (a double) and Franka arms (a server of its protocol), the live view."""
+
+import inspect
+import socket
+import sys
+import time
+import types
+
+import numpy as np
+import psutil
+import pytest
+
+import nbs_pin as nbs
+from nbs_pin import cli
+from nbs_pin.benchmarks import faults
+from nbs_pin.reports.live import LiveView
+from tests.commands import printed_by, refusal
+
+ROBOT = nbs.load_robot("two_link")
+LAW = nbs.NeuralBackstepping.for_robot(ROBOT)
+MOTION = nbs.Sinusoid.for_robot(ROBOT)
+H = 0.001
+
+
+def simulated(robot=ROBOT, q=None, **more):
+    start = MOTION(0.0).q if q is None else q
+    return nbs.PlantArm(nbs.MujocoPlant(robot), start, real_time=False, **more)
+
+
+def test_an_approach_begins_with_the_arm_and_ends_in_the_motion_smoothly():
+    q, v = np.array([-1.0, 0.7]), np.array([0.5, -0.2])
+    led = nbs.Approach.from_state(MOTION, ROBOT, q, v)
+    begin, T = led(0.0), led.length
+    assert np.allclose([begin.q, begin.v], [q, v], atol=1e-12)
+    assert np.allclose(begin.a, 0.0, atol=1e-9)
+    t = np.linspace(0.0, T, 2001)
+    along, h = led(t), t[1]
+    assert np.allclose(np.gradient(along.q, h, axis=0)[1:-1], along.v[1:-1], atol=1e-4)
+    assert np.allclose(np.gradient(along.v, h, axis=0)[1:-1], along.a[1:-1], atol=1e-2)
+    for t in (T, T + 0.37):
+        assert all(np.allclose(x, y, atol=1e-12) for x, y in zip(led(t), MOTION(t), strict=True))
+    assert (np.abs(along.v - MOTION(np.linspace(0.0, T, 2001)).v) <= 0.5 * ROBOT.velocity_limit + 1e-3).all()
+
+
+def test_the_loop_leads_the_arm_to_the_motion_and_along_it():
+    driven = nbs.drive(simulated(q=[-0.5, 0.5]), LAW, ROBOT, MOTION, 2.0)
+    assert driven.report is None
+    assert len(driven.run.t) == 2000
+    assert nbs.metrics.squared_error(driven.run).max() < 1e-8
+    assert driven.times.missed == 0
+    assert np.abs(driven.run.q_ref[-1] - MOTION(driven.run.t[-1]).q).max() < 1e-12
+
+
+def test_what_a_watcher_raises_and_what_the_plant_raises_stop_the_arm_and_do_not_leave():
+    def watch(seen):
+        if seen.sample.t > 0.1:
+            raise RuntimeError("the screen is gone")
+
+    driven = nbs.drive(simulated(), LAW, ROBOT, MOTION, 1.0, watch=watch)
+    assert driven.report.code is nbs.Fault.REQUESTED
+    assert "the screen is gone" in driven.run.info["watcher"]
+    assert driven.run.t[-1] > 0.5  # it was braked
+    push = simulated(disturbance=lambda t, q, v: np.full(2, np.nan if t > 0.1 else 0.0))
+    driven = nbs.drive(push, LAW, ROBOT, MOTION, 1.0)
+    assert "SimulationDiverged" in driven.report.message
+
+
+def test_ctrl_c_brakes_the_arm():
+    def watch(seen):
+        if 0.3 < seen.sample.t < 0.3 + 1.5 * H:
+            raise KeyboardInterrupt
+
+    driven = nbs.drive(simulated(), LAW, ROBOT, MOTION, 2.0, watch=watch)
+    assert driven.report.code is nbs.Fault.REQUESTED
+    assert driven.run.t[-1] == pytest.approx(0.8, abs=0.01)  # it was braked for half a second
+    assert np.abs(driven.run.v[-1]).max() < 0.2 * np.abs(driven.run.v[290]).max()
+
+
+def test_an_arm_in_real_time_moves_on_without_torques():
+    arm = nbs.PlantArm(nbs.MujocoPlant(ROBOT), [0.3, 0.2])
+    arm.start()
+    arm.write(nbs.PinocchioDynamics(ROBOT).gravity(np.array([0.3, 0.2])))
+    began, last = time.perf_counter(), 0.0
+    for _ in range(20):
+        sample = arm.read()
+        assert sample.t > last
+        last = sample.t
+    time.sleep(0.03)
+    assert arm.read().t > last + 0.029  # it did not wait for the caller
+    assert sample.t <= time.perf_counter() - began + 2 * H
+
+
+@pytest.fixture
+def ur(monkeypatch):
+    """Modules with the classes of ur_rtde 1.6, around a simulated arm that adds gravity."""
+    robot = nbs.load_robot("ur5")
+    plant, model = nbs.MujocoPlant(robot), nbs.PinocchioDynamics(robot)
+    state = {"q": nbs.Sinusoid.for_robot(robot)(0.0).q, "v": np.zeros(6), "tau": np.zeros(6), "t": 5.0, "stop": False}
+
+    class RTDEControlInterface:
+        def __init__(self, hostname, frequency=-1.0):
+            assert (hostname, frequency) == ("arm", 500.0)
+
+        def initPeriod(self):
+            return None
+
+        def waitPeriod(self, start):
+            for _ in range(2):
+                q = state["q"]
+                state["q"], state["v"] = plant.step(q, state["v"], state["tau"] + model.gravity(q), 0.001)
+            state["t"] += 0.002
+
+        def directTorque(self, torque, viscous_scale, coulomb_scale):
+            assert viscous_scale == coulomb_scale == [0.0] * 6
+            state["tau"] = np.array(torque)
+            return True
+
+        def stopScript(self):
+            state["tau"] = np.zeros(6)
+
+    class RTDEReceiveInterface:
+        def __init__(self, hostname, frequency=-1.0):
+            assert (hostname, frequency) == ("arm", 500.0)
+
+        def getActualQ(self):
+            return state["q"].tolist()
+
+        def getActualQd(self):
+            return state["v"].tolist()
+
+        def getTimestamp(self):
+            return state["t"]
+
+        def isConnected(self):
+            return True
+
+        def isEmergencyStopped(self):
+            return False
+
+        def isProtectiveStopped(self):
+            return state["stop"]
+
+    for name, kind in (("rtde_control", RTDEControlInterface), ("rtde_receive", RTDEReceiveInterface)):
+        module = types.ModuleType(name)
+        setattr(module, kind.__name__, kind)
+        monkeypatch.setitem(sys.modules, name, module)
+    return robot, state
+
+
+def test_a_ur_arm_as_its_client_describes_it(ur):
+    robot, state = ur
+    law = nbs.NeuralBackstepping.for_robot(robot, period=0.002)
+    driven = nbs.drive(nbs.URArm("arm"), law, robot, nbs.Sinusoid.for_robot(robot), 1.0)
+    assert driven.report is None
+    assert np.abs(nbs.metrics.error(driven.run)).max() < 1e-3
+
+    def watch(seen):
+        state["stop"] = seen.sample.t > 6.5
+
+    driven = nbs.drive(nbs.URArm("arm"), law, robot, nbs.Sinusoid.for_robot(robot), 1.0, watch=watch)
+    assert driven.report.code is nbs.Fault.ARM
+    assert "protective stop" in driven.report.message
+
+
+def test_the_double_of_the_ur_arm_has_the_names_of_its_client(ur):
+    double = {name: sys.modules[name] for name in ("rtde_control", "rtde_receive")}
+    for name, kind in (("rtde_control", "RTDEControlInterface"), ("rtde_receive", "RTDEReceiveInterface")):
+        del sys.modules[name]
+        real = getattr(pytest.importorskip(name), kind)
+        ours = getattr(double[name], kind)
+        for method, _ in inspect.getmembers(ours, inspect.isfunction):
+            assert hasattr(real, method)
+        if hasattr(ours, "directTorque"):
+            assert all(word in real.directTorque.__doc__ for word in ("torque", "viscous_scale", "coulomb_scale"))
+
+
+def test_an_arm_that_does_not_answer_or_whose_client_is_missing_is_refused(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pylibfranka", None)
+    with pytest.raises(nbs.MissingExtra, match=r"nbs-pin\[franka\]"):
+        nbs.FrankaArm("127.0.0.1")
+    monkeypatch.setitem(sys.modules, "rtde_control", None)
+    with pytest.raises(nbs.MissingExtra, match=r"nbs-pin\[ur\]"):
+        nbs.URArm("127.0.0.1")
+
+
+@pytest.fixture(scope="module")
+def franka():
+    pytest.importorskip("pylibfranka")
+    pytest.importorskip("franky_sim")
+    from tests.franka_wire import simulated_arm
+
+    robot = simulated_arm()
+    return robot, nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot, amplitude=0.2)
+
+
+def test_the_wire_carries_what_a_franka_arm_takes(franka):
+    from tests.franka_wire import drive_with_fault, is_legal
+
+    robot, _, motion = franka
+    friction = nbs.JointFriction(viscous=np.full(7, 0.21), coulomb=[1.137] * 4 + [0.763, 0.44, 0.248])
+    law = nbs.NeuralBackstepping.for_robot(robot, friction=friction)
+    driven, story = drive_with_fault(robot, law, motion, "", duration=0.6)
+    assert driven.report is None
+    assert is_legal(story, robot)
+    assert story["commands"] >= 600
+    assert np.abs(nbs.metrics.error(driven.run)).max() < 5e-3
+    gravity = nbs.PinocchioDynamics(robot).gravity(driven.run.q)
+    assert np.abs(driven.run.tau - gravity).max() <= max(story["largest"]) + 1e-9  # sent without it
+
+
+@pytest.mark.parametrize("fault", ["drop 10", "deaf 40", "reflex", "close"])
+def test_every_fault_on_the_wire_of_a_franka_arm_ends_in_a_recovery_or_a_stop(franka, fault):
+    from tests.franka_wire import ENDS, drive_with_fault, is_legal
+
+    robot, law, motion = franka
+    driven, story = drive_with_fault(robot, law, motion, fault, duration=0.25)
+    assert ("" if driven.report is None else driven.report.code.name) in ENDS[fault]
+    assert is_legal(story, robot)
+    if fault == "drop 10":
+        assert len(driven.run.t) == 240
+        assert driven.counters.late == 10
+
+
+def test_the_live_view_listens_on_this_machine_only():
+    with LiveView(ROBOT) as view:
+        assert view.url.startswith("http://127.0.0.1:")
+        here = psutil.Process(view._server.pid)
+        listening = [c for c in here.net_connections("inet") if c.status == psutil.CONN_LISTEN]
+        assert listening
+        assert all(c.laddr.ip == "127.0.0.1" for c in listening)
+        view.show(np.array([0.3, 0.2]))
+        port = int(view.url.split(":")[2].split("/")[0])
+        socket.create_connection(("127.0.0.1", port), timeout=5.0).close()
+
+
+def test_nbs_pin_run_writes_what_happened(tmp_path, monkeypatch):
+    from nbs_pin.commands import run as command
+
+    monkeypatch.setattr(command, "arm_at", lambda text, robot, motion, period: simulated(robot, motion(0.0).q))
+    text = printed_by("run", "two_link", "--duration", "0.3", "--certified", "5", "--out", tmp_path)
+    assert "guard: OK" in text
+    assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "tracking.png", "replay.html", "summary.json"}
+    assert len(nbs.Run.load(tmp_path / "run.npz").t) == 300
+
+
+def test_nbs_pin_faults_prints_a_row_for_each_fault(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(faults, "on_all_cores", lambda function, tasks, *_: (function(*task) for task in tasks))
+    text = printed_by("faults", "--arms", "two_link", "--seeds", "1", "--only", "F22", "--out", tmp_path)
+    assert text.count("TIME at once") == 3
+    assert "3 of 3 rows passed" in text
+    assert "F99" in refusal(cli.main(["faults", "--only", "F99", "--out", str(tmp_path)]), capsys)
+    assert "libfranka:HOST" in refusal(cli.main(["run", "panda", "--arm", "libfranka"]), capsys)

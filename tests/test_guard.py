@@ -1,0 +1,236 @@
+"""The guard: what leaves it is always legal, what it holds and when it stops, and what it tells."""
+
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nbs_pin as nbs
+from nbs_pin.benchmarks.faults import MATRIX, judge
+from nbs_pin.controllers.controller import MemorylessController
+from nbs_pin.kernels import guarding as at
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
+
+ROBOT = nbs.load_robot("two_link")
+LAW = nbs.NeuralBackstepping.for_robot(ROBOT).compile()
+MOTION = nbs.Sinusoid.for_robot(ROBOT)
+PLANT = nbs.MujocoPlant(ROBOT)
+H = 0.001
+
+
+def begun(law=LAW, guard=None, start=None):
+    guarded = nbs.Guarded(law, ROBOT, guard)
+    q = MOTION(0.0).q if start is None else start
+    guarded.begin(q, MOTION(guarded.lead))
+    return guarded
+
+
+def follow(guarded, count, first=0, q=None, v=None, spoil=lambda k, sample: sample):
+    """So many periods in the loop; returns the state of the plant and the torques."""
+    q, v = (MOTION(first * H).q, MOTION(first * H).v) if q is None else (q, v)
+    torques = []
+    for k in range(first, first + count):
+        tau = guarded.step(spoil(k, nbs.Sample(k * H, q, v)), MOTION(k * H + guarded.lead))
+        torques.append(tau)
+        q, v = PLANT.step(q, v, tau, H)
+    return q, v, np.array(torques)
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("name", ["two_link", "panda"])
+def test_no_hostile_sample_makes_an_illegal_torque(name, compensated):
+    from hostile_samples import campaign, run
+
+    illegal, modes, codes = run(name, 20_000, seed=1, compensated=compensated, function=campaign.py_func)
+    assert illegal == 0
+    assert (modes > 0).all()
+    assert (codes > 0).sum() >= 6  # reasons to stop
+
+
+def test_what_the_guard_lets_pass_is_what_simulate_applies():
+    rest = nbs.Hold([0.3, 0.2])
+    guarded = nbs.Guarded(LAW, ROBOT)
+    guarded.begin(rest(0.0).q, rest(0.0))
+    q, v = rest(0.0).q, np.zeros(2)
+    push = nbs.SinusoidalTorque([3.0, -2.0], 10.0)
+    run = nbs.simulate(PLANT, LAW, rest, 0.3, H, disturbance=push)
+    for k in range(300):
+        assert np.allclose(q, run.q[k], rtol=0.0, atol=1e-12)
+        tau = guarded.step(nbs.Sample(k * H, q, v), rest(0.0))
+        q, v = PLANT.step(q, v, tau + push(k * H, q, v), H)
+    assert guarded.mode is nbs.Mode.OK
+    assert guarded.report is None
+
+
+def test_a_bad_sample_is_held_the_twentieth_stops_and_only_begin_goes_on():
+    guarded = begun()
+    q, v, before = follow(guarded, 50)
+    gone = np.full(2, np.nan)
+    _, _, held = follow(guarded, 19, 50, q, v, lambda k, s: s._replace(q=gone))
+    assert (held == before[-1]).all()
+    assert guarded.mode is nbs.Mode.DEGRADED
+    assert guarded.counters.held == 19
+    guarded.step(nbs.Sample(0.069, gone, v), MOTION(0.069))
+    assert guarded.mode is nbs.Mode.STOPPED
+    assert guarded.report.code is nbs.Fault.NOT_FINITE
+    assert len(guarded.report.samples) == 50
+    assert guarded.report.t[-1] == 0.069
+    for k in range(70, 200):  # good samples do not undo it
+        guarded.step(nbs.Sample(k * H, MOTION(k * H).q, MOTION(k * H).v), MOTION(k * H))
+    assert guarded.mode is nbs.Mode.STOPPED
+    guarded.begin(MOTION(0.0).q, MOTION(0.0))
+    follow(guarded, 30)
+    assert guarded.mode is nbs.Mode.OK
+    assert guarded.report is None
+
+
+def test_after_a_hundred_good_samples_degraded_is_over():
+    guarded = begun()
+    q, v, _ = follow(guarded, 10, spoil=lambda k, s: s._replace(fresh=k != 5))
+    assert guarded.mode is nbs.Mode.DEGRADED
+    q, v, _ = follow(guarded, 95, 10, q, v)
+    assert guarded.mode is nbs.Mode.DEGRADED
+    follow(guarded, 1, 105, q, v)
+    assert guarded.mode is nbs.Mode.OK
+
+
+def test_the_safe_stop_brakes_the_arm_against_gravity_and_lets_go_when_the_state_is_lost():
+    guarded = begun()
+    q, v, _ = follow(guarded, 700)
+    guarded.step(nbs.Sample(0.7, q, v), MOTION(0.7), stop=True)
+    assert guarded.report.code is nbs.Fault.REQUESTED
+    for k in range(701, 2700):
+        tau = guarded.step(nbs.Sample(k * H, q, v), MOTION(k * H))
+        q, v = PLANT.step(q, v, tau, H)
+    assert np.abs(v).max() < 1e-3  # it rests, where it was braked
+    assert np.allclose(tau, nbs.PinocchioDynamics(ROBOT).gravity(q), atol=1e-2)
+    sent = [guarded.step(nbs.Sample(2.7, q, v, fresh=False), MOTION(2.7)) for _ in range(200)]
+    assert np.allclose(sent[90], tau, atol=1e-2)  # gravity of the last position, for a while
+    assert (sent[-1] == 0.0).all()
+    assert (np.abs(np.diff(sent, axis=0)) <= guarded.guard.torque_rate * H).all()
+
+
+def test_a_joint_that_runs_away_from_the_brake_goes_limp():
+    guarded = begun()
+    q, v, _ = follow(guarded, 200)
+    guarded.step(nbs.Sample(0.2, q, v), MOTION(0.2), stop=True)
+    for k in range(201, 600):
+        tau = guarded.step(nbs.Sample(k * H, q, v), MOTION(k * H))
+        q, v = PLANT.step(q, v, np.array([1.0, -1.0]) * tau - np.array([0.0, 5.0]), H)  # flipped, and pushed
+    limp = guarded.guard.vector(guarded.state, at.LIMP)
+    assert limp[1] == 1.0
+    assert tau[1] == 0.0
+
+
+class Strange(MemorylessController):
+    """A law that does something else from a call on."""
+
+    def __init__(self, after, do):
+        self.calls, self.after, self.do = 0, after, do
+
+    @property
+    def nv(self):
+        return 2
+
+    def torque(self, *state):
+        self.calls += 1
+        return self.do() if self.calls > self.after else LAW.torque(*state)
+
+
+def test_a_law_that_raises_stops_the_arm_in_that_period_with_its_traceback():
+    guarded = begun(Strange(60, lambda: 1 / 0))
+    *_, torques = follow(guarded, 70)
+    report = guarded.report
+    assert report.code is nbs.Fault.LAW
+    assert "ZeroDivisionError" in report.traceback
+    assert "division by zero" in str(report)
+    assert np.isfinite(torques).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e300])  # the last is larger than any torque
+def test_a_law_without_numbers_is_held_and_stops_at_the_twentieth(value):
+    guarded = begun(Strange(60, lambda: np.full(2, value)))
+    *_, torques = follow(guarded, 100)
+    assert guarded.report.code is nbs.Fault.OUTPUT
+    assert np.isfinite(torques).all()
+    assert guarded.counters.held >= 19
+
+
+def test_a_torque_from_limit_to_limit_is_chatter():
+    signs = iter(np.tile([1.0, -1.0], 1000))
+    guarded = begun(Strange(60, lambda: np.full(2, 1e3 * next(signs))))
+    follow(guarded, 200)
+    assert guarded.report.code is nbs.Fault.CHATTER
+
+
+def test_a_torque_from_outside_and_an_arm_with_a_fault_stop():
+    guard = replace(nbs.Guard.for_robot(ROBOT), external_limit=np.array([4.0, 4.0]))
+    guarded = begun(guard=guard)
+    follow(guarded, 30, spoil=lambda k, s: s._replace(external=np.array([0.0, 3.9 if k < 10 else 4.1])))
+    assert guarded.report.code is nbs.Fault.EXTERNAL
+    assert guarded.report.time == pytest.approx(0.012)  # the third in a row
+    guarded = begun()
+    follow(guarded, 30, spoil=lambda k, s: s._replace(fault="reflex" if k == 20 else ""))
+    assert guarded.report.code is nbs.Fault.ARM
+    assert "reflex" in str(guarded.report)
+
+
+def test_a_certificate_gives_the_errors_at_which_the_loop_has_diverged():
+    certificate = nbs.certify(nbs.NeuralBackstepping.for_robot(ROBOT), [5.0, 5.0])
+    guard = nbs.Guard.for_robot(ROBOT, certificate=certificate)
+    assert np.array_equal(guard.error_limit, certificate.joint_errors)
+    q, v = MOTION(0.0).q, MOTION(0.0).v
+    for size, stops in ((1.0, False), (40.0, True)):  # admissible torques never stop it, much larger ones do
+        guarded = begun(guard=guard)
+        q, v = MOTION(0.0).q, MOTION(0.0).v
+        for k in range(1500):
+            tau = guarded.step(nbs.Sample(k * H, q, v), MOTION(k * H + guarded.lead))
+            q, v = PLANT.step(q, v, tau + size * 5.0 * np.sign(np.sin(8.0 * k * H)) * np.ones(2), H)
+        assert (guarded.report is not None) == stops
+    assert guarded.report.code is nbs.Fault.DIVERGED
+
+
+def test_one_thread_at_a_time():
+    inside, leave = threading.Event(), threading.Event()
+
+    def wait():
+        inside.set()
+        leave.wait(10.0)
+        return np.zeros(2)
+
+    guarded = begun(Strange(5, wait))
+    q, v, _ = follow(guarded, 4)
+    other = threading.Thread(target=lambda: follow(guarded, 3, 4, q, v))
+    other.start()
+    inside.wait(10.0)
+    with pytest.raises(nbs.ArgumentError, match="another thread"):
+        guarded.step(nbs.Sample(0.01, q, v), MOTION(0.01))
+    leave.set()
+    other.join()
+
+
+def test_arguments_that_do_not_fit_are_refused_or_held():
+    with pytest.raises(nbs.ArgumentError, match="2 joints, the guard 7 and two_link 2"):
+        nbs.Guarded(LAW, ROBOT, nbs.Guard.for_robot(nbs.load_robot("panda")))
+    with pytest.raises(nbs.ArgumentError, match="has not begun"):
+        nbs.Guarded(LAW, ROBOT).step(nbs.Sample(0.0, np.zeros(2), np.zeros(2)), MOTION(0.0))
+    with pytest.raises(nbs.ArgumentError, match="torque_rate"):
+        nbs.Guard.for_robot(ROBOT, torque_rate=-1.0)
+    guarded = begun()
+    _, _, torques = follow(guarded, 3)
+    short = guarded.step(nbs.Sample(0.003, np.zeros(1), np.zeros(5)), MOTION(0.003))  # no reading of this arm
+    assert np.array_equal(short, torques[-1])
+    listed = guarded.step(nbs.Sample(0.004, MOTION(0.004).q.tolist(), list(MOTION(0.004).v)), MOTION(0.004))
+    assert np.isfinite(listed).all()
+
+
+SHORT = ["F9", "F14 rate, gains for 1 kHz", "F16 samples lost in a row", "F19", "F21 velocity", "F22", "F23", "F25"]
+
+
+@pytest.mark.parametrize("at", [k for k, case in enumerate(MATRIX) if case.fault.startswith(tuple(SHORT))])
+def test_rows_of_the_fault_matrix(at):
+    assert judge(at, "two_link", 0).passed
