@@ -2,9 +2,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign bench-history clean
+.PHONY: help setup demo demos test check mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
+	@echo "make demos          every demo in demos/, at its full length; some minutes"
 	@echo "make test           the test suite"
 	@echo "make check          ruff, mypy and the architecture test"
 	@echo "make mutants        how many of 60 seeded faults the tests find; about half an hour"
@@ -26,6 +27,9 @@ $(READY): pyproject.toml constraints.txt
 
 demo: $(READY)
 	$(BIN)/python demos/three_arms.py
+
+demos: $(READY)
+	for demo in demos/*.py; do echo "$$demo"; $(BIN)/python "$$demo" || exit 1; done
 
 test: $(READY)
 	$(BIN)/python -m pytest
