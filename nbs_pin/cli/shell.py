@@ -51,7 +51,8 @@ COMMANDS: dict[str, type] = {
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` lists the options of a command, "
     "`nbs-pin --version` prints the version, `nbs-pin --tyro-print-completion bash` (or zsh) a script for completion. "
-    "Commands print their verdict first and the tables behind it with -v. Exit codes: 0 success, 2 bad input, 3 no promise from certify or verify, "
+    "Commands print their verdict first and the tables behind it with -v. "
+    "Exit codes: 0 success, 2 bad input, 3 no promise from certify or verify, "
     "130 interrupted."
 )
 
