@@ -2,9 +2,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign export-check faults hostile-samples bench-history clean
+.PHONY: help setup demo demos test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign export-check faults hostile-samples bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
+	@echo "make demos          every demo in demos/, at its full length; some minutes"
 	@echo "make test           the test suite"
 	@echo "make check          ruff, mypy and the architecture test"
 	@echo "make docs           the documentation as a site that works offline, in out/site"
@@ -32,6 +33,9 @@ $(READY): pyproject.toml constraints.txt
 
 demo: $(READY)
 	$(BIN)/python demos/three_arms.py
+
+demos: $(READY)
+	for demo in demos/*.py; do echo "$$demo"; $(BIN)/python "$$demo" || exit 1; done
 
 test: $(READY)
 	$(BIN)/python -m pytest

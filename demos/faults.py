@@ -5,6 +5,8 @@ know of, and a motor that saturates are each named by the assumption that they b
 honest run.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 import nbs_pin as nbs
@@ -23,7 +25,11 @@ def main(duration: float = 2.0) -> dict[str, str]:
     def run(arm: nbs.Robot = robot, torque: float = LARGEST, limit: float = np.inf) -> nbs.Run:
         plant = nbs.DynamicsPlant.for_robot(arm)
         wave = nbs.SquareWave(np.full(2, torque), frequency=3.0)
-        return nbs.simulate(plant, law, reference, duration, 0.001, disturbance=wave, effort_limit=limit, check=False)
+        recorded = nbs.simulate(
+            plant, law, reference, duration, 0.001, disturbance=wave, effort_limit=limit, check=False
+        )
+        # A log names the arm that its controller believes in, not the one that hangs there.
+        return replace(recorded, robot_sha256=robot.sha256)
 
     cases = {
         "honest": run(),

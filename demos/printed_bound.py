@@ -1,8 +1,9 @@
 """The error bound that the paper's Theorem 3 prints, broken by a switching torque; the certified one holds.
 
-What to see: one joint of 1 kg·m² without gravity, S = ¼, Λ = 1, D = ½, ψ = 0. The printed bound is where the error
-settles under the worst constant torque. An adversary that follows the gradient of the error through the loop finds a torque, of the same size but
-switching, under which the error passes it; it stays below what `certify` proves (docs/theory.md §5).
+What to see: one joint of 1 kg·m² without gravity, S = ¼, Λ = 1, D = ½, ψ = 0. The printed bound is true of where the
+error settles under constant torques. An adversary that follows the gradient of the error through the loop finds a
+torque, of the same size but switching, under which the error passes it; it stays below what `certify` proves
+(docs/theory.md §5).
 """
 
 import tempfile

@@ -88,3 +88,43 @@ def test_a_trained_controller_is_faster_and_its_storage_still_falls(tmp_path):
     folder = tmp_path / "out" / "demo" / "train"
     assert sorted(path.name for path in folder.iterdir()) == ["controller.nbs", "learning.png"]
     assert "lower the held-out cost by" in printed
+
+
+def test_an_arm_by_name_or_path_is_tracked_and_replayed(tmp_path):
+    error, printed = run_demo("any_urdf", tmp_path, "main('two_link', duration=1.0)")
+    assert error < 1e-6
+    assert "Robot('two_link', 2 joints" in printed
+    assert (tmp_path / "out" / "demo" / "two_link.html").stat().st_size > 100_000
+
+
+def test_the_hand_draws_its_circle_and_a_larger_one_is_refused(tmp_path):
+    found, _ = run_demo("tool_circle", tmp_path, "main(duration=2.0)")
+    assert found["error"] < 1e-6
+    assert 0.5 < found["fastest"] < 2.0
+    assert "circle of radius 0.6 m" in found["refusal"]
+
+
+def test_a_switching_torque_passes_the_printed_bound_and_not_the_proved_one(tmp_path):
+    errors, _ = run_demo("printed_bound", tmp_path, "main(duration=14.0)")
+    assert errors["constant"] < errors["printed"] < errors["found"] <= errors["certified"]
+
+
+def test_a_noisy_log_is_explained_up_to_its_noise(tmp_path):
+    found, _ = run_demo("own_log", tmp_path, "main('two_link', samples=600)")
+    assert found["over_noise"] < 2.5
+    assert found["friction"] < 0.2
+    assert (tmp_path / "out" / "demo" / "log" / "log.csv").read_text().startswith("t,trajectory,q_joint1,")
+
+
+def test_faults_break_the_promise_and_an_honest_run_keeps_it(tmp_path):
+    verdicts, _ = run_demo("faults", tmp_path, "main(duration=1.0)")
+    assert verdicts["honest"] == "promise kept"
+    assert "disturbance" in verdicts["torque too large"]
+    assert "model" in verdicts["unknown load"]
+    assert "effort limits" in verdicts["weak motor"]
+
+
+def test_arms_nobody_tuned_follow_their_motions(tmp_path):
+    errors, printed = run_demo("many_arms", tmp_path, "main(('two_link', 'z1'), duration=1.5)")
+    assert max(errors.values()) < 1e-4
+    assert printed.count("of a torque limit") == 2

@@ -58,7 +58,8 @@ def measured(value: float, unit: str) -> str:
     text = f"{value:.3g} {unit}".rstrip()
     if not math.isfinite(value) or unit not in (TURNING.position, SLIDING.position):
         return text
-    return f"{text} ({math.degrees(value):.3g}°)" if unit == TURNING.position else f"{text} ({1e3 * value:.3g} mm)"
+    pictured, sign = (math.degrees(value), "°") if unit == TURNING.position else (1e3 * value, " mm")
+    return f"{text} ({pictured:.{3 if abs(pictured) < 100.0 else 4}g}{sign})"
 
 
 def with_units(texts: Sequence[str], given: Sequence[str]) -> list[str]:

@@ -59,7 +59,9 @@ COMMANDS: dict[str, type] = {
 """The options class of every command. The module of the same name in `nbs_pin.commands` does the work in `run`."""
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` lists the options of a command, "
-    "`nbs-pin --version` prints the version. Exit codes: 0 success, 2 bad input, 3 no promise from certify or verify, "
+    "`nbs-pin --version` prints the version, `nbs-pin --tyro-print-completion bash` (or zsh) a script for completion. "
+    "Commands print their verdict first and the tables behind it with -v. "
+    "Exit codes: 0 success, 2 bad input, 3 no promise from certify or verify, "
     "4 stopped by the guard or a row of faults not passed, 130 interrupted."
 )
 
