@@ -59,8 +59,8 @@ def track(folder, *options):
 
 def motion_in(page):
     """The poses and times that a replay plays."""
-    found = re.findall(r'"(?:poses|times|position)": "([^"]+)"', page.read_text())
-    assert len(found) == 3
+    found = re.findall(r'"(?:poses|times|q)":"([^"]+)"', page.read_text())
+    assert len(found) == 4  # the times of the poses, and those of the positions
     return found
 
 

@@ -226,10 +226,12 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
             robot = result.certificate.robot
             if robot is not None and not is_in_its_file(robot):
                 (draft / ARM).write_bytes(robot.urdf.without_geometry())
-    names = ("law", "controller", "bandwidth", "period", "friction", "unknown_payload", "delay", "encoder_bits", "seed")
-    settings = chosen(results.facts["settings"], *names)
+    given = results.facts["settings"]
+    law = ("controller",) if given["controller"].endswith(SAVED) else ("law", "bandwidth")
+    settings = chosen(given, *law, "period", "friction", "unknown_payload", "delay", "encoder_bits", "seed")
     with drawing(folder / FILES[0]) as path:
-        plot_certificate(result.certificate, result.attack, path, settings=settings, verdict=verdict_of(found))
+        plot_certificate(result.certificate, result.attack, path, settings=settings,
+                         verdict=verdict_of(found | {"monitor": None}))  # fmt: skip
     if result.watched is not None:
         with drawing(folder / MONITOR) as path:
             title = f"{found['arm'] or 'a run'}: a run against its certificate"

@@ -78,7 +78,7 @@ def plot_coverage(data: Dataset, path: str | Path, robot: Robot, heading: Headin
     """Plot the states that the samples cover and write the picture (`plotting.picture`); returns its path.
 
     Each column shows velocity against position with the range of a joint, and torque against acceleration with its
-    limits if they are near. At most 4000 samples, evenly picked, are drawn.
+    limits where they are within the panel. At most 4000 samples, evenly picked, are drawn.
     """
     shown = np.unique(np.linspace(0, len(data) - 1, _DOTS).astype(int))
     q, v, a, tau = (x[shown] for x in (data.q, data.v, data.a, data.tau))
@@ -91,9 +91,10 @@ def plot_coverage(data: Dataset, path: str | Path, robot: Robot, heading: Headin
             for bound in (info.lower, info.upper):
                 if np.isfinite(bound):
                     states.axvline(bound, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
-            for bound in (-limit, limit):
-                if np.abs(tau[:, joint]).max() > 0.5 * limit:
-                    torques.axhline(bound, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
+            shown_range = torques.get_ylim()
+            for bound in (-limit, limit) if np.isfinite(limit) else ():
+                torques.axhline(bound, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
+            torques.set_ylim(shown_range)
             (of,) = units_of([info.prismatic])
             states.set_title(info.name, loc="left")
             share = float(np.ptp(data.q[:, joint]) / (info.upper - info.lower))

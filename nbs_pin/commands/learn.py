@@ -158,6 +158,7 @@ def plot_learning(result: Learned, path: str | Path, heading: Heading | None = N
             if values:
                 curve.semilogy(values, color=colour, label=name)
         if not result.report.history:
+            curve.set_axis_off()
             curve.text(0.5, 0.5, "solved without iterations", ha="center", transform=curve.transAxes, color=LIMIT)
         else:
             curve.legend(frameon=False)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, SymmetricalLogLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.base.units import measured, several
 from nbs_pin.certificates.attack import Attack
@@ -141,9 +141,11 @@ def _draw_terms(axes: Axes, seen: Monitored) -> None:
             axes.plot(*thin(middle, values), color=colour, linewidth=1.0, label=label)
     axes.plot(*thin(middle, seen.balance.change), color=INK, linewidth=1.0, linestyle=_DOTTED, label="V̇")
     axes.axhline(0.0, color=LIMIT, linewidth=0.7)
-    peak = max((float(np.abs(line.get_ydata()).max()) for line in axes.lines), default=0.0)
-    axes.set_yscale("symlog", linthresh=1e-4 * peak or 1.0)  # what comes after the first instants is far smaller
-    axes.yaxis.set_major_locator(SymmetricalLogLocator(base=100.0, linthresh=1e-4 * peak or 1.0))
+    peak = max(float(np.abs(line.get_ydata()).max()) for line in axes.lines) or 1.0
+    most = 10.0 ** np.floor(np.log10(peak))
+    axes.set_yscale("symlog", linthresh=1e-4 * peak)  # what comes after the first instants is far smaller
+    axes.set_yticks([-most, -0.01 * most, 0.0, 0.01 * most, most])
+    axes.yaxis.set_minor_locator(NullLocator())
     _title(axes, "rate of V and its terms [W]")
 
 

@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,7 +123,7 @@ def _arm(result: _Result) -> str:
     if result.run is not None:
         return arm_in_words(result.run)
     settings = result.summary.get("settings", {})
-    named = next((settings[key] for key in ("robot", "against", "model") if settings.get(key)), result.label)
+    named = next((settings[key] for key in ("robot", "against") if settings.get(key)), result.label)
     return Path(str(named)).stem
 
 
@@ -164,31 +165,37 @@ def _details(result: _Result, missing: str) -> str:
     parts.append(joints_table(figures))
     if isinstance(summary.get("rows"), list):
         parts.append(bench_table(summary["rows"]))
+    pictures = _pictures(result.folder)
     if (result.folder / _PAGE).is_file():
-        text = (result.folder / _PAGE).read_text(encoding="utf-8")
-        parts.append(MarkdownIt("js-default", {"html": False}).enable("table").disable("image").render(text))
-    parts.append(_pictures(result.folder))
+        parts.append(_written(result.folder / _PAGE, pictures))
+    parts += [
+        f"<figure>{image}<figcaption>{html.escape(name)}</figcaption></figure>" for name, image in pictures.items()
+    ]
     parts.append(folded("all figures", numbers_table({"value": figures})))
     parts.append(_origin(summary))
     return f"<section>{''.join(parts)}</section>"
 
 
-def _pictures(folder: Path) -> str:
-    """The pictures in the folder, each within the page."""
-    parts, left = [], _MOST_PICTURES
+def _pictures(folder: Path) -> dict[str, str]:
+    """The pictures in the folder by name, each within the page."""
+    found, left = {}, _MOST_PICTURES
     for picture in sorted(folder.glob("*.png")):
-        content = picture.read_bytes()
         if picture.name in _DRAWN and (folder / _RUN).is_file():
             continue
+        content, name = picture.read_bytes(), html.escape(picture.name)
         if len(content) > left:
-            parts.append(f"<p>{html.escape(picture.name)} is in the folder; it is too large for this page.</p>")
+            found[picture.name] = f"<p>{name} is in the folder; it is too large for this page.</p>"
             continue
         left -= len(content)
         data = base64.b64encode(content).decode()
-        name = html.escape(picture.name)
-        image = f'<img src="data:image/png;base64,{data}" alt="{name}">'
-        parts.append(f"<figure>{image}<figcaption>{name}</figcaption></figure>")
-    return "".join(parts)
+        found[picture.name] = f'<img src="data:image/png;base64,{data}" alt="{name}">'
+    return found
+
+
+def _written(page: Path, pictures: dict[str, str]) -> str:
+    """A page in Markdown, with those of the pictures that it shows, which are taken out of them."""
+    text = MarkdownIt("js-default", {"html": False}).render(page.read_text(encoding="utf-8"))
+    return re.sub(r'<img src="([\w.-]+)"[^>]*>', lambda shown: pictures.pop(shown[1], ""), text)
 
 
 def _origin(summary: Mapping[str, Any]) -> str:

@@ -86,7 +86,7 @@ def _learned(figures: Mapping[str, Any]) -> Verdict:
     worst = max(range(len(shares)), key=shares.__getitem__)
     off = measured(errors[worst], figures["units"]["torque"][worst])
     said = (
-        f"On {where}, torques are off by {100.0 * shares[worst]:.2g} % of their standard deviation in the worst joint, "
+        f"On {where}, torques are off by {100.0 * shares[worst]:.2g}% of their standard deviation in the worst joint, "
         f"{figures['joints'][worst]}: {off} RMS."
     )
     noise = (figures.get("details") or {}).get("noise_Nm")
@@ -107,7 +107,7 @@ def _trained(figures: Mapping[str, Any]) -> Verdict:
 def _compared(figures: Mapping[str, Any]) -> Verdict:
     off = figures["relative_error"]
     torque, forward = (
-        "not finite" if off[name] is None else f"{100.0 * off[name]:.2g} %" for name in ("inverse", "forward")
+        "not finite" if off[name] is None else f"{100.0 * off[name]:.2g}%" for name in ("inverse", "forward")
     )
     said = f"The model's torques are off by {torque} and its accelerations by {forward} (RMS, relative, over the box)."
     return Verdict(NOTE, said)
