@@ -63,10 +63,9 @@ def verify(path: str | Path, *, urdf: str | Path | None = None, robot: Arm | Non
     Example:
         >>> import tempfile
         >>> import nbs_pin as nbs
-        >>> robot = nbs.load_robot("two_link")
-        >>> bound = nbs.certify(nbs.SlotineLi.for_robot(robot), [5.0, 5.0])
+        >>> bound = nbs.certify(nbs.SlotineLi.for_robot(nbs.load_robot("two_link")), [5.0, 5.0])
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     nbs.verify(nbs.write_certificate(bound, f"{folder}/certificate.json"), robot=robot).confirmed
+        ...     nbs.verify(nbs.write_certificate(bound, f"{folder}/certificate.json")).confirmed
         True
     """
     for name, given in (("path", path), ("urdf", urdf)):
