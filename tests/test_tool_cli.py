@@ -23,7 +23,8 @@ def circle(tmp_path_factory):
 
 def page_data(folder):
     text = (folder / "replay.html").read_text()
-    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)[1])
+    data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)[1])
+    return data["runs"][0]["scene"]
 
 
 def decoded(text):
@@ -83,7 +84,8 @@ def test_the_replay_draws_the_path_and_the_trace_of_the_frame(circle):
     assert len(path) > 100
     assert steps.max() < 0.03
     tip = robot.model.frames[robot.frame_id("tip")]
-    assert data["tip"] == {"body": tip.parentJoint, "point": tip.placement.translation.tolist()}
+    at = {"body": tip.parentJoint, "point": tip.placement.translation.tolist()}
+    assert data["tips"] == [{"name": "tip", **at}]
 
 
 def test_a_run_without_a_path_has_none_in_its_replay(tmp_path):
