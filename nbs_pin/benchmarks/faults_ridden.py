@@ -113,7 +113,8 @@ def encoders(arm: Arm, rng: np.random.Generator, size: tuple[float, int, float])
         seen.append(q)
         return sample._replace(q=q, v=(q - seen.pop(0)) / (over * PERIOD))
 
-    outcome = Trial(arm, sense=sense).run()
+    guard = replace(Guard.for_robot(arm.robot), resolution=np.full(arm.robot.nv, 4.0 * step))
+    outcome = Trial(arm, sense=sense, guard=guard).run()
     if size[2] == np.inf:
         return Verdict(outcome.is_legal and not outcome.diverged, outcome.rms, outcome.code)
     return below(outcome, size[2])
