@@ -97,12 +97,12 @@ def wrong_gravity(arm: Arm, rng: np.random.Generator, size: tuple[Any, float]) -
 
 @rows(
     "F10 encoder steps, v by differences",
-    "RMS ≤ {}",
-    ("2^-16 turn, 1 ms", (2.0**-16, 1, 0.002)),
-    ("2^-12 turn, 8 ms", (2.0**-12, 8, 0.01)),
-    ("2^-12 turn, 1 ms", (2.0**-12, 1, np.inf)),
+    "{}",
+    ("2^-16 turn, 1 ms", (2.0**-16, 1, 0.002, "RMS ≤ 0.002")),
+    ("2^-12 turn, 8 ms", (2.0**-12, 8, np.inf, "goes on or stops, legally")),
+    ("2^-12 turn, 1 ms", (2.0**-12, 1, np.inf, "goes on or stops, legally")),
 )
-def encoders(arm: Arm, rng: np.random.Generator, size: tuple[float, int, float]) -> Verdict:
+def encoders(arm: Arm, rng: np.random.Generator, size: tuple[float, int, float, str]) -> Verdict:
     """Positions are rounded, velocities are their differences over some periods."""
     step, over = size[0] * TURN, size[1]
     offset = rng.uniform(0.0, step, arm.robot.nv)
