@@ -36,11 +36,11 @@ class Wire(FrankaRobotServer):
 
     def _handle_udp_command(self, data):
         self.heard = True
+        self.sent.append(struct.unpack("<7d", data[-57:-1]))
         if self.deaf > 0:
             self.deaf -= 1
             return
         self.silent = 0
-        self.sent.append(struct.unpack("<7d", data[-57:-1]))
         super()._handle_udp_command(data)
 
     def process_commands(self):

@@ -73,7 +73,7 @@ def test_ctrl_c_brakes_the_arm():
     driven = nbs.drive(simulated(), LAW, ROBOT, MOTION, 2.0, watch=watch)
     assert driven.report.code is nbs.Fault.REQUESTED
     assert driven.run.t[-1] == pytest.approx(0.8, abs=0.01)  # it was braked for half a second
-    assert np.abs(driven.run.v[-1]).max() < 0.2 * np.abs(driven.run.v[290]).max()
+    assert np.abs(driven.run.v[-1]).max() < 0.3 * np.abs(driven.run.v[290]).max()
 
 
 def test_an_arm_in_real_time_moves_on_without_torques():

@@ -193,7 +193,7 @@ class _Loop:
             row += max(passed, 0 if sample.fresh else 1)
 
     def watched(self, seen: Live) -> bool:
-        """Show an instant to the watcher; whether the arm is to stop for what it raised. It then sees no more."""
+        """Show an instant to the watcher; whether the arm is to stop for what it raises, which ends its watch."""
         try:
             if self.watch is not None:
                 self.watch(seen)
