@@ -23,6 +23,12 @@ class ArmInterface(Protocol):
 
     `read` waits for the next instant, for at most about a second, and never raises for what can happen to an arm: it
     returns a sample that is not fresh, or one with a `fault`.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> arm = nbs.PlantArm(nbs.MujocoPlant(nbs.load_robot("two_link")), [0.0, 0.0])
+        >>> isinstance(arm, nbs.ArmInterface), arm.period, arm.compensated
+        (True, 0.001, False)
     """
 
     period: float

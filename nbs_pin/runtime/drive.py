@@ -48,7 +48,17 @@ class Times(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """What came of a motion on an arm."""
+    """What came of a motion on an arm.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> arm = nbs.PlantArm(nbs.MujocoPlant(robot), [0.0, 0.0], real_time=False)
+        >>> still = nbs.Hold([0.0, 0.0])
+        >>> driven = nbs.drive(arm, nbs.PD.for_robot(robot), robot, still, duration=0.1)
+        >>> driven.run.q.shape, driven.report is None, driven.times.missed
+        ((100, 2), True, 0)
+    """
 
     run: Run
     """States, references and torques; gravity is in `tau` even where the arm adds it."""

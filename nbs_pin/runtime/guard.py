@@ -39,7 +39,13 @@ _LOST_AFTER, _RECOVERY, _REVERSALS, _SIGN_SPEED = 5, 100, 10.0, 0.1
 
 
 class Mode(IntEnum):
-    """State of a guard; STOPPED is left by an explicit reset only."""
+    """State of a guard; STOPPED is left by an explicit reset only.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> [mode.name for mode in nbs.Mode]
+        ['OK', 'DEGRADED', 'STOPPED']
+    """
 
     OK = at.OK
     DEGRADED = at.DEGRADED
@@ -48,7 +54,13 @@ class Mode(IntEnum):
 
 
 class Fault(IntEnum):
-    """What made a guard stop."""
+    """What made a guard stop.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.Fault.FROZEN.sentence
+        'a position did not change while the reference moved'
+    """
 
     NONE = at.NONE
     MISSED = at.MISSED

@@ -29,7 +29,14 @@ _OF_GRAVITY, _OF_EFFORT = 0.5, 0.02  # a holding torque that differs by more tha
 
 
 class Sample(NamedTuple):
-    """What an arm tells at a control instant."""
+    """What an arm tells at a control instant.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> arm = nbs.PlantArm(nbs.MujocoPlant(nbs.load_robot("two_link")), [0.3, 0.2], real_time=False)
+        >>> arm.look()
+        Sample(t=0.0, q=array([0.3, 0.2]), v=array([0., 0.]), fresh=True, external=None, fault='')
+    """
 
     t: float
     """Time by the arm's clock [s]."""
@@ -56,7 +63,17 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FaultReport:
-    """Why a guard stopped, when, and what it had seen last."""
+    """Why a guard stopped, when, and what it had seen last.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("two_link")
+        >>> arm = nbs.PlantArm(nbs.MujocoPlant(robot), [0.0, 0.0], real_time=False, disturbance=lambda t, q, v: 200.0)
+        >>> law, still = nbs.NeuralBackstepping.for_robot(robot), nbs.Hold([0.0, 0.0])
+        >>> report = nbs.drive(arm, law, robot, still, duration=2.0).report
+        >>> report.code.name in ("JUMP", "DIVERGED", "CHATTER"), len(report.samples)
+        (True, 50)
+    """
 
     code: Fault
     time: float
