@@ -38,7 +38,8 @@ def metadata(wheel):
 
 def test_the_wheel_has_its_licence_and_its_readme(wheel):
     folder, stated = metadata(wheel)
-    assert stated.get_all("License-File") == PROJECT["license-files"] == ["LICENSE"]
+    assert stated.get_all("License-File") == PROJECT["license-files"]
+    assert PROJECT["license-files"][0] == "LICENSE"
     assert stated["License-Expression"] == PROJECT["license"]
     for name in stated.get_all("License-File"):
         assert wheel.read(f"{folder}/licenses/{name}") == (ROOT / name).read_bytes()

@@ -8,6 +8,7 @@ import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import SAVED, OptionError, choice, default, number, text
 from nbs_pin.controllers.registry import LAWS
@@ -24,7 +25,7 @@ def _read_arm(words: list[str]) -> str:
 
 
 @dataclass(frozen=True)
-class Run(FileUnits):
+class Run(FileUnits, Reported):
     """Move an arm in real time behind the guard, a monitor and no safety function; from where it is, to the motion.
 
     Example: nbs-pin run panda --arm mujoco --duration 10

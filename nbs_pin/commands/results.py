@@ -21,6 +21,7 @@ from nbs_pin.base.doors import typed_command
 from nbs_pin.base.files import replaced_together
 from nbs_pin.base.summaries import REPORT, SUMMARY as SUMMARY, summary_in, summary_text as summary_text
 from nbs_pin.base.versions import versions
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import OptionError
 from nbs_pin.robots.robot import Robot
 
@@ -54,7 +55,7 @@ class Results:
         folder = options.out or Path("out") / f"{command}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
         sha256 = {} if robot is None else {"robot_sha256": robot.sha256}
         facts = {"settings": settings_of(options, **resolved), "versions": versions(), **sha256}
-        return cls(folder, facts, options.out is None, options.report)
+        return cls(folder, facts, options.out is None, isinstance(options, Reported) and options.report)
 
     def check(
         self,

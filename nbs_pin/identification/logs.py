@@ -82,7 +82,7 @@ def load_log(
         ...     table = np.column_stack([t, t >= 1.0, np.sin(t), -np.sin(t)])
         ...     np.savetxt(f"{folder}/log.csv", table, delimiter=",", header="t,trajectory,q1,tau1", comments="")
         ...     nbs.load_log(f"{folder}/log.csv")
-        Dataset(180 samples, 2 trajectories, 1 joints)
+        Dataset(180 samples, 2 trajectories, 1 joint)
     """
     path, seconds = Path(path), seconds_in(time_unit)
     names = None if robot is None else robot.joint_names

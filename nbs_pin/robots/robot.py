@@ -343,7 +343,7 @@ def load_robot(
     Example:
         >>> import nbs_pin as nbs
         >>> nbs.load_robot("panda")
-        Robot('panda', 7 joints)
+        Robot('panda', 7 joints, 17.5 kg, effort 12 to 87 N·m)
     """
     given = dict(
         gravity=gravity, lock=lock, zero_limits=zero_limits, limits=limits, repair=repair, inertia_from=inertia_from,
