@@ -163,7 +163,7 @@ def test_known_arms():
     assert np.isinf(pendulum.effort_limit).all()
     assert np.isinf(pendulum.upper).all()
     np.testing.assert_array_equal(pendulum.damping, [0.05, 0.05])
-    assert repr(panda) == "Robot('panda', 7 joints)"
+    assert repr(panda) == "Robot('panda', 7 joints, 17.5 kg, effort 12 to 87 N·m)"
 
 
 def test_the_papers_arm_has_the_papers_mass_matrix():

@@ -203,6 +203,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "Certificate.storage_bound": {"t": np.linspace(0.0, 1.0, 3)},
         "Dataset.save": {"path": s.folder / "data.npz"},
         "attack": {"rounds": 0, "starts": 1, "effort_limit": np.inf},
+        "certified_margins": {"acceleration": 2.0, "velocity": 1.0},
         "certify": {"duration": 0.5, "q0": Q, "v0": Z},
         "collect": {"recipe": "uniform", "samples": 20, "friction": False, "duration": 3.0},
         "compare": {"samples": 20, "motions": 1, "run": None, "friction": None},
