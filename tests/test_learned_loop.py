@@ -18,10 +18,10 @@ from nbs_pin.identification.collect import collect
 from nbs_pin.identification.fit import fit
 from nbs_pin.motions.references import paper_reference
 from nbs_pin.reports.markdown import Section, page
-from nbs_pin.reproduction import figure5, learned_loop, passive_data, study
+from nbs_pin.reproduction import figure5, learned_loop, passive_data
 from nbs_pin.reproduction.figure5 import Weightless
 from nbs_pin.robots.robot import load_robot
-from nbs_pin.simulation import metrics
+from nbs_pin.simulation import metrics, processes
 from tests.test_plotting import png_size
 
 SMALL = learned_loop.Scale(
@@ -185,7 +185,7 @@ def small(tmp_path_factory, chain):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learned_loop, "ARMS", ("three_link",))
         patch.setattr(learned_loop, "learn_chains", lambda *_: chains)
-        patch.setattr(study, "cores", lambda: 1)
+        patch.setattr(processes, "cores", lambda: 1)
         return folder, list(learned_loop.reproduce_learned(folder, seed=3, scale=SMALL))
 
 
