@@ -28,8 +28,8 @@ def certified_margins(certificate: Certificate, acceleration: Any, velocity: Any
     Position margins bound |z1_i|, velocity margins |v_i − v_d,i|, and effort margins the difference of each torque of
     the law from that of the reference, M(q_d)a_d + C(q_d, v_d)v_d + G(q_d): on {V ≤ V̄} with V̄ = max(V(0), V∞), from
     a start on the reference or the one certified, for every admissible disturbance (docs/certificates.md §15). They
-    are known like the certificate's bounds (`Certificate.label`), in continuous time, and where bounds with held
-    torques are proved, at the control instants.
+    are known like the certificate's bounds (`Certificate.label`), in continuous time: a torque that is held for a
+    period, evaluated ahead of its reading, is not covered by the velocity and effort margins.
 
     Args:
         certificate: Of the law, for the exact model of an arm, without friction that is fed forward.
@@ -65,8 +65,7 @@ def certified_margins(certificate: Certificate, acceleration: Any, velocity: Any
     arm = CoriolisBounds.of(robot, constants)
     motion = _within(arm, constants.floor, fastest, _one_each(robot, "acceleration", acceleration))
     begin = 0.0 if certificate.start is None else certificate.start.storage
-    held = certificate.held_storage(begin)
-    level = held if math.isfinite(held) else max(begin, certificate.storage)
+    level = max(begin, certificate.storage)
     friction = certificate.comparison
     loop = SampledLaw(law, constants, arm, motion, friction.t, friction.alpha, np.zeros(robot.nv), 0.0, 0.0)
     asked = Asked(law, constants, *Curvature.with_diagonal(loop, level), level)

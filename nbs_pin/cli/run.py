@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
-from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.followed import Followed
 from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import SAVED, OptionError, choice, default, number, text
@@ -25,7 +25,7 @@ def _read_arm(words: list[str]) -> str:
 
 
 @dataclass(frozen=True)
-class Run(FileUnits, Reported):
+class Run(Followed, Reported):
     """Move an arm in real time behind the guard, a monitor and no safety function; from where it is, to the motion.
 
     Example: nbs-pin run panda --arm mujoco --duration 10
@@ -37,17 +37,6 @@ class Run(FileUnits, Reported):
     """What to move: mujoco (a simulation in real time), libfranka:HOST, or ur:HOST (not tested on hardware)."""
     controller: Annotated[str, choice("--controller", LAWS, SAVED)] = "nbs"
     """A law by name, or a .nbs file with a controller and its gains."""
-    reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
-    """Motion to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints.
-    Paths of the tool: circle:RADIUS[@PLANE], line:DX,DY,DZ [m], or a .csv or .npz file with x, y, z."""
-    frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0
-    """Frequency of the sinusoid [rad/s]."""
-    duration: Annotated[
-        float | None,
-        number("--duration", above=0.0, most=100_000.0, unit="s"),
-        default("10, 5 for a path of the tool, or the file's"),
-    ] = None
-    """How long to move [s], a whole number of periods; the way to the motion is part of it."""
     rate: Annotated[float, number("--rate", least=10.0, most=10_000.0, unit="Hz")] = 1000.0
     """Rate of the loop [Hz]; a Franka arm has 1000, a UR arm 500."""
     bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
-from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.followed import Followed
 from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import (
@@ -27,7 +27,7 @@ from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
 
 
 @dataclass(frozen=True)
-class Track(FileUnits, Reported):
+class Track(Followed, Reported):
     """Simulate an arm that follows a motion, and write run.npz, summary.json, tracking.png and replay.html.
 
     With several laws, write a run of each, comparison.png and summary.json. Ctrl-C keeps what was simulated.
@@ -42,17 +42,6 @@ class Track(FileUnits, Reported):
     controller: Annotated[str, choices("--controller", LAWS, SAVED)] = "nbs"
     """A law by name, or a .nbs file with a controller and its gains; several, separated by commas, are compared.
     nbs-paper: the paper's controller on two_link, its networks with gains for the arm on any other."""
-    reference: Annotated[str, tyro.conf.arg(metavar="MOTION")] = "sinusoid"
-    """Motion to follow: sinusoid (fitted to the arm), paper, or a .csv or .npz file with t and the joints.
-    Paths of the tool: circle:RADIUS[@PLANE], line:DX,DY,DZ [m], or a .csv or .npz file with x, y, z."""
-    frequency: Annotated[float, number("--frequency", above=0.0, most=1000.0, unit="rad/s")] = 1.0
-    """Frequency of the sinusoid [rad/s]."""
-    duration: Annotated[
-        float | None,
-        number("--duration", above=0.0, most=100_000.0, unit="s"),
-        default("10, 5 for a path of the tool, or the file's"),
-    ] = None
-    """Simulated time, a whole number of periods [s]; a path of the tool takes all of it."""
     period: Annotated[float, number("--period", least=1e-5, most=0.1, unit="s")] = 0.001
     """Control period [s]."""
     bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0
