@@ -50,11 +50,11 @@ def test_a_whole_law_of_panda_is_the_same_in_c(precision, tmp_path):
     law = nbs.NeuralBackstepping.for_robot(PANDA)
     for part in (law.potential, law.damping):
         randomise(part, 3)
-    passes(law.compile(), tmp_path / "law", precision=precision, gravity=precision == "double", rate_limit=1000.0)
+    passes(law.compile(), tmp_path / "law", precision=precision, gravity=precision == "double", rate_limit=999.0)
     if shutil.which("g++") is None:
         pytest.skip("no C++ compiler here")
     printed = export_check.middleware(tmp_path / "law", "libfranka/law_law_franka.cpp", FRANKA, None)
-    assert printed.startswith("10002 steps")
+    assert printed.startswith("9982 steps")
     printed = export_check.middleware(tmp_path / "law", "ros2_control/law_law_controller.cpp", ROS, ROS_DRIVER)
     assert printed.split() == [
         "panda_joint1/position", "panda_joint7/velocity", "panda_joint7/effort", "panda_joint7/acceleration"

@@ -19,9 +19,7 @@ _FRANKA_JOINTS = 7
 _FRANKA_ROW = "| `libfranka/` | an example for libfranka |\n"
 _MODEL_INCLUDE = "#include <franka/model.h>\n"
 _MODEL = "    const franka::Model model = robot.loadModel();\n"
-_GRAVITY = """      const auto weight = model.gravity(state);  // libfranka adds the weight itself
-      std::transform(command.begin(), command.end(), weight.begin(), command.begin(), std::minus<double>());
-"""
+_WEIGHT = "      const auto weight = model.gravity(state);  // libfranka's torques are without it\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +69,9 @@ def _around(exported: Exported, steps: Steps) -> dict[str, str]:
         "FRANKA_WORDS": " and the example for libfranka were" if franka else " was",
         "MODEL_INCLUDE": _MODEL_INCLUDE if exported.gravity else "",
         "MODEL": _MODEL if exported.gravity else "",
-        "GRAVITY": _GRAVITY if exported.gravity else "",
+        "WEIGHT": _WEIGHT if exported.gravity else "",
+        "PLUS_WEIGHT": " + weight[i]" if exported.gravity else "",
+        "MINUS_WEIGHT": " - weight[i]" if exported.gravity else "",
     }
     places = {
         "selftest.c": "selftest.c",
