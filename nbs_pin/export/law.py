@@ -86,10 +86,11 @@ def law_files(exported: Exported) -> dict[str, str]:
     """The header and the source file, by name."""
     words, remembers = exported.words, exported.code is LawCode.PID
     parts, torque = _pid(exported) if exported.tree is None else _on_tree(exported, exported.tree)
-    tables, limits = _limits(exported)
+    tables, limits, first = _limits(exported)
     source = words | {
         "PARTS": "\n".join([*parts, *tables]),
         "TORQUE": torque,
+        "FIRST": first,
         "START": _inner(["state->integral[i] = 0;", "state->derivative[i] = 0;"] if remembers else []),
         "LIMITS": _inner(limits),
     }
@@ -98,7 +99,7 @@ def law_files(exported: Exported) -> dict[str, str]:
         "ABOUT": "\n".join(f" * {comment(line)}".rstrip() for line in _about(exported)),
         "MEMORY": filled("pid_memory.h", words) if remembers else "",
         "LIBM": ", ".join(sorted(set(_LIBM.findall(text)))) or "nothing",
-        "RATE_WORDS": " and its rate" if np.isfinite(exported.rate_limit).any() else "",
+        "LIMITED": "its rate and then its size" if np.isfinite(exported.rate_limit).any() else "its size",
     }
     return {f"{exported.name}.h": filled("law.h", header), f"{exported.name}.c": text}
 
@@ -155,16 +156,17 @@ def _pid(exported: Exported) -> tuple[list[str], str]:
     return [real.table(name, values) for name, values in tables.items()], filled("pid.c", words)
 
 
-def _limits(exported: Exported) -> tuple[list[str], list[str]]:
-    """Tables of the limits that there are, and what is done to next.tau[i]."""
-    tables, lines = [], []
-    if np.isfinite(exported.effort_limit).any():
-        tables += [exported.real.table("effort_limit", exported.effort_limit)]
-        lines += ["next.tau[i] = clamped(next.tau[i], effort_limit[i]);"]
+def _limits(exported: Exported) -> tuple[list[str], list[str], str]:
+    """Tables of the limits that there are, what is done to next.tau[i], and what of tau[i] the first step builds on."""
+    tables, lines, first = [], [], "tau[i]"
     if np.isfinite(exported.rate_limit).any():
         tables += [exported.real.table("rate_limit", exported.rate_limit)]
         lines += ["next.tau[i] = state->tau[i] + clamped(next.tau[i] - state->tau[i], rate_limit[i] * period);"]
-    return ([*tables, _CLAMPED] if lines else []), lines
+    if np.isfinite(exported.effort_limit).any():  # last, so that it holds whatever the torque before was
+        tables += [exported.real.table("effort_limit", exported.effort_limit)]
+        lines += ["next.tau[i] = clamped(next.tau[i], effort_limit[i]);"]
+        first = "clamped(tau[i], effort_limit[i])"
+    return ([*tables, _CLAMPED] if lines else []), lines, first
 
 
 def _inner(lines: list[str]) -> str:

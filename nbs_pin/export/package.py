@@ -42,10 +42,10 @@ def write_package(folder: Path, exported: Exported, steps: Steps) -> list[Path]:
 
 def sent(exported: Exported, steps: Steps) -> Float[np.ndarray, "steps n"]:
     """The torques within the limits of effort and rate, from a torque of 0 on."""
-    limited, last = np.clip(steps.torque, -exported.effort_limit, exported.effort_limit), np.zeros(exported.nv)
-    change = exported.rate_limit * steps.period
-    for tau in limited:
-        tau[:] = last = last + np.clip(tau - last, -change, change)
+    limited, last = np.empty_like(steps.torque), np.zeros(exported.nv)
+    change, most = exported.rate_limit * steps.period, exported.effort_limit
+    for k, tau in enumerate(steps.torque):
+        limited[k] = last = np.clip(last + np.clip(tau - last, -change, change), -most, most)
     return limited
 
 
