@@ -97,6 +97,30 @@ def test_a_whole_law_of_panda_is_the_same_in_c(precision, tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler here")
+def test_a_pid_for_a_franka_arm_has_no_weight_to_take_off(tmp_path):
+    passes(nbs.PID.for_robot(PANDA), tmp_path / "law", rate_limit=999.0)
+    printed = export_check.middleware(tmp_path / "law", "libfranka/law_law_franka.cpp", FRANKA, None)
+    assert abs(float(printed.split()[2])) < 1e-3  # of a joint without an error
+
+
+def test_the_effort_limit_of_a_pid_is_the_smaller_of_its_own_and_the_arms(tmp_path):
+    gains = {"kp": [900.0, 900.0], "ki": 1.0, "kd": 1.0, "robot": TWO_LINK}
+    text = ""
+    for own in ([150.0, 30.0], np.inf):
+        passes(nbs.PID(**gains, effort_limit=own), tmp_path / "law")
+        text += (tmp_path / "law" / "law_law.h").read_text()
+    assert re.findall(r"\|tau\| <= (\S+)", text) == ["100", "30", "100", "100"]
+
+
+def test_without_limits_the_torque_of_the_law_is_sent_to_the_last_digit(tmp_path):
+    nbs.PID(kp=[900.0, 900.0], ki=1.0, kd=1.0, effort_limit=np.inf).export(tmp_path / "law")
+    rows = (tmp_path / "law" / "selftest.c").read_text().split("    {{")[1:]
+    for row in rows:
+        *_, law, sent = re.findall(r"[^{}\s][^{}]*(?=\})", row.split("}}")[0] + "}")
+        assert law == sent
+
+
 @pytest.mark.parametrize("seed", [3, 5, 8])
 def test_trees_of_every_kind_are_the_same_in_c(seed, tmp_path):
     """Branches, sliding and continuous joints, rotors, friction and a tilted base."""

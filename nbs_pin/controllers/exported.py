@@ -17,7 +17,7 @@ from nbs_pin.base.versions import versions
 from nbs_pin.export.law import Exported, pid_limit
 from nbs_pin.export.package import Steps, write_package
 from nbs_pin.export.reals import Precision, Real
-from nbs_pin.kernels.layout import LAW, LawCode, Packed
+from nbs_pin.kernels.layout import JOINTS, LAW, LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
 _TITLES = {
@@ -59,7 +59,7 @@ def export_law(
         name=_identifier(folder),
         law=law,
         tree=tree,
-        effort_limit=pid_limit(law) if tree is None else np.full(n, np.inf) if robot is None else robot.effort_limit,
+        effort_limit=_effort_limit(law, robot),
         rate_limit=np.full(n, rate_limit),
         gravity=gravity,
         real=Real(precision),
@@ -88,6 +88,12 @@ def _tree(law: Packed, dynamics: Any, gravity: bool) -> Packed | None:
             " with PinocchioDynamics, IdentifiedDynamics or a learned chain."
         )
     return tree
+
+
+def _effort_limit(law: Packed, robot: Robot | None) -> JointArray:
+    """The arm's; of a PID no more than where it saturates, which need not be there."""
+    limit = np.full(law.layout[JOINTS], np.inf) if robot is None else robot.effort_limit
+    return np.minimum(limit, pid_limit(law)) if law.layout[LAW] == LawCode.PID else limit
 
 
 def _check_certificate(certificate: Any, controller: Any) -> None:

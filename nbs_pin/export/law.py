@@ -55,6 +55,11 @@ class Exported:
         return int(self.law.layout[at.JOINTS])
 
     @property
+    def has_weight(self) -> bool:
+        """Whether the torque has the arm's weight in it from the model on; a PID has no model."""
+        return self.gravity and self.tree is not None
+
+    @property
     def code(self) -> LawCode:
         """Which law it is."""
         return LawCode(int(self.law.layout[at.LAW]))
@@ -123,7 +128,9 @@ def _about(exported: Exported) -> list[str]:
         effort, rate = exported.effort_limit[i], exported.rate_limit[i]
         rated = f", |dtau/dt| <= {rate:g} {unit}/s" if np.isfinite(rate) else ""
         joints.append(f"  {i}  {name}: |tau| <= {effort:g} {unit}{rated}")
-    weight = "holds the weight of the arm" if exported.gravity else "leaves the weight of the arm to the arm itself"
+    weight = "holds the weight of the arm" if exported.has_weight else "leaves the weight of the arm to the arm itself"
+    if exported.tree is None:
+        weight = "holds by its integral what the arm does not hold of its weight"
     fed = exported.tree is not None and bool(exported.law.layout[at.FRICTION])
     friction = "feeds joint friction forward" if fed else "feeds no joint friction forward"
     certified = exported.known or ("No certificate was given at the export.",)

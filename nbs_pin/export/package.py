@@ -45,7 +45,8 @@ def sent(exported: Exported, steps: Steps) -> Float[np.ndarray, "steps n"]:
     limited, last = np.empty_like(steps.torque), np.zeros(exported.nv)
     change, most = exported.rate_limit * steps.period, exported.effort_limit
     for k, tau in enumerate(steps.torque):
-        limited[k] = last = np.clip(last + np.clip(tau - last, -change, change), -most, most)
+        rated = last + np.clip(tau - last, -change, change) if np.isfinite(change).any() else tau  # as C rounds it
+        limited[k] = last = np.clip(rated, -most, most)
     return limited
 
 
@@ -67,11 +68,11 @@ def _around(exported: Exported, steps: Steps) -> dict[str, str]:
         "JOINTS": ", ".join(json.dumps(joint) for joint in exported.joint_names),
         "FRANKA_ROW": _FRANKA_ROW if franka else "",
         "FRANKA_WORDS": " and the example for libfranka were" if franka else " was",
-        "MODEL_INCLUDE": _MODEL_INCLUDE if exported.gravity else "",
-        "MODEL": _MODEL if exported.gravity else "",
-        "WEIGHT": _WEIGHT if exported.gravity else "",
-        "PLUS_WEIGHT": " + weight[i]" if exported.gravity else "",
-        "MINUS_WEIGHT": " - weight[i]" if exported.gravity else "",
+        "MODEL_INCLUDE": _MODEL_INCLUDE if exported.has_weight else "",
+        "MODEL": _MODEL if exported.has_weight else "",
+        "WEIGHT": _WEIGHT if exported.has_weight else "",
+        "PLUS_WEIGHT": " + weight[i]" if exported.has_weight else "",
+        "MINUS_WEIGHT": " - weight[i]" if exported.has_weight else "",
     }
     places = {
         "selftest.c": "selftest.c",
