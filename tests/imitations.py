@@ -102,6 +102,7 @@ struct Model { std::array<double, 7> gravity(const RobotState &) const { return 
 #include <cmath>
 #include <functional>
 #include <iostream>
+#include <stdexcept>
 #include <string>
 #include <franka/model.h>
 namespace franka {
@@ -117,15 +118,20 @@ struct Robot {
   explicit Robot(const std::string &) {}
   Model loadModel() { return {}; }
   void control(std::function<Torques(const RobotState &, Duration)> law) {
-    RobotState state{{0, -0.8, 0, -2.3, 0, 1.6, 0.8}, {}, {0, -0.8, 0, -2.3, 0, 1.6, 0.8}, {}};
+    const std::array<double, 7> q{0, -0.8, 0, -2.3, 0, 1.6, 0.8}, held{0.5, -3, 1, 2, -0.4, 0.3, -0.2};
+    RobotState state{q, {}, q, held};
     int steps = 0;
     for (bool done = false; !done; steps++) {
-      const Torques sent = law(state, {steps ? 0.001 : 0.0});
-      for (double x : sent.tau) if (!std::isfinite(x)) throw std::runtime_error("a torque is not finite");
+      const bool late = steps % 1000 == 500;  // two packets were lost, and meanwhile the arm was hit
+      state.dq.fill(late ? 0.5 : 0.0);
+      const Torques sent = law(state, {steps == 0 ? 0.0 : late ? 0.003 : 0.001});
+      for (int i = 0; i < 7; i++)
+        if (!(std::abs(sent.tau[i] - state.tau_J_d[i]) <= 1.0))  // libfranka: 1000 N m/s
+          throw std::runtime_error("torque discontinuity at step " + std::to_string(steps));
       state.tau_J_d = sent.tau;
       done = sent.motion_finished;
     }
-    std::cout << steps << " steps, " << state.tau_J_d[3] << "\n";
+    std::cout << steps << " steps, " << state.tau_J_d[0] << "\n";
   }
 };
 }

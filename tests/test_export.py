@@ -1,7 +1,9 @@
 """Laws in C: the torques of Python to rounding, C that no compiler complains of, and nothing else behind it."""
 
+import ctypes
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -45,20 +47,78 @@ def test_every_compiled_law_is_the_same_in_c(name, tmp_path):
     passes(build_law(name, TWO_LINK, **friction), tmp_path / "law", rate_limit=[500.0, np.inf])
 
 
+def test_no_torque_beyond_the_limits_is_sent_whatever_the_arm_was_sent_last(tmp_path):
+    name, limit, compiled = "law_law", TWO_LINK.effort_limit, tmp_path / "law.so"
+    nbs.PD.for_robot(TWO_LINK).export(tmp_path / "law", rate_limit=1.0)
+    subprocess.run(["gcc", "-shared", "-fPIC", tmp_path / f"law/{name}.c", "-lm", "-o", compiled], check=True)
+    library, vector = ctypes.CDLL(str(compiled)), ctypes.c_double * 2
+    state, tau, rest = vector(), vector(), vector()  # the law remembers its torque alone
+    for last, taken in (
+        ([np.nan, 5.0 * limit[1]], [0.0, limit[1]]),
+        ([-5.0 * limit[0], -np.inf], [-limit[0], 0.0]),
+        ([3.0, -4.0], [3.0, -4.0]),
+    ):
+        library[f"{name}_start"](state, vector(*last))
+        assert list(state) == taken
+        assert library[f"{name}_step"](state, rest, rest, rest, rest, rest, ctypes.c_double(0.001), tau) == 0
+        assert (np.abs(tau) <= limit).all()
+        assert np.abs(np.subtract(tau, taken)).max() <= 0.001 * (1.0 + 1e-9)
+
+
+def test_the_self_test_fails_for_a_torque_that_is_no_number(tmp_path):
+    nbs.PD.for_robot(TWO_LINK).export(tmp_path / "law")
+    path = tmp_path / "law" / "selftest.c"
+    text = path.read_text()
+    head, *rows = text.split("    {{")
+    for vector in (5, 6):  # of the law, and sent
+        for joint in (0, 1):
+            vectors = rows[3].split("},\n     {")
+            numbers = vectors[vector].split(", ")
+            numbers[joint] = re.sub(r"^[^}]+", "NAN", numbers[joint])
+            vectors[vector] = ", ".join(numbers)
+            path.write_text("    {{".join([head, *rows[:3], "},\n     {".join(vectors), *rows[4:]]))
+            with pytest.raises(export_check.Failed, match="FAILED"):
+                export_check.self_test(tmp_path / "law", "gcc", ["-O0"])
+
+
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_a_whole_law_of_panda_is_the_same_in_c(precision, tmp_path):
     law = nbs.NeuralBackstepping.for_robot(PANDA)
     for part in (law.potential, law.damping):
         randomise(part, 3)
-    passes(law.compile(), tmp_path / "law", precision=precision, gravity=precision == "double", rate_limit=1000.0)
+    passes(law.compile(), tmp_path / "law", precision=precision, gravity=precision == "double", rate_limit=999.0)
     if shutil.which("g++") is None:
         pytest.skip("no C++ compiler here")
     printed = export_check.middleware(tmp_path / "law", "libfranka/law_law_franka.cpp", FRANKA, None)
-    assert printed.startswith("10002 steps")
+    assert printed.startswith("9982 steps")
     printed = export_check.middleware(tmp_path / "law", "ros2_control/law_law_controller.cpp", ROS, ROS_DRIVER)
     assert printed.split() == [
         "panda_joint1/position", "panda_joint7/velocity", "panda_joint7/effort", "panda_joint7/acceleration"
     ]  # fmt: skip
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler here")
+def test_a_pid_for_a_franka_arm_has_no_weight_to_take_off(tmp_path):
+    passes(nbs.PID.for_robot(PANDA), tmp_path / "law", rate_limit=999.0)
+    printed = export_check.middleware(tmp_path / "law", "libfranka/law_law_franka.cpp", FRANKA, None)
+    assert abs(float(printed.split()[2])) < 1e-3  # of a joint without an error
+
+
+def test_the_effort_limit_of_a_pid_is_the_smaller_of_its_own_and_the_arms(tmp_path):
+    gains = {"kp": [900.0, 900.0], "ki": 1.0, "kd": 1.0, "robot": TWO_LINK}
+    text = ""
+    for own in ([150.0, 30.0], np.inf):
+        passes(nbs.PID(**gains, effort_limit=own), tmp_path / "law")
+        text += (tmp_path / "law" / "law_law.h").read_text()
+    assert re.findall(r"\|tau\| <= (\S+)", text) == ["100", "30", "100", "100"]
+
+
+def test_without_limits_the_torque_of_the_law_is_sent_to_the_last_digit(tmp_path):
+    nbs.PID(kp=[900.0, 900.0], ki=1.0, kd=1.0, effort_limit=np.inf).export(tmp_path / "law")
+    rows = (tmp_path / "law" / "selftest.c").read_text().split("    {{")[1:]
+    for row in rows:
+        *_, law, sent = re.findall(r"[^{}\s][^{}]*(?=\})", row.split("}}")[0] + "}")
+        assert law == sent
 
 
 @pytest.mark.parametrize("seed", [3, 5, 8])
@@ -91,6 +151,11 @@ def test_the_header_states_what_the_certificate_of_this_law_says(tmp_path):
     assert TWO_LINK.sha256 in text
     with pytest.raises(ArgumentError, match="other numbers"):
         nbs.SlotineLi.for_robot(TWO_LINK, bandwidth=9.0).export(tmp_path / "law", certificate=certificate)
+    for change in ({"payload": 2.0}, {"limits": {"joint1": {"velocity": 9.0}}}):
+        other = nbs.PinocchioDynamics(nbs.load_robot("two_link", **change))
+        same_gains = nbs.SlotineLi(other, rate=law.rate, gain=law.gain)
+        with pytest.raises(ArgumentError, match="other numbers"):
+            same_gains.export(tmp_path / "law", certificate=certificate)
     assert "No certificate" in law.export(tmp_path / "law").read_text()
 
 

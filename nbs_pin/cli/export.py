@@ -18,7 +18,7 @@ class Export:
 
     Files and functions are called after the folder. make test in it compiles the law and compares it with Python.
 
-    Example: nbs-pin export panda --rate-limit 1000 --without-gravity --out out/panda_law
+    Example: nbs-pin export panda --rate-limit 999 --without-gravity --out out/panda_law
     """
 
     controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")]

@@ -17,7 +17,7 @@ from nbs_pin.base.versions import versions
 from nbs_pin.export.law import Exported, pid_limit
 from nbs_pin.export.package import Steps, write_package
 from nbs_pin.export.reals import Precision, Real
-from nbs_pin.kernels.layout import LAW, LawCode, Packed
+from nbs_pin.kernels.layout import JOINTS, LAW, LawCode, Packed
 from nbs_pin.robots.robot import Robot
 
 _TITLES = {
@@ -54,12 +54,12 @@ def export_law(
     if rate_limit.shape not in ((), (n,)):
         raise ArgumentError(f"rate_limit has {rate_limit.size} numbers, expected {n}; give one per joint.")
     if certificate is not None:
-        _check_certificate(certificate, law)
+        _check_certificate(certificate, controller)
     exported = Exported(
         name=_identifier(folder),
         law=law,
         tree=tree,
-        effort_limit=pid_limit(law) if tree is None else np.full(n, np.inf) if robot is None else robot.effort_limit,
+        effort_limit=_effort_limit(law, robot),
         rate_limit=np.full(n, rate_limit),
         gravity=gravity,
         real=Real(precision),
@@ -90,12 +90,30 @@ def _tree(law: Packed, dynamics: Any, gravity: bool) -> Packed | None:
     return tree
 
 
-def _check_certificate(certificate: Any, law: Packed) -> None:
-    """Raise ArgumentError unless it is a certificate, whose class lies above this module, of this law."""
+def _effort_limit(law: Packed, robot: Robot | None) -> JointArray:
+    """The arm's; of a PID no more than where it saturates, which need not be there."""
+    limit = np.full(law.layout[JOINTS], np.inf) if robot is None else robot.effort_limit
+    return np.minimum(limit, pid_limit(law)) if law.layout[LAW] == LawCode.PID else limit
+
+
+def _check_certificate(certificate: Any, controller: Any) -> None:
+    """Raise ArgumentError unless it is a certificate, whose class lies above this module, of this law on this arm."""
     if not (hasattr(certificate, "controller") and callable(getattr(certificate, "summary", None))):
         raise ArgumentError(f"certificate is {told(certificate)}; give a Certificate, as certify returns it.")
-    if not all(np.array_equal(x, y) for x, y in zip(certificate.controller.packed_law(), law, strict=True)):
-        raise ArgumentError("certificate is for a law with other numbers; certify the one that is exported.")
+    ours, theirs = _numbers(controller), _numbers(certificate.controller)
+    same = (np.array_equal(x, y, equal_nan=True) for x, y in zip(ours, theirs, strict=False))
+    if len(ours) != len(theirs) or not all(same):
+        raise ArgumentError("certificate is for a law or an arm with other numbers; certify the one that is exported.")
+
+
+def _numbers(controller: Any) -> list[np.ndarray]:
+    """Those of a law, of its model, and of the limits within which the arm moves."""
+    dynamics = getattr(controller, "dynamics", None)
+    if dynamics is None:
+        return [*controller.packed_law()]
+    tree, robot = dynamics.packed_tree(), dynamics.robot
+    limits = () if robot is None else (robot.lower, robot.upper, robot.velocity_limit)
+    return [*controller.packed_law(), *(tree or ()), *limits]
 
 
 def _known(certificate: Any) -> tuple[str, ...]:

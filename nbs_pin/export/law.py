@@ -55,6 +55,11 @@ class Exported:
         return int(self.law.layout[at.JOINTS])
 
     @property
+    def has_weight(self) -> bool:
+        """Whether the torque has the arm's weight in it from the model on; a PID has no model."""
+        return self.gravity and self.tree is not None
+
+    @property
     def code(self) -> LawCode:
         """Which law it is."""
         return LawCode(int(self.law.layout[at.LAW]))
@@ -86,10 +91,11 @@ def law_files(exported: Exported) -> dict[str, str]:
     """The header and the source file, by name."""
     words, remembers = exported.words, exported.code is LawCode.PID
     parts, torque = _pid(exported) if exported.tree is None else _on_tree(exported, exported.tree)
-    tables, limits = _limits(exported)
+    tables, limits, first = _limits(exported)
     source = words | {
         "PARTS": "\n".join([*parts, *tables]),
         "TORQUE": torque,
+        "FIRST": first,
         "START": _inner(["state->integral[i] = 0;", "state->derivative[i] = 0;"] if remembers else []),
         "LIMITS": _inner(limits),
     }
@@ -98,7 +104,7 @@ def law_files(exported: Exported) -> dict[str, str]:
         "ABOUT": "\n".join(f" * {comment(line)}".rstrip() for line in _about(exported)),
         "MEMORY": filled("pid_memory.h", words) if remembers else "",
         "LIBM": ", ".join(sorted(set(_LIBM.findall(text)))) or "nothing",
-        "RATE_WORDS": " and its rate" if np.isfinite(exported.rate_limit).any() else "",
+        "LIMITED": "its rate and then its size" if np.isfinite(exported.rate_limit).any() else "its size",
     }
     return {f"{exported.name}.h": filled("law.h", header), f"{exported.name}.c": text}
 
@@ -122,7 +128,9 @@ def _about(exported: Exported) -> list[str]:
         effort, rate = exported.effort_limit[i], exported.rate_limit[i]
         rated = f", |dtau/dt| <= {rate:g} {unit}/s" if np.isfinite(rate) else ""
         joints.append(f"  {i}  {name}: |tau| <= {effort:g} {unit}{rated}")
-    weight = "holds the weight of the arm" if exported.gravity else "leaves the weight of the arm to the arm itself"
+    weight = "holds the weight of the arm" if exported.has_weight else "leaves the weight of the arm to the arm itself"
+    if exported.tree is None:
+        weight = "holds by its integral what the arm does not hold of its weight"
     fed = exported.tree is not None and bool(exported.law.layout[at.FRICTION])
     friction = "feeds joint friction forward" if fed else "feeds no joint friction forward"
     certified = exported.known or ("No certificate was given at the export.",)
@@ -155,16 +163,17 @@ def _pid(exported: Exported) -> tuple[list[str], str]:
     return [real.table(name, values) for name, values in tables.items()], filled("pid.c", words)
 
 
-def _limits(exported: Exported) -> tuple[list[str], list[str]]:
-    """Tables of the limits that there are, and what is done to next.tau[i]."""
-    tables, lines = [], []
-    if np.isfinite(exported.effort_limit).any():
-        tables += [exported.real.table("effort_limit", exported.effort_limit)]
-        lines += ["next.tau[i] = clamped(next.tau[i], effort_limit[i]);"]
+def _limits(exported: Exported) -> tuple[list[str], list[str], str]:
+    """Tables of the limits that there are, what is done to next.tau[i], and what of tau[i] the first step builds on."""
+    tables, lines, first = [], [], "tau[i]"
     if np.isfinite(exported.rate_limit).any():
         tables += [exported.real.table("rate_limit", exported.rate_limit)]
         lines += ["next.tau[i] = state->tau[i] + clamped(next.tau[i] - state->tau[i], rate_limit[i] * period);"]
-    return ([*tables, _CLAMPED] if lines else []), lines
+    if np.isfinite(exported.effort_limit).any():  # last, so that it holds whatever the torque before was
+        tables += [exported.real.table("effort_limit", exported.effort_limit)]
+        lines += ["next.tau[i] = clamped(next.tau[i], effort_limit[i]);"]
+        first = "clamped(tau[i], effort_limit[i])"
+    return ([*tables, _CLAMPED] if lines else []), lines, first
 
 
 def _inner(lines: list[str]) -> str:

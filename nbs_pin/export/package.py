@@ -19,9 +19,7 @@ _FRANKA_JOINTS = 7
 _FRANKA_ROW = "| `libfranka/` | an example for libfranka |\n"
 _MODEL_INCLUDE = "#include <franka/model.h>\n"
 _MODEL = "    const franka::Model model = robot.loadModel();\n"
-_GRAVITY = """      const auto weight = model.gravity(state);  // libfranka adds the weight itself
-      std::transform(command.begin(), command.end(), weight.begin(), command.begin(), std::minus<double>());
-"""
+_WEIGHT = "      const auto weight = model.gravity(state);  // libfranka's torques are without it\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +42,11 @@ def write_package(folder: Path, exported: Exported, steps: Steps) -> list[Path]:
 
 def sent(exported: Exported, steps: Steps) -> Float[np.ndarray, "steps n"]:
     """The torques within the limits of effort and rate, from a torque of 0 on."""
-    limited, last = np.clip(steps.torque, -exported.effort_limit, exported.effort_limit), np.zeros(exported.nv)
-    change = exported.rate_limit * steps.period
-    for tau in limited:
-        tau[:] = last = last + np.clip(tau - last, -change, change)
+    limited, last = np.empty_like(steps.torque), np.zeros(exported.nv)
+    change, most = exported.rate_limit * steps.period, exported.effort_limit
+    for k, tau in enumerate(steps.torque):
+        rated = last + np.clip(tau - last, -change, change) if np.isfinite(change).any() else tau  # as C rounds it
+        limited[k] = last = np.clip(rated, -most, most)
     return limited
 
 
@@ -69,9 +68,11 @@ def _around(exported: Exported, steps: Steps) -> dict[str, str]:
         "JOINTS": ", ".join(json.dumps(joint) for joint in exported.joint_names),
         "FRANKA_ROW": _FRANKA_ROW if franka else "",
         "FRANKA_WORDS": " and the example for libfranka were" if franka else " was",
-        "MODEL_INCLUDE": _MODEL_INCLUDE if exported.gravity else "",
-        "MODEL": _MODEL if exported.gravity else "",
-        "GRAVITY": _GRAVITY if exported.gravity else "",
+        "MODEL_INCLUDE": _MODEL_INCLUDE if exported.has_weight else "",
+        "MODEL": _MODEL if exported.has_weight else "",
+        "WEIGHT": _WEIGHT if exported.has_weight else "",
+        "PLUS_WEIGHT": " + weight[i]" if exported.has_weight else "",
+        "MINUS_WEIGHT": " - weight[i]" if exported.has_weight else "",
     }
     places = {
         "selftest.c": "selftest.c",

@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.motions.approach import Approach
-from nbs_pin.motions.references import MOTION, DesiredMotion, at_times
+from nbs_pin.motions.references import MOTION, DesiredMotion, at_times, check_reference
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.runtime.arms import ArmInterface
 from nbs_pin.runtime.guard import Counters, Guard, Mode
@@ -26,6 +27,7 @@ from nbs_pin.runtime.guarded import FaultReport, Guarded, Sample
 BRAKING = 0.5
 """How long a stopped arm is braked before control is given up [s]."""
 _PRIORITY, _REHEARSED = 50, 5
+_CHECKED = 20_000  # instants at most at which the motion is compared with the limits
 
 
 class Times(NamedTuple):
@@ -109,15 +111,16 @@ def drive(
         law: The control law.
         robot: Its description.
         motion: The desired motion; its time 0 is the time of the arm's first sample.
-        duration: How long [s], a whole number of periods.
+        duration: How long [s], a whole number of periods; if the motion waits for the arm, so much longer.
         guard: Limits; None takes those of `Guard.for_robot` for this arm and period.
-        approach: Whether to lead from where the arm is to the motion (`Approach`).
+        approach: Whether to lead from where the arm is to the motion (`Approach`), which may have to wait for that.
         watch: Called at every instant, with what must not take long; an exception of it stops the arm and is
             told in the run's `info`.
         priority: Ask the system for a real-time priority, which needs the right to have one.
 
     Raises:
-        ArgumentError: If arm, law and robot do not fit, or the arm does not start.
+        ArgumentError: If arm, law and robot do not fit, the motion with its approach leaves the limits of the robot
+            (`check_reference`), or the arm does not start.
 
     Example:
         >>> import nbs_pin as nbs
@@ -134,8 +137,11 @@ def drive(
     if guard.compensated != arm.compensated or abs(guard.period - arm.period) > 1e-9:
         raise ArgumentError("the guard is for another period, or another treatment of gravity; build it for the arm.")
     steps = whole(duration, arm.period, "duration", "period", 10**7)
-    here, guarded = arm.look(), Guarded(law, robot, guard)
-    led = Approach.from_state(motion, robot, here.q) if approach else motion
+    here, guarded, led = arm.look(), Guarded(law, robot, guard), motion
+    if approach:
+        led = Approach.from_state(motion, robot, here.q)
+        steps += math.ceil(led.lag / arm.period)
+    check_reference(led, robot, steps * arm.period, samples=min(steps, _CHECKED) + 1)
     loop = _Loop(arm, guarded, led, watch, steps)
     loop.rehearse(here)
     with _undisturbed(priority) as granted:

@@ -174,7 +174,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "Guard": {"effort_limit": [9.0, 9.0], "velocity_limit": 2.0, "lower": -1.0, "upper": 1.0, "damping": 1.0},
         "Guard.for_robot": {"torque_rate": 500.0, "certificate": None},
         "Guarded": {"law": s.law, "lookahead": 0.001},
-        "Approach": {"motion": s.motion, "length": 1.0, "coefficients": np.zeros((6, 2))},
+        "Approach": {"motion": s.motion, "length": 1.0, "coefficients": np.zeros((6, 2)), "ramp": 1.0},
         "Approach.from_state": {"motion": s.motion, "length": None},
         "PlantArm": {"real_time": False, "disturbance": None},
         "drive": {"arm": s.arm, "law": s.law, "motion": s.motion, "guard": None},
