@@ -228,6 +228,36 @@ def test_arguments_that_do_not_fit_are_refused_or_held():
     assert np.isfinite(listed).all()
 
 
+def test_an_arm_that_adds_gravity_takes_no_law_without_it():
+    guard, model = nbs.Guard.for_robot(ROBOT, compensated=True), nbs.PinocchioDynamics(ROBOT)
+    upright = min(([x, 0.0] for x in 0.5 * np.pi * np.arange(4)), key=lambda q: np.abs(model.gravity(q)).max())
+    for law in (nbs.PID.for_robot(ROBOT), Strange(0, lambda: np.zeros(2))):
+        guarded = nbs.Guarded(law, ROBOT, guard)
+        with pytest.raises(nbs.ArgumentError, match="law with a model"):
+            guarded.begin([0.3, 0.2], nbs.Hold([0.3, 0.2])(0.0))
+        guarded.begin(upright, nbs.Hold(upright)(0.0))  # nothing to subtract here
+        for k in range(150):
+            aim = nbs.Hold(np.add(upright, [4e-3 * k, 0.0]))(0.0)
+            guarded.step(nbs.Sample(k * H, aim.q, aim.v), aim)
+        assert guarded.report.code is nbs.Fault.MODEL
+
+    class Remembers(nbs.Controller):
+        """A law with memory and a model."""
+
+        nv = 2
+
+        def initial_memory(self, q):
+            return 0
+
+        def step(self, memory, q, v, reference, period):
+            return LAW.step(None, q, v, reference, period)[0], memory + 1
+
+    aim = nbs.Hold([0.3, 0.2])(0.0)
+    guarded = nbs.Guarded(Remembers(), ROBOT, guard)
+    guarded.begin(aim.q, aim)
+    assert np.abs(guarded.step(nbs.Sample(0.0, aim.q, aim.v), aim)).max() < 1e-9
+
+
 SHORT = ["F9", "F14 rate, gains for 1 kHz", "F16 samples lost in a row", "F19", "F21 velocity", "F22", "F23", "F25"]
 
 

@@ -156,14 +156,25 @@ class Guarded:
         self._model, self._using = PinocchioDynamics(robot), threading.Lock()
         self._unknown, self._nothing = np.full(robot.nv, np.nan), np.zeros(robot.nv)
         self._every = max(1, round(PROBE / self.guard.period))
+        # An integral may carry an arm in place of a model, but not where G(q) is subtracted from its torque.
+        self._probed = self.guard.compensated or isinstance(self.law, MemorylessController)
         self._state: np.ndarray | None = None
         self.report: FaultReport | None = None
         """Why it stopped; None while it has not."""
 
     def begin(self, q: Any, aim: Reference) -> None:
-        """Begin, or begin again, with an arm that is held at q [rad]; a stop is left in this way only."""
+        """Begin, or begin again, with an arm that is held at q [rad]; a stop is left in this way only.
+
+        Raises:
+            ArgumentError: For a law that has no gravity in it, such as PID, on an arm that adds gravity by itself.
+        """
         n = self.robot.nv
         at_rest, wanted = vector_of("q", q, n, "rad"), vector_of("aim.q", aim.q, n, "rad")
+        if self.guard.compensated and not self._holds(at_rest):
+            raise ArgumentError(
+                "the law does not give G(q) at rest, which is subtracted for an arm that adds gravity by itself; give a"
+                " law with a model, such as NeuralBackstepping (in the shell nbs)."
+            )
         self._state = self.guard.begin(at_rest, wanted, self._model.gravity(at_rest))
         self._memory, self._count, self.report = self.law.initial_memory(at_rest), 0, None
         self._seen: deque[Seen] = deque(maxlen=LAST)
@@ -227,9 +238,9 @@ class Guarded:
         if action == at.COMPUTE and fault is Fault.NONE:
             try:
                 command = self._command(sample, aim)
-                self._count += 1
-                if self._count % self._every == 1 and not self._holds(aim.q):
+                if self._probed and self._count % self._every == 0 and not self._holds(aim.q):
                     fault = Fault.MODEL
+                self._count += 1
             except Exception:  # a law may raise anything; its arm is stopped, and the report has the traceback
                 fault, trace = Fault.LAW, traceback.format_exc()
         if self.guard.compensated or fault is not Fault.NONE or action >= at.BRAKE:
@@ -248,13 +259,11 @@ class Guarded:
         return np.ascontiguousarray(command, dtype=float)
 
     def _holds(self, q: JointArray) -> bool:
-        """Whether the law, at rest where it wants to be, carries the arm; a law with memory is not asked."""
-        if not isinstance(self.law, MemorylessController):
-            return True
-        gravity = self._model.gravity(q)
-        off = self.law.torque(q, self._nothing, q, self._nothing, self._nothing) - gravity
+        """Whether the law, at rest where it wants to be, carries the arm."""
+        gravity, still = self._model.gravity(q), Reference(q, self._nothing, self._nothing)
+        torque, _ = self.law.step(self.law.initial_memory(q), q, self._nothing, still, self.guard.period)
         tolerance = np.maximum(_OF_GRAVITY * np.abs(gravity).max(), _OF_EFFORT * self.guard.effort_limit)
-        return bool((np.abs(off) <= tolerance).all())
+        return bool((np.abs(torque - gravity) <= tolerance).all())
 
     def _reported(self, sample: Sample, trace: str) -> FaultReport:
         code = Fault(int(self.state[at.CODE]))
