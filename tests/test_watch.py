@@ -10,6 +10,7 @@ import pytest
 
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.energy_balance import LoopSamples, balance
@@ -305,3 +306,18 @@ def test_a_time_beyond_any_run_is_refused():
     aim = nbs.Reference(run.q_ref[0], run.v_ref[0], run.a_ref[0])
     with pytest.raises(ArgumentError, match="expected a finite time"):
         watch.step(None, 1e160, run.q[0], run.v[0], aim, run.tau[0], run.tau_command[0])
+
+
+@pytest.mark.parametrize("model", [CompiledModel, PlainModel])
+def test_storage_never_rounds_below_zero(model):
+    """V = Φ(z1) + ½z2ᵀMz2 ≥ 0 where Φ(z) − Φ(0) cancels, so that a watch may begin on the reference itself."""
+    rng, of_law, watch = np.random.default_rng(0), model(law()), nbs.Watch(held())
+    values = []
+    for _ in range(300):
+        q, v, size = rng.uniform(-1.0, 1.0, 2), rng.normal(size=2), 10.0 ** rng.uniform(-18.0, -8.0)
+        sample = np.zeros((len(FIELDS), 2))
+        sample[0], sample[1], sample[2:4] = q, v, (q, v) + size * rng.normal(size=(2, 2))
+        values.append(of_law.storage(sample))
+        seen, _ = watch.step(None, 0.0, q, v, Reference(*sample[2:5]), sample[5], sample[6])
+        assert seen.verdict == "promise kept"
+    assert min(values) == 0.0 < max(values)

@@ -125,7 +125,7 @@ class WindowWatch:
         mean = np.zeros((at.SIGNALS, sample.shape[1]))
         mean[at.Z1], mean[at.Z2] = e.z1, e.z2
         (phi, more, kinetic, slack), _ = self.model.centre(mean, sample[at.Q], self.resolution, period)
-        initial = float(phi + more) + (math.sqrt(kinetic) + math.sqrt(slack)) ** 2
+        initial = max(float(phi + more), 0.0) + (math.sqrt(kinetic) + math.sqrt(slack)) ** 2
         size, joints = self.certificate.from_start(initial)
         proved, basis = self.certificate.held_storage(initial), in_which_time(self.certificate, initial)
         return memory._replace(initial=initial, proved=proved, basis=basis, bounds=np.array([size, *joints]))

@@ -118,6 +118,7 @@ class LyapunovLaw(ModelLaw):
         q, v, q_ref, v_ref = as_vectors(self.nv, q=q, v=v, q_ref=q_ref, v_ref=v_ref)
         e = self._errors(q, v, q_ref, v_ref, 0.0 * v_ref)
         value = e.value + 0.5 * _dot(e.z2, matvec(self.dynamics.mass_matrix(q), e.z2))
+        value = array_namespace(value).clip(value, 0.0, math.inf)  # V ≥ 0; Φ(z) − Φ(0) may round to less
         return finite_result("V", value, q, v, q_ref, v_ref)
 
     def dissipation(self, q: Array, v: Array, q_ref: Array, v_ref: Array) -> Scalars:

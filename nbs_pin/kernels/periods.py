@@ -86,7 +86,8 @@ def storage(sample: Mat, layout: Vec, weights: Vec, work: Vec) -> float:
     for i in range(n):
         z2[i] = sample[V, i] - sample[V_REF, i] + rate[i] * gradient[i]
     inertia(sample[Q], tree, work, mass)
-    return value + 0.5 * _quadratic(mass, z2)
+    value += 0.5 * _quadratic(mass, z2)
+    return 0.0 if value < 0.0 else value  # V ≥ 0; Φ(z) − Φ(0) may round to less
 
 
 @kernel

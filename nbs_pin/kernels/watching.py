@@ -203,3 +203,5 @@ def settle(z2: Vec, mass: Mat, gradient: Vec, error: Vec, resolution: Vec, out: 
         out[KINETIC] += 0.5 * z2[i] * product
         out[KINETIC_SLACK] += 0.5 * error[i] * reach
         out[PHI_SLACK] += 0.5 * abs(gradient[i]) * resolution[i]
+    if out[KINETIC] < 0.0:  # by rounding
+        out[KINETIC] = 0.0
