@@ -20,7 +20,7 @@ help:
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
 	@echo "make export-check   exported C under gcc, clang, sanitizers, qemu and frama-c, as far as they are here; about ten minutes"
-	@echo "make faults         the fault matrix of docs/runtime.md, 5 trials a row; up to 10 minutes"
+	@echo "make faults         the fault matrix of docs/runtime.md, 5 trials a row; up to 20 minutes"
 	@echo "make hostile-samples  ten million hostile samples through the guard; about 3 minutes"
 	@echo "make bench-history  append this machine's figures to bench-history.jsonl; leave it alone meanwhile"
 	@echo "make clean          remove .venv and out/"

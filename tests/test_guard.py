@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import nbs_pin as nbs
+from nbs_pin.benchmarks import fault_trial, faults_ridden, faults_stopped
 from nbs_pin.benchmarks.faults import MATRIX, judge
 from nbs_pin.controllers.controller import MemorylessController
 from nbs_pin.kernels import guarding as at
@@ -121,9 +122,59 @@ def test_a_joint_that_runs_away_from_the_brake_goes_limp():
     for k in range(201, 600):
         tau = guarded.step(nbs.Sample(k * H, q, v), MOTION(k * H))
         q, v = PLANT.step(q, v, np.array([1.0, -1.0]) * tau - np.array([0.0, 5.0]), H)  # flipped, and pushed
-    limp = guarded.guard.vector(guarded.state, at.LIMP)
-    assert limp[1] == 1.0
+    away = guarded.guard.vector(guarded.state, at.AWAY)
+    assert away[1] >= at.LIMP
     assert tau[1] == 0.0
+
+
+@pytest.mark.parametrize("bad", [1.0, 0.01, [0.5, -0.5, 0.5]])
+def test_a_few_bad_readings_do_not_end_the_brake(bad):
+    """One reading far off, one off by less than three times the velocity limit, and three that leap about."""
+    off = dict(enumerate(np.atleast_1d(bad).tolist(), start=210))
+
+    def braked(off):
+        guarded, torques = begun(), []
+        q, v, _ = follow(guarded, 200)
+        for k in range(200, 1200):
+            sample = nbs.Sample(k * H, q + off.get(k, 0.0), v)
+            torques.append(guarded.step(sample, MOTION(k * H), stop=k == 200))
+            q, v = PLANT.step(q, v, torques[-1], H)
+        return guarded, v, np.array(torques)
+
+    (_, slow, usual), (guarded, v, torques) = braked({}), braked(off)
+    assert (guarded.guard.vector(guarded.state, at.AWAY) < at.LIMP).all()
+    assert np.abs(v).max() < 1.05 * np.abs(slow).max()  # braked
+    if np.abs(bad).max() > 0.1:  # and not moved by what no motion can be
+        assert np.abs(torques - usual).max() < 1.0
+
+
+def test_an_arm_is_braked_while_its_clock_stands():
+    speeds = {}
+    for clock in ("goes on", "stands", "stands, and so do readings"):
+        guarded = begun()
+        q, v, _ = follow(guarded, 700)
+        shown = q, v
+        for k in range(700, 1200):
+            shown = shown if clock.endswith("readings") else (q, v)
+            sample = nbs.Sample(k * H if clock == "goes on" else 0.699, *shown)
+            q, v = PLANT.step(q, v, guarded.step(sample, MOTION(k * H), stop=clock == "goes on"), H)
+        assert guarded.report.code.name == ("REQUESTED" if clock == "goes on" else "TIME")
+        speeds[clock] = np.abs(v).max()
+    assert speeds["stands"] == pytest.approx(speeds["goes on"], rel=0.02)
+    assert speeds["stands"] < 0.2 * speeds["stands, and so do readings"]
+
+
+def test_no_velocity_of_the_wrong_sign_enters_the_brake():
+    guarded = begun()
+    q, v, _ = follow(guarded, 300)
+    k = 300
+    while guarded.report is None:
+        tau = guarded.step(nbs.Sample(k * H, q, -v), MOTION(k * H + guarded.lead))
+        kept = guarded.guard.vector(guarded.state, at.V).copy()
+        q, v = PLANT.step(q, v, tau, H)
+        k += 1
+    assert guarded.report.code is nbs.Fault.SIGN
+    assert (kept == 0.0).all()
 
 
 class Strange(MemorylessController):
@@ -224,8 +275,104 @@ def test_arguments_that_do_not_fit_are_refused_or_held():
     _, _, torques = follow(guarded, 3)
     short = guarded.step(nbs.Sample(0.003, np.zeros(1), np.zeros(5)), MOTION(0.003))  # no reading of this arm
     assert np.array_equal(short, torques[-1])
-    listed = guarded.step(nbs.Sample(0.004, MOTION(0.004).q.tolist(), list(MOTION(0.004).v)), MOTION(0.004))
-    assert np.isfinite(listed).all()
+
+
+def test_readings_of_any_kind_are_taken_or_held():
+    guarded = begun()
+    taken = 0
+    for k in range(60):
+        q, v, aim = MOTION(k * H).q, MOTION(k * H).v, MOTION(k * H + guarded.lead)
+        fixed = q.copy()
+        fixed.flags.writeable = False
+        good = [fixed, q.tolist(), tuple(q), np.repeat(q, 2)[::2], q[::-1].copy()[::-1]]
+        bad = [q[None], q[:1], q[:, None], q[0], None, "q", [[0.0], [0.0, 1.0]], [None, 0.0]]
+        kind = (good + bad)[k % 13]
+        before = guarded.counters.held
+        tau = guarded.step(nbs.Sample(k * H, kind, v), aim)
+        assert guarded.counters.held - before == (k % 13 >= 5)
+        taken += k % 13 < 5
+        assert tau.shape == (2,)
+        assert np.isfinite(tau).all()
+    assert taken == 25
+    assert guarded.mode is nbs.Mode.DEGRADED
+    for spoilt in (nbs.Reference(aim.q[:1], aim.v, aim.a), nbs.Reference(aim.q, aim.v[None], aim.a)):
+        held = guarded.counters.held
+        guarded.step(nbs.Sample(0.06 + held * H, q, v), spoilt)
+        assert guarded.counters.held == held + 1
+    guarded.step(nbs.Sample(None, q, v), aim)
+    assert guarded.counters.held == held + 2
+    for _ in range(20):
+        guarded.step(nbs.Sample(0.2, "nothing", v), aim)
+    assert guarded.report.q.shape == (50, 2)
+
+
+def test_what_a_law_returns_in_another_shape_is_held():
+    for value in (np.zeros((1, 2)), np.zeros(3), None):
+        guarded = begun(Strange(60, lambda value=value: value))
+        follow(guarded, 100)
+        assert guarded.report.code is nbs.Fault.OUTPUT
+
+
+def test_a_reference_of_another_length_is_not_read():
+    """A row of large numbers lies behind an empty view: a joint at rest must not look frozen for them."""
+    guard, rest, behind = nbs.Guard.for_robot(ROBOT), np.array([0.3, 0.2]), np.full(4, 1e9)
+    state, still = guard.begin(rest, rest, np.zeros(2)), np.zeros(2)
+    for k in range(60):
+        v_ref = {5: behind[:0], 6: np.full(2, np.nan)}.get(k, still)
+        at.admit(guard.config, state, k * H, True, False, rest, still, rest, v_ref, still)
+    assert state[at.HELD] == 2.0
+    assert state[at.MODE] != at.STOPPED
+    for k in range(60, 90):  # and one that is frozen is found
+        at.admit(guard.config, state, k * H, True, False, rest, still, rest, np.ones(2), still)
+    assert state[at.CODE] == at.FROZEN
+
+
+def test_an_error_is_that_of_one_instant():
+    """A law that looks far ahead of a fast motion is not off by what the motion does until then."""
+    guard = replace(nbs.Guard.for_robot(ROBOT), error_limit=np.full(2, 0.01))
+    guarded = nbs.Guarded(LAW, ROBOT, guard, lookahead=0.02)
+
+    def at_speed(t):
+        return nbs.Reference(np.array([0.0, t]), np.array([0.0, 1.0]), np.zeros(2))
+
+    for first, stops in ((0.0, False), (0.012, True)):
+        guarded.begin(at_speed(0.0).q, at_speed(guarded.lead))
+        for k in range(60):
+            q, v, _ = at_speed(k * H)
+            q[1] += min(first, 0.001 * k)
+            guarded.step(nbs.Sample(k * H, q, v), at_speed(k * H + guarded.lead))
+        assert (guarded.report is not None) == stops
+    assert guarded.report.code is nbs.Fault.DIVERGED
+
+
+def test_an_arm_that_adds_gravity_takes_no_law_without_it():
+    guard, model = nbs.Guard.for_robot(ROBOT, compensated=True), nbs.PinocchioDynamics(ROBOT)
+    upright = min(([x, 0.0] for x in 0.5 * np.pi * np.arange(4)), key=lambda q: np.abs(model.gravity(q)).max())
+    for law in (nbs.PID.for_robot(ROBOT), Strange(0, lambda: np.zeros(2))):
+        guarded = nbs.Guarded(law, ROBOT, guard)
+        with pytest.raises(nbs.ArgumentError, match="law with a model"):
+            guarded.begin([0.3, 0.2], nbs.Hold([0.3, 0.2])(0.0))
+        guarded.begin(upright, nbs.Hold(upright)(0.0))  # nothing to subtract here
+        for k in range(150):
+            aim = nbs.Hold(np.add(upright, [4e-3 * k, 0.0]))(0.0)
+            guarded.step(nbs.Sample(k * H, aim.q, aim.v), aim)
+        assert guarded.report.code is nbs.Fault.MODEL
+
+    class Remembers(nbs.Controller):
+        """A law with memory and a model."""
+
+        nv = 2
+
+        def initial_memory(self, q):
+            return 0
+
+        def step(self, memory, q, v, reference, period):
+            return LAW.step(None, q, v, reference, period)[0], memory + 1
+
+    aim = nbs.Hold([0.3, 0.2])(0.0)
+    guarded = nbs.Guarded(Remembers(), ROBOT, guard)
+    guarded.begin(aim.q, aim)
+    assert np.abs(guarded.step(nbs.Sample(0.0, aim.q, aim.v), aim)).max() < 1e-9
 
 
 SHORT = ["F9", "F14 rate, gains for 1 kHz", "F16 samples lost in a row", "F19", "F21 velocity", "F22", "F23", "F25"]
@@ -234,3 +381,49 @@ SHORT = ["F9", "F14 rate, gains for 1 kHz", "F16 samples lost in a row", "F19", 
 @pytest.mark.parametrize("at", [k for k, case in enumerate(MATRIX) if case.fault.startswith(tuple(SHORT))])
 def test_rows_of_the_fault_matrix(at):
     assert judge(at, "two_link", 0).passed
+
+
+class Unguarded(nbs.Guarded):
+    """The law alone: whatever comes in is used, whatever comes out is sent."""
+
+    def step(self, sample, aim, *, overrun=False, stop=False):
+        if not np.isfinite(sample.q).all() or not sample.fresh:
+            return self.tau
+        return self._command(sample, aim)
+
+
+def fails(at, arm="two_link"):
+    try:
+        return not judge(at, arm, 0).passed
+    except ZeroDivisionError:  # the law's, which a guard keeps
+        return True
+
+
+GUARDED = ["F10 2^-12 turn, 1 ms", "F16 20 ms", "F23", "F25", "F27"]
+
+
+@pytest.mark.parametrize("name", GUARDED)
+def test_rows_of_the_fault_matrix_fail_without_a_guard(name, monkeypatch):
+    monkeypatch.setattr(fault_trial, "Guarded", Unguarded)
+    fault, _, level = name.partition(" ")
+    rows = [k for k, case in enumerate(MATRIX) if case.fault.split()[0] == fault and level in case.level]
+    assert rows
+    assert all(map(fails, rows))
+
+
+def test_rows_that_need_no_guard_can_fail_too(monkeypatch):
+    def row(fault, level):
+        (found,) = (k for k, case in enumerate(MATRIX) if case.fault.startswith(fault) and case.level == level)
+        return found
+
+    monkeypatch.setattr(faults_ridden, "check_reference", lambda *_: None)  # nothing is refused before the start
+    assert fails(row("F17", "5 %"))
+    monkeypatch.setattr(faults_stopped, "simulate", lambda *_, **__: None)  # nothing diverges
+    assert fails(row("F26", "torque 1e9 N·m at 0.1 s"))
+    slow = nbs.Guard.for_robot
+    monkeypatch.setattr(
+        nbs.Guard,
+        "for_robot",
+        lambda robot, *a, torque_rate=None, **k: slow(robot, *a, torque_rate=torque_rate and 0.02 * torque_rate, **k),
+    )
+    assert fails(row("F18", "1000 N·m/s against none"))

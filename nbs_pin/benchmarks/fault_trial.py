@@ -18,7 +18,8 @@ from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.motions.approach import Approach
 from nbs_pin.motions.references import Sinusoid, at_times
 from nbs_pin.robots.robot import Robot, configuration_difference, load_robot
-from nbs_pin.runtime.guard import Guard
+from nbs_pin.runtime.franka_arm import FrankaArm
+from nbs_pin.runtime.guard import Counters, Guard
 from nbs_pin.runtime.guarded import FaultReport, Guarded, Sample
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 from nbs_pin.simulation.plant import Plant
@@ -29,6 +30,8 @@ STRIKE = 1000
 """Instant at which faults that begin in the motion begin."""
 LATE = 0.5
 """RMS errors are over the time from here on [s]."""
+RATES = {"panda": FrankaArm.torque_rate}
+"""Torque rates that the drivers of arms state [N·m/s]."""
 _AFTER_STOP = 300  # instants that a trial goes on after a stop
 
 
@@ -39,6 +42,10 @@ class Arm(NamedTuple):
     law: NeuralBackstepping
     plant: MujocoPlant
     motion: Sinusoid
+
+    def guard(self, period: float = PERIOD, robot: Robot | None = None) -> Guard:
+        """With the torque rate of its driver, for the arm or for another with its name."""
+        return Guard.for_robot(robot or self.robot, period, torque_rate=RATES.get(self.robot.name))
 
     @property
     def certificate(self) -> Certificate:
@@ -93,6 +100,8 @@ class Trial:
     """Torque from outside [N·m], at an instant and a time."""
     calls: Callable[[int], bool] = field(default=lambda k: True)
     """Whether the law is called at an instant."""
+    overruns: Callable[[int], bool] = field(default=lambda k: False)
+    """Whether it is told at an instant that the last call came back late."""
     delay: int = 0
     """Instants between a torque and its action."""
 
@@ -115,8 +124,7 @@ class Outcome:
     stopped: int
     """Instant of the stop; the number of instants if there was none."""
     degraded: bool
-    saturated: float
-    """Share of instants at which the law asked for more than the arm gives."""
+    counters: Counters
     diverged: str = ""
     """What the plant said when it diverged."""
 
@@ -132,8 +140,8 @@ class Outcome:
 
     @property
     def peak(self) -> float:
-        """Largest |z1_i| [rad]."""
-        return float(np.abs(self.error).max())
+        """Largest |z1_i| until the stop [rad]."""
+        return float(np.abs(self.error[: self.stopped + 1]).max())
 
     @property
     def code(self) -> str:
@@ -155,7 +163,7 @@ class Outcome:
 
 def _run(trial: Trial) -> Outcome:
     arm, h = trial.arm, trial.period
-    guard = Guard.for_robot(arm.robot, h) if trial.guard is None else trial.guard
+    guard = arm.guard(h) if trial.guard is None else trial.guard
     plant = trial.plant or arm.plant
     guarded = Guarded(trial.law or arm.law, arm.robot, guard)
     steps = round(trial.seconds / h)
@@ -172,7 +180,8 @@ def _run(trial: Trial) -> Outcome:
         t = float(times[k])
         errors.append(configuration_difference(q, desired.q[k], arm.robot.continuous))
         if trial.calls(k):
-            tau = guarded.step(trial.sense(k, Sample(t, q, v)), trial.aim(k, desired_at(target, k)))
+            sample, aim = trial.sense(k, Sample(t, q, v)), trial.aim(k, desired_at(target, k))
+            tau = guarded.step(sample, aim, overrun=trial.overruns(k))
             torques.append(tau)
             degraded = degraded or guarded.mode.name == "DEGRADED"
         if guarded.report is not None and stopped == steps:
@@ -193,7 +202,7 @@ def _run(trial: Trial) -> Outcome:
         report=guarded.report,
         stopped=stopped,
         degraded=degraded,
-        saturated=guarded.counters.saturated / len(torques),
+        counters=guarded.counters,
         diverged=diverged,
     )
 

@@ -27,9 +27,8 @@ from nbs_pin.reports.plotting import plot_tracking
 from nbs_pin.reports.replay import replay
 from nbs_pin.robots.robot import Robot, configuration_difference, load_robot
 from nbs_pin.runtime.arms import ArmInterface, PlantArm
-from nbs_pin.runtime.drive import Driven, Live, drive
+from nbs_pin.runtime.drive import Driven, Live, drive, guard_for
 from nbs_pin.runtime.franka_arm import FrankaArm
-from nbs_pin.runtime.guard import Guard
 from nbs_pin.runtime.ur_arm import URArm
 from nbs_pin.simulation import metrics
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
@@ -53,7 +52,7 @@ def run(options: Run, console: Console, notes: Console) -> int:
         law = law_of(options.controller, robot, bandwidth=options.bandwidth, period=period, friction=None, seed=0)
         law.compile()
         arm = arm_at(options.at, robot, motion, period)
-        guard = Guard.for_robot(robot, period, compensated=arm.compensated, certificate=_bound(options, law, robot))
+        guard = guard_for(arm, robot, certificate=_bound(options, law, robot))
     with results.made() as folder, _watching(options, robot, notes) as latest:
         driven = drive(arm, law, robot, motion, duration, guard=guard, watch=latest.append, priority=options.priority)
         found = figures(driven)

@@ -21,21 +21,25 @@ COMPUTE, HOLD, BRAKE, RELEASE = range(4)
  ARM, REQUESTED) = range(17)  # fmt: skip
 """Codes of faults."""
 (LENGTH, COMPENSATED, PATIENCE, LOST_AFTER, RECOVERY, SLOWEST, FASTEST, SLOW, FAST, DECAY, REVERSALS, SIGN_SPEED,
- NUMBERS) = range(13)  # fmt: skip
-"""Numbers of the configuration, and how many."""
+ LEAD, NUMBERS) = range(14)  # fmt: skip
+"""Numbers of the configuration, and how many; LEAD is how far references are ahead of the samples [s]."""
 EFFORT, STEP, REACH, SPEED, ERROR, PUSH, DAMPING, RESOLUTION, WRAPS, LOWER, UPPER, VECTORS = range(12)
 """Vectors of the configuration, and how many."""
 (MODE, CODE, ACTION, BEGUN, AT, BAD, UNFIT, CYCLES, LOST, QUIET, MEAN, SWINGS, FAR, PUSHED, TROUBLE, HELD, LATE,
  OVERRUN, CUT, SCALARS) = range(20)  # fmt: skip
 """Numbers of the state, and how many: the last four count what has happened since the beginning."""
-(Q, V, Q_REF, V_REF, TAU, GRAVITY, STALE, MOVED, ALONG, SQUARE, SIDE, ROOM, PEAK, LIMP, ROWS) = range(15)  # fmt: skip
-"""Vectors of the state, and how many."""
+(Q, V, Q_REF, V_REF, TAU, GRAVITY, STALE, MOVED, ALONG, SQUARE, SIDE, ROOM, PEAK, READ, AWAY,
+ ROWS) = range(16)  # fmt: skip
+"""Vectors of the state, and how many. While braking, Q and V are what is believed, and READ was read last."""
 
 Part = namedtuple("Part", "x rows")
 """Numbers and vectors, of the configuration or the state."""
 
 _TURN = 2.0 * math.pi
 _WINDOW, _SIGN_WINDOW, _CHATTER_TIME, _SMOOTH = 0.02, 0.05, 0.1, 0.2
+LIMP = 5.0
+"""Readings in a row in which a joint runs away from the brake, from which on it gets no torque."""
+_GAP = 3.0  # periods over which a difference of positions still tells a velocity
 _VEC = float64[::1]
 
 
@@ -65,13 +69,13 @@ def _apart(x: float, y: float, wraps: float) -> float:
 
 @inlined
 def _stop(s: Part, c: Part, code: int) -> None:
-    """Latch the first fault, and remember how fast every joint was."""
+    """Latch the first fault, after its sample is kept; remember where every joint was and how fast."""
     if s.x[MODE] == STOPPED:
         return
     s.x[MODE], s.x[CODE] = STOPPED, code
     for i in range(s.rows.shape[1]):
-        s.rows[PEAK, i] = abs(s.rows[V, i]) / c.rows[SPEED, i]
-        if code == SIGN:
+        s.rows[PEAK, i], s.rows[READ, i] = abs(s.rows[V, i]) / c.rows[SPEED, i], s.rows[Q, i]
+        if code == SIGN:  # a damping of this velocity would drive the joint
             s.rows[V, i] = 0.0
 
 
@@ -104,20 +108,20 @@ def _jumped(x: Vec, at: int, s: Part, c: Part, passed: float) -> bool:
 
 
 @inlined
-def _follows(q_ref: Vec, v_ref: Vec, s: Part, c: Part, passed: float) -> bool:
-    """Whether a reference is finite, within the limits of the joints, and goes on from the one before."""
-    n = s.rows.shape[1]
-    if not (_finite(q_ref, n) and _finite(v_ref, n)):
-        return False
-    for i in range(n):
+def _follows(q_ref: Vec, s: Part, c: Part, passed: float) -> bool:
+    """Whether a finite reference is within the limits of the joints and goes on from the one before."""
+    for i in range(len(q_ref)):
         if not c.rows[LOWER, i] <= q_ref[i] <= c.rows[UPPER, i]:
             return False
     return s.x[BEGUN] == 0.0 or not _jumped(q_ref, Q_REF, s, c, passed)
 
 
 @inlined
-def _sensed(q: Vec, v: Vec, v_ref: Vec, passed: float, s: Part, c: Part) -> int:
-    """JUMP: a velocity that cannot be. FROZEN: a reading that stays while the reference moves. SIGN: both differ."""
+def _sensed(q: Vec, v: Vec, v_ref: Vec, aimed: bool, passed: float, s: Part, c: Part) -> int:
+    """JUMP: a velocity that cannot be. FROZEN: a reading that stays while the reference moves. SIGN: both differ.
+
+    `v_ref` is not read unless `aimed`, which says that it is n finite numbers.
+    """
     found, floor, per = NONE, c.x[SIGN_SPEED] * c.x[SIGN_SPEED], 1.0 / passed
     for i in range(len(q)):
         if not abs(v[i]) <= c.rows[REACH, i]:
@@ -125,7 +129,8 @@ def _sensed(q: Vec, v: Vec, v_ref: Vec, passed: float, s: Part, c: Part) -> int:
         change = _apart(q[i], s.rows[Q, i], c.rows[WRAPS, i])
         if change == 0.0:
             s.rows[STALE, i] += 1.0
-            s.rows[MOVED, i] += abs(v_ref[i]) * passed
+            if aimed:
+                s.rows[MOVED, i] += abs(v_ref[i]) * passed
         else:
             s.rows[STALE, i], s.rows[MOVED, i] = 0.0, 0.0
         if s.rows[STALE, i] >= c.x[PATIENCE] - 1.0 and s.rows[MOVED, i] > 2.0 * c.rows[RESOLUTION, i]:
@@ -138,11 +143,11 @@ def _sensed(q: Vec, v: Vec, v_ref: Vec, passed: float, s: Part, c: Part) -> int:
 
 
 @inlined
-def _strayed(q: Vec, q_ref: Vec, external: Vec, s: Part, c: Part) -> int:
+def _strayed(q: Vec, q_ref: Vec, v_ref: Vec, external: Vec, s: Part, c: Part) -> int:
     """DIVERGED or EXTERNAL where an error, or a torque from outside, is too large three times in a row."""
     far, pushed = False, False
     for i in range(len(q)):
-        error = _apart(q[i], q_ref[i], c.rows[WRAPS, i])
+        error = _apart(q[i], q_ref[i] - c.x[LEAD] * v_ref[i], c.rows[WRAPS, i])  # at the time of the sample
         far = far or not abs(error) <= c.rows[ERROR, i] + s.rows[ROOM, i]
         pushed = pushed or not abs(external[i]) <= c.rows[PUSH, i]
         s.rows[ROOM, i] *= c.x[DECAY]
@@ -164,28 +169,25 @@ def _keep(t: float, q: Vec, v: Vec, s: Part) -> None:
 @inlined
 def _examined(t: float, q: Vec, v: Vec, q_ref: Vec, v_ref: Vec, external: Vec, s: Part, c: Part) -> int:
     """What is wrong with a finite sample, which the state knows afterwards; some faults stop at once."""
-    passed = t - s.x[AT] if s.x[BEGUN] > 0.0 else c.x[LENGTH]
+    fault, passed, n = NONE, c.x[LENGTH], s.rows.shape[1]
+    aimed = _finite(q_ref, n) and _finite(v_ref, n)
     if s.x[BEGUN] > 0.0:
+        passed = t - s.x[AT]
         fault = _clock(s, c, t)
-        if fault != NONE:
-            _keep(t, q, v, s)
-            _stop(s, c, fault)
-            return fault
-        if _jumped(q, Q, s, c, passed):
-            return JUMP
-        fault = _sensed(q, v, v_ref, passed, s, c)
+        if fault == NONE:
+            fault = JUMP if _jumped(q, Q, s, c, passed) else _sensed(q, v, v_ref, aimed, passed, s, c)
         if fault == JUMP:
             return JUMP
-        if fault != NONE:
-            _stop(s, c, fault)
-    follows = _follows(q_ref, v_ref, s, c, passed)
+    follows = fault == NONE and aimed and _follows(q_ref, s, c, passed)
     _keep(t, q, v, s)
-    if not follows:
-        return REFERENCE
-    fault = _strayed(q, q_ref, external, s, c)
+    if fault == NONE:
+        if not follows:
+            return REFERENCE
+        fault = _strayed(q, q_ref, v_ref, external, s, c)
     if fault != NONE:
         _stop(s, c, fault)
-    for i in range(len(q)):
+        return fault
+    for i in range(n):
         s.rows[Q_REF, i], s.rows[V_REF, i] = q_ref[i], v_ref[i]
     s.x[BEGUN] = 1.0
     return NONE
@@ -193,17 +195,28 @@ def _examined(t: float, q: Vec, v: Vec, q_ref: Vec, v_ref: Vec, external: Vec, s
 
 @inlined
 def _braked(t: float, q: Vec, s: Part, c: Part) -> None:
-    """A sample while stopped: velocities from positions alone; a joint that runs away from the brake goes limp."""
-    passed = t - s.x[AT]
-    continues = 0.0 < passed <= c.x[PATIENCE] * c.x[LENGTH] and s.x[LOST] == 1.0
+    """A sample while stopped: velocities from positions alone; a joint that runs away from the brake goes limp.
+
+    A clock that says nothing (it stands, goes back, leaps or is no number) is replaced by the count of periods. A step
+    where no motion leads changes neither position nor velocity: one reading may be wrong, `LIMP` in a row are a joint
+    that runs away, or an encoder that tells nothing.
+    """
+    h, passed = c.x[LENGTH], t - s.x[AT]
+    if not c.x[FASTEST] * h <= passed <= c.x[PATIENCE] * h:
+        passed = s.x[CYCLES] * h
     for i in range(len(q)):
-        rate = 0.0  # differences over a gap say nothing
-        if continues:
-            rate = _apart(q[i], s.rows[Q, i], c.rows[WRAPS, i]) / passed
-            rate = s.rows[V, i] + _SMOOTH * (rate - s.rows[V, i])
-        s.rows[Q, i], s.rows[V, i] = q[i], rate
-        if not abs(rate) / c.rows[SPEED, i] <= 1.5 * s.rows[PEAK, i] + 0.5:
-            s.rows[LIMP, i] = 1.0
+        step = _apart(q[i], s.rows[READ, i], c.rows[WRAPS, i])
+        s.rows[READ, i] = q[i]
+        if s.x[LOST] > _GAP:  # a difference over a gap says nothing
+            s.rows[Q, i], s.rows[V, i] = q[i], 0.0
+            continue
+        away = not abs(step - s.rows[V, i] * passed) <= c.rows[REACH, i] * passed
+        if not away:
+            s.rows[Q, i] = q[i]
+            s.rows[V, i] += _SMOOTH * (step / passed - s.rows[V, i])
+            away = not abs(s.rows[V, i]) / c.rows[SPEED, i] <= 1.5 * s.rows[PEAK, i] + 0.5
+        if s.rows[AWAY, i] < LIMP:
+            s.rows[AWAY, i] = s.rows[AWAY, i] + 1.0 if away else 0.0
     s.x[AT], s.x[CYCLES], s.x[LOST] = t, 0.0, 0.0
 
 
@@ -234,21 +247,21 @@ def admit(
     if overrun:
         state[OVERRUN] += 1.0
         state[TROUBLE] = 1.0
-    usable = fresh and abs(t) <= 1e100 and _finite(q, n) and _finite(v, n) and len(external) == n
+    placed = fresh and _finite(q, n)
     if state[MODE] == STOPPED:
-        if usable:
+        if placed:  # the brake needs neither the time nor velocities
             _braked(t, q, s, c)
     else:
         fault = NOT_FINITE if fresh else MISSED
-        if usable:
+        if placed and abs(t) <= 1e100 and _finite(v, n) and len(external) == n:
             fault = _examined(t, q, v, q_ref, v_ref, external, s, c)
         state[ACTION] = COMPUTE
         state[BAD] = state[BAD] + 1.0 if fault != NONE else 0.0
         if fault != NONE:
             state[ACTION], state[TROUBLE] = HOLD, 1.0
-            state[HELD] += 1.0
             if state[BAD] >= config[PATIENCE]:
                 _stop(s, c, fault)
+            state[HELD] += 1.0 if state[MODE] != STOPPED else 0.0
     if state[MODE] == STOPPED:
         state[ACTION] = BRAKE if state[LOST] <= config[LOST_AFTER] else RELEASE
     return int(state[ACTION])
@@ -275,7 +288,7 @@ def _wanted(i: int, command: Vec, s: Part, c: Part) -> float:
     action, gravity = s.x[ACTION], s.rows[GRAVITY, i]
     if action == COMPUTE:
         return command[i]
-    if action == RELEASE or s.rows[LIMP, i] > 0.0:
+    if action == RELEASE or s.rows[AWAY, i] >= LIMP:
         return c.x[COMPENSATED] * gravity
     return gravity - (c.rows[DAMPING, i] * s.rows[V, i] if s.x[LOST] == 0.0 else 0.0)
 

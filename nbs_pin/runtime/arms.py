@@ -6,9 +6,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from nbs_pin.base.arguments import PERIOD, checked, flag, function, maybe
+from nbs_pin.base.arguments import PERIOD, checked, flag, function, joints, maybe
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.checks import vector_of
+from nbs_pin.base.checks import PerJoint, vector_of
 from nbs_pin.runtime.guarded import Sample
 from nbs_pin.simulation.plant import PLANT, Plant
 
@@ -35,6 +35,8 @@ class ArmInterface(Protocol):
     """Time between two instants [s]."""
     compensated: bool
     """Whether the arm adds G(q) to the torques that it is sent."""
+    torque_rate: PerJoint
+    """Largest |Δτ|/period that it takes [N·m/s]; None where its maker states none."""
     nv: int
     """Number of joints."""
 
@@ -63,6 +65,8 @@ class PlantArm:
         v: How fast [rad/s]; None is at rest.
         period: Control period [s], one plant step.
         real_time: Whether `read` waits for the clock; without, every `read` is one period after the last.
+        torque_rate: Largest |Δτ|/period that the simulated arm is said to take [N·m/s], such as
+            `FrankaArm.torque_rate`; None for no such limit.
         disturbance: Torque τ_d(t, q, v) [N·m], or None.
 
     Example:
@@ -74,7 +78,13 @@ class PlantArm:
 
     compensated = False
 
-    @checked(plant=PLANT, period=PERIOD, real_time=flag, disturbance=maybe(_PUSH))
+    @checked(
+        plant=PLANT,
+        period=PERIOD,
+        real_time=flag,
+        torque_rate=maybe(joints(above=0.0, unit="N·m/s")),
+        disturbance=maybe(_PUSH),
+    )
     def __init__(
         self,
         plant: Plant,
@@ -83,10 +93,11 @@ class PlantArm:
         *,
         period: float = 0.001,
         real_time: bool = True,
+        torque_rate: PerJoint = None,
         disturbance: Callable[[float, np.ndarray, np.ndarray], Any] | None = None,
     ) -> None:
         self.plant, self.period, self.real_time, self.disturbance = plant, period, real_time, disturbance
-        self.nv = plant.nv
+        self.torque_rate, self.nv = torque_rate, plant.nv
         self._q, self._v = vector_of("q", q, self.nv, "rad"), np.zeros(self.nv)
         if v is not None:
             self._v = vector_of("v", v, self.nv, "rad/s")

@@ -4,6 +4,8 @@ import contextlib
 import gc
 import math
 import os
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,16 +15,17 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arguments import DURATION, a, checked, flag, function, maybe
-from nbs_pin.base.checks import whole
+from nbs_pin.base.checks import told, whole
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
+from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.motions.approach import Approach
 from nbs_pin.motions.references import MOTION, DesiredMotion, at_times, check_reference
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.runtime.arms import ArmInterface
 from nbs_pin.runtime.guard import Counters, Guard, Mode
-from nbs_pin.runtime.guarded import FaultReport, Guarded, Sample
+from nbs_pin.runtime.guarded import FaultReport, Guarded, Sample, Seen
 
 BRAKING = 0.5
 """How long a stopped arm is braked before control is given up [s]."""
@@ -106,13 +109,16 @@ def drive(
 ) -> Driven:
     """Move an arm along a motion behind a guard, and stop it when the guard does, or on Ctrl-C.
 
+    Called in the main thread it takes Ctrl-C (SIGINT) for itself until the arm has stopped: the arm is braked and the
+    report says REQUESTED. In another thread, end it by what `watch` raises.
+
     Args:
         arm: The arm.
         law: The control law.
         robot: Its description.
         motion: The desired motion; its time 0 is the time of the arm's first sample.
         duration: How long [s], a whole number of periods; if the motion waits for the arm, so much longer.
-        guard: Limits; None takes those of `Guard.for_robot` for this arm and period.
+        guard: Limits; None takes those of `Guard.for_robot` for this arm, its period and its torque rate.
         approach: Whether to lead from where the arm is to the motion (`Approach`), which may have to wait for that.
         watch: Called at every instant, with what must not take long; an exception of it stops the arm and is
             told in the run's `info`.
@@ -133,9 +139,14 @@ def drive(
     """
     if arm.nv != robot.nv:
         raise ArgumentError(f"the arm has {arm.nv} joints and {robot.name} {robot.nv}; give its own description.")
-    guard = Guard.for_robot(robot, arm.period, compensated=arm.compensated) if guard is None else guard
+    guard = guard_for(arm, robot) if guard is None else guard
     if guard.compensated != arm.compensated or abs(guard.period - arm.period) > 1e-9:
         raise ArgumentError("the guard is for another period, or another treatment of gravity; build it for the arm.")
+    if arm.torque_rate is not None and (guard.torque_rate > arm.torque_rate).any():
+        raise ArgumentError(
+            f"the guard's torque_rate is {told(guard.torque_rate.tolist())}, beyond the arm's {told(arm.torque_rate)}"
+            " N·m/s; give Guard.for_robot the arm's torque_rate."
+        )
     steps = whole(duration, arm.period, "duration", "period", 10**7)
     here, guarded, led = arm.look(), Guarded(law, robot, guard), motion
     if approach:
@@ -144,12 +155,23 @@ def drive(
     check_reference(led, robot, steps * arm.period, samples=min(steps, _CHECKED) + 1)
     loop = _Loop(arm, guarded, led, watch, steps)
     loop.rehearse(here)
-    with _undisturbed(priority) as granted:
+    with _undisturbed(priority) as granted, _interrupts(loop.ask):
         try:
             loop.run(here)
         finally:
             arm.stop()
     return loop.driven(robot, type(law).__name__, granted)
+
+
+def _tells(sample: Sample) -> bool:
+    return sample.fresh and bool(np.isfinite(sample.q).all() and np.isfinite(sample.v).all())
+
+
+def guard_for(arm: ArmInterface, robot: Robot, certificate: Certificate | None = None) -> Guard:
+    """The guard of `Guard.for_robot` with the period, the torque rate and the gravity of a driver."""
+    return Guard.for_robot(
+        robot, arm.period, certificate=certificate, torque_rate=arm.torque_rate, compensated=arm.compensated
+    )
 
 
 class _Loop:
@@ -164,16 +186,21 @@ class _Loop:
         steps: int,
     ) -> None:
         self.arm, self.guarded, self.watch, self.steps = arm, guarded, watch, steps
+        self.braking = round(BRAKING / arm.period)
         times = arm.period * np.arange(steps + 2.0)
         self.desired = at_times(motion, times, arm.nv)
         self.target = at_times(motion, times + guarded.lead, arm.nv)
-        self.rows: list[tuple[int, Sample, np.ndarray]] = []
-        self.work = np.zeros(steps + 1)
-        self.missed, self.trouble = 0, ""
+        self.rows: list[tuple[int, Seen]] = []
+        self.work = np.zeros(steps + self.braking + 1)
+        self.missed, self.trouble, self.asked = 0, "", False
+
+    def ask(self) -> None:
+        """Ask for a stop at the next instant."""
+        self.asked = True
 
     def aim(self, row: int) -> Reference:
-        """The reference for which the law is evaluated in a row."""
-        return Reference(*(x[row] for x in self.target))
+        """The reference for which the law is evaluated in a row; after the end, that of the end."""
+        return Reference(*(x[min(row, self.steps)] for x in self.target))
 
     def rehearse(self, here: Sample) -> None:
         """A few steps that are not sent, so that nothing is done for the first time when it counts."""
@@ -182,55 +209,60 @@ class _Loop:
             self.guarded.step(here._replace(t=row * self.arm.period, v=np.zeros(self.arm.nv)), self.aim(0))
 
     def run(self, here: Sample) -> None:
-        """Until the end, or a while after a stop."""
+        """Until the end; after a stop for as long as it is braked, even beyond the end."""
         arm, guarded, h = self.arm, self.guarded, self.arm.period
         guarded.begin(here.q, self.aim(0))
+        self.here = here
         self.first = sample = arm.start()
-        row, stop, overrun, left = 0, False, False, round(BRAKING / h)
-        while row < self.steps and left > 0 and len(self.rows) <= self.steps:
+        row, overrun, left = 0, False, self.braking
+        while left > 0 and ((row < self.steps and len(self.rows) <= self.steps) or guarded.report is not None):
             begun = time.perf_counter()
             aim = self.aim(row)
-            tau = guarded.step(sample, aim, overrun=overrun, stop=stop)
+            tau = guarded.step(sample, aim, overrun=overrun, stop=self.asked)
             arm.write(tau)
             self.work[len(self.rows)] = spent = time.perf_counter() - begun
-            self.rows.append((row, sample, tau))
+            self.rows.append((row, guarded.seen))
             overrun = spent > h
             if guarded.report is not None:
                 left = 0 if sample.fault else left - 1  # an arm with a fault takes no torque
-            stop = self.watched(Live(sample, aim, tau, guarded.mode, guarded.counters)) or stop
+            self.show(Live(sample, aim, tau, guarded.mode, guarded.counters))
             try:
                 sample = arm.read()
-            except KeyboardInterrupt:
-                stop, sample = True, sample._replace(fresh=False)
             except Exception as error:  # a plant may raise anything: nothing more is sent to it
                 sample = sample._replace(fresh=False, fault=f"{type(error).__name__}: {error}")
-            passed = round((sample.t - self.first.t) / h) - row if sample.fresh else 1
+            passed = self.passed(sample, row)
             self.missed += max(passed - 1, 0)
-            row += max(passed, 0 if sample.fresh else 1)
+            row += passed
 
-    def watched(self, seen: Live) -> bool:
-        """Show an instant to the watcher; whether the arm is to stop for what it raises, which ends its watch."""
+    def passed(self, sample: Sample, row: int) -> int:
+        """Periods to the next sample: by the arm's clock where it can be; else one, and the guard judges the clock."""
+        if not sample.fresh:
+            return 1
+        since = (sample.t - self.first.t) / self.arm.period - row
+        return round(since) if -0.5 <= since <= self.guarded.guard.patience else 1
+
+    def show(self, seen: Live) -> None:
+        """Show an instant to the watcher; what it raises ends its watch and asks for a stop."""
         try:
             if self.watch is not None:
                 self.watch(seen)
-        except KeyboardInterrupt:
-            return True
         except Exception as error:  # a watcher may raise anything: the arm is braked, and the run says why
-            self.watch, self.trouble = None, f"{type(error).__name__}: {error}"
-            return True
-        return False
+            self.watch, self.trouble, self.asked = None, f"{type(error).__name__}: {error}", True
 
     def driven(self, robot: Robot, law: str, granted: bool) -> Driven:
         """What was recorded, on the raster of the periods."""
-        rows = {row: (sample, tau) for row, sample, tau in self.rows if sample.fresh}
+        rows = {row: seen for row, seen in self.rows if row <= self.steps and _tells(seen.sample)}
+        rows.setdefault(0, self.rows[0][1]._replace(sample=self.here))
         at = np.array(sorted(rows))
-        lift = self.guarded.gravity(np.array([rows[k][0].q for k in at.tolist()])) if self.arm.compensated else 0.0
-        tau = np.array([rows[k][1] for k in at.tolist()]) + lift
+        kept = [rows[k] for k in at.tolist()]
+        q, v = np.array([seen.sample.q for seen in kept]), np.array([seen.sample.v for seen in kept])
+        lift = self.guarded.gravity(q) if self.arm.compensated else 0.0
+        tau = np.array([seen.tau for seen in kept]) + lift
         desired = Reference(*(x[at] for x in self.desired))
         run = Run(
             t=self.arm.period * at,
-            q=np.array([rows[k][0].q for k in at.tolist()]),
-            v=np.array([rows[k][0].v for k in at.tolist()]),
+            q=q,
+            v=v,
             tau=tau,
             tau_command=tau,
             disturbance=np.zeros_like(tau),
@@ -249,6 +281,20 @@ class _Loop:
         )
         times = Times(self.arm.period, self.work[: len(self.rows)], self.missed, granted)
         return Driven(run, self.guarded.report, self.guarded.mode, self.guarded.counters, times)
+
+
+@contextlib.contextmanager
+def _interrupts(ask: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C asks, in place of an exception anywhere in a period, which would leave the arm with its last torque."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is None or threading.current_thread() is not threading.main_thread():
+        yield  # signals come to the main thread alone, and a handler that is not Python's could not be restored
+        return
+    signal.signal(signal.SIGINT, lambda number, frame: ask())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

@@ -36,10 +36,16 @@ class FrankaArm:
     Raises:
         MissingExtra: If pylibfranka is not installed.
         ArgumentError: If nothing answers at the address.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> nbs.FrankaArm.period, nbs.FrankaArm.torque_rate  # s, N·m/s
+        (0.001, 1000.0)
     """
 
     period = 0.001
     compensated = True
+    torque_rate = 1000.0
     nv = _JOINTS
 
     @checked(host=text, real_time=flag, recover=flag)

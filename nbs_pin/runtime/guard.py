@@ -23,10 +23,8 @@ from nbs_pin.robots.robot import ARM, Robot
 
 PATIENCE = 20
 """Missed or bad samples in a row at which the guard stops."""
-TORQUE_RATES = {"panda": 1000.0, "fr3": 1000.0}
-"""Largest |Δτ|/period that the maker states [N·m/s], by arm."""
 FULL_EFFORT_IN = 0.025
-"""Time from no torque to the effort limit where no maker states a rate [s], at 1000 N·m/s or more."""
+"""Time from no torque to the effort limit where no torque rate is given [s], at 1000 N·m/s or more."""
 ERROR, SLIDE = 0.5, 0.1
 """Default errors beyond which a loop counts as diverged [rad, m]."""
 RESOLUTION, SLIDE_RESOLUTION = 2.0 * np.pi * 2.0**-11, 1e-4
@@ -142,7 +140,7 @@ class Guard:
         >>> import nbs_pin as nbs
         >>> guard = nbs.Guard.for_robot(nbs.load_robot("panda"))
         >>> guard.effort_limit[0], guard.torque_rate[0], guard.error_limit[0]
-        (np.float64(87.0), np.float64(1000.0), np.float64(0.5))
+        (np.float64(87.0), np.float64(3480.0), np.float64(0.5))
     """
 
     period: float
@@ -218,11 +216,11 @@ class Guard:
     ) -> "Guard":
         """The guard of an arm: its limits, and the certificate's bounds of each |z1| in place of 0.5 rad (0.1 m).
 
-        Without a torque rate it takes the maker's (`TORQUE_RATES`), or one that reaches the effort limit in 25 ms.
+        Without a torque rate the effort limit is reached in 25 ms, at 1000 N·m/s or more; a driver may state what its
+        arm takes, such as `FrankaArm.torque_rate`.
         """
         if torque_rate is None:
-            reached = np.maximum(1000.0, robot.effort_limit / FULL_EFFORT_IN)
-            torque_rate = TORQUE_RATES.get(robot.name, reached)
+            torque_rate = np.maximum(1000.0, robot.effort_limit / FULL_EFFORT_IN)
         gains = gains_for_robot(robot, PinocchioDynamics(robot), bandwidth=BRAKE, period=max(period, 0.005))
         error = np.where(robot.prismatic, SLIDE, ERROR) if certificate is None else certificate.joint_errors
         return cls(

@@ -17,7 +17,6 @@ from nbs_pin.base.records import Reference
 from nbs_pin.controllers.controller import CONTROLLER, Controller, MemorylessController
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.kernels import guarding as at
-from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.runtime.guard import Counters, Fault, Guard, Mode
 
@@ -155,16 +154,30 @@ class Guarded:
         self.robot, self.lead = robot, 0.5 * self.guard.period if lookahead is None else lookahead
         self._model, self._using = PinocchioDynamics(robot), threading.Lock()
         self._unknown, self._nothing = np.full(robot.nv, np.nan), np.zeros(robot.nv)
+        self._config = self.guard.config.copy()
+        self._config[at.LEAD] = self.lead
         self._every = max(1, round(PROBE / self.guard.period))
+        # An integral may carry an arm in place of a model, but not where G(q) is subtracted from its torque.
+        self._probed = self.guard.compensated or isinstance(self.law, MemorylessController)
         self._state: np.ndarray | None = None
         self.report: FaultReport | None = None
         """Why it stopped; None while it has not."""
 
     def begin(self, q: Any, aim: Reference) -> None:
-        """Begin, or begin again, with an arm that is held at q [rad]; a stop is left in this way only."""
+        """Begin, or begin again, with an arm that is held at q [rad]; a stop is left in this way only.
+
+        Raises:
+            ArgumentError: For a law that has no gravity in it, such as PID, on an arm that adds gravity by itself.
+        """
         n = self.robot.nv
         at_rest, wanted = vector_of("q", q, n, "rad"), vector_of("aim.q", aim.q, n, "rad")
-        self._state = self.guard.begin(at_rest, wanted, self._model.gravity(at_rest))
+        if self.guard.compensated and not self._holds(at_rest):
+            raise ArgumentError(
+                "the law does not give G(q) at rest, which is subtracted for an arm that adds gravity by itself; give a"
+                " law with a model, such as NeuralBackstepping (in the shell nbs)."
+            )
+        now = wanted - self.lead * vector_of("aim.v", aim.v, n, "rad/s")  # the aim is that of a moment later
+        self._state = self.guard.begin(at_rest, now, self._model.gravity(at_rest))
         self._memory, self._count, self.report = self.law.initial_memory(at_rest), 0, None
         self._seen: deque[Seen] = deque(maxlen=LAST)
 
@@ -184,6 +197,11 @@ class Guarded:
     def tau(self) -> JointArray:
         """The torque that was sent last [N·m]; before the first, the one that holds the arm."""
         return self.guard.vector(self.state, at.TAU).copy()
+
+    @property
+    def seen(self) -> Seen:
+        """What came in last, as numbers, and what was sent for it."""
+        return self._seen[-1]
 
     def gravity(self, q: JointArray) -> JointArray:
         """G(q) by the guard's model [N·m]."""
@@ -214,22 +232,19 @@ class Guarded:
             self._using.release()
 
     def _step(self, sample: Sample, aim: Reference, overrun: bool, stop: bool) -> JointArray:
-        state, config, told = self.state, self.guard.config, sample.external
-        external = self._nothing if told is None else told
+        state, config = self.state, self._config
+        sample, aim = self._numbers(sample), Reference(*map(self._vector, aim))
+        external = self._nothing if sample.external is None else sample.external
         fault, trace = Fault.ARM if sample.fault else Fault.REQUESTED if stop else Fault.NONE, ""
-        seen: tuple[Any, ...] = sample.q, sample.v, aim.q, aim.v, external
-        try:
-            action = at.admit(config, state, sample.t, sample.fresh, overrun, *seen)
-        except NOT_TAKEN:  # not all contiguous float64 vectors
-            seen = tuple(np.ascontiguousarray(x, dtype=float).ravel() for x in seen)
-            action = at.admit(config, state, float(sample.t), bool(sample.fresh), overrun, *seen)
+        seen = sample.q, sample.v, aim.q, aim.v, external
+        action = at.admit(config, state, sample.t, sample.fresh, bool(overrun), *seen)
         command, gravity = self._unknown, self._unknown
         if action == at.COMPUTE and fault is Fault.NONE:
             try:
                 command = self._command(sample, aim)
-                self._count += 1
-                if self._count % self._every == 1 and not self._holds(aim.q):
+                if self._probed and self._count % self._every == 0 and not self._holds(aim.q):
                     fault = Fault.MODEL
+                self._count += 1
             except Exception:  # a law may raise anything; its arm is stopped, and the report has the traceback
                 fault, trace = Fault.LAW, traceback.format_exc()
         if self.guard.compensated or fault is not Fault.NONE or action >= at.BRAKE:
@@ -241,23 +256,46 @@ class Guarded:
             self.report = self._reported(sample, trace)
         return tau
 
+    def _numbers(self, sample: Sample) -> Sample:
+        """A sample of its own, as the kernel takes it."""
+        t, external = _floats(sample.t), None if sample.external is None else self._vector(sample.external)
+        return Sample(
+            float(t) if t.ndim == 0 else np.nan,
+            self._vector(sample.q),
+            self._vector(sample.v),
+            bool(sample.fresh),
+            external,
+            sample.fault,
+        )
+
+    def _vector(self, x: Any) -> JointArray:
+        """A vector of its own; what is none of n numbers counts as not finite, which the guard judges."""
+        vector = _floats(x)
+        return vector if vector.shape == self._unknown.shape else self._unknown
+
     def _command(self, sample: Sample, aim: Reference) -> JointArray:
         lead, dv = self.lead, self.lead * aim.a
         q, v = sample.q + lead * (sample.v + 0.5 * dv), sample.v + dv
         command, self._memory = self.law.step(self._memory, q, v, aim, self.guard.period)
-        return np.ascontiguousarray(command, dtype=float)
+        return self._vector(command)
 
     def _holds(self, q: JointArray) -> bool:
-        """Whether the law, at rest where it wants to be, carries the arm; a law with memory is not asked."""
-        if not isinstance(self.law, MemorylessController):
-            return True
-        gravity = self._model.gravity(q)
-        off = self.law.torque(q, self._nothing, q, self._nothing, self._nothing) - gravity
+        """Whether the law, at rest where it wants to be, carries the arm."""
+        gravity, still = self._model.gravity(q), Reference(q, self._nothing, self._nothing)
+        torque, _ = self.law.step(self.law.initial_memory(q), q, self._nothing, still, self.guard.period)
         tolerance = np.maximum(_OF_GRAVITY * np.abs(gravity).max(), _OF_EFFORT * self.guard.effort_limit)
-        return bool((np.abs(off) <= tolerance).all())
+        return bool((np.abs(torque - gravity) <= tolerance).all())
 
     def _reported(self, sample: Sample, trace: str) -> FaultReport:
         code = Fault(int(self.state[at.CODE]))
         told = sample.fault if code is Fault.ARM else trace.strip().rsplit("\n", 1)[-1]
         message = f"{code.sentence}{f' ({told})' if told else ''}"
         return FaultReport(code, float(self.state[at.AT]), message, trace, self.counters, tuple(self._seen))
+
+
+def _floats(x: Any) -> np.ndarray:
+    """A copy as an array of numbers; NaN for what is none, such as text or a list of lists of several lengths."""
+    try:
+        return np.array(x, dtype=float)
+    except (TypeError, ValueError):
+        return np.array(np.nan)

@@ -1,7 +1,8 @@
 """A Universal Robots arm by the torque mode of ur_rtde, at 500 Hz.
 
 Not tested on hardware: the tests run it against a double with the signatures of ur_rtde 1.6. The controller adds
-gravity and a share of the joint friction.
+gravity. The compensation of joint friction that it offers is switched off, so that a law that feeds friction forward is
+not added to one that does too; without either, friction is an error of the law's (docs/runtime.md, F3).
 """
 
 import importlib
@@ -16,7 +17,7 @@ from nbs_pin.runtime.guarded import Sample
 
 _JOINTS = 6
 _FREQUENCY = 500.0
-_FRICTION = [0.0] * _JOINTS  # the shares that the controller compensates: none, as the law feeds its own forward
+_FRICTION = [0.0] * _JOINTS  # the shares of viscous and Coulomb friction that the controller compensates
 
 
 def clients() -> tuple[Any, Any]:
@@ -40,6 +41,7 @@ class URArm:
 
     period = 1.0 / _FREQUENCY
     compensated = True
+    torque_rate = None
     nv = _JOINTS
 
     @checked(host=text)
@@ -56,12 +58,18 @@ class URArm:
 
     def look(self) -> Sample:
         """Where the arm is."""
-        return self._sample()
+        try:
+            return self._sample()
+        except Exception as error:  # as above
+            raise ArgumentError(f"the arm tells no state ({error}); check the connection.") from error
 
     def start(self) -> Sample:
         """Begin the first period."""
-        self._fault, self._tick = "", self._control.initPeriod()
-        self._last = self._sample()
+        try:
+            self._fault, self._tick = "", self._control.initPeriod()
+            self._last = self._sample()
+        except Exception as error:  # as above
+            raise ArgumentError(f"the arm does not take control ({error}); set it to remote control.") from error
         return self._last
 
     def read(self) -> Sample:
