@@ -13,11 +13,11 @@ from nbs_pin.base.exceptions import FileFormatError
 from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.certificates.tip_bound import tip_bound
 from nbs_pin.cli.shell import parse
-from nbs_pin.commands.track import figures as tracking_figures
 from nbs_pin.reports.report import report
 from nbs_pin.reports.scene import positions
 from nbs_pin.reports.verdicts import BAD, GOOD, verdict_of
 from nbs_pin.robots.visuals import tips
+from nbs_pin.simulation.run_figures import figures as tracking_figures
 from tests.browser import Browser, find_chromium
 from tests.test_replay import moving_run
 
@@ -101,14 +101,17 @@ def test_verdicts_follow_the_figures():
     better = nbs.Run(**{**vars(run), "q": run.q_ref})
     assert verdict_of(tracking_figures(better)).level == GOOD
     bounds = {"void": [], "units": ["rad"], "error_rad": 0.1, "joint_errors_rad": [0.1], "joints": ["a"]}
-    bounds |= {"label": "PROVED", "disturbance": "‖τ_d‖ ≤ 1 N·m"}
-    found = {"certificate": bounds, "attack": None, "monitor": None, "tip_error_m": 0.2}
+    bounds |= {"label": "PROVED", "disturbance": "‖τ_d‖ ≤ 1 N·m", "joint_overshoots_rad": None}
+    bounds |= {"clock": "continuous time", "unproved_hold": ""}
+    found = {"arm": "a", "certificate": bounds, "attack": None, "monitor": None, "tip_error_m": 0.2}
     said = verdict_of(found)
     assert said.level == GOOD
     assert "0.1 rad (5.73°)" in said.text
     assert "0.2 m (200 mm)" in said.text
     assert verdict_of(found | {"certificate": bounds | {"void": ["ρ > 0"]}}).level == BAD
-    assert verdict_of(found | {"attack": {"error_rad": 0.2, "exceeds": True}}).level == BAD
+    attack = {"error_rad": 0.2, "exceeds": True, "found_by": "waves", "duration_s": 1.0, "period_s": 1e-3}
+    attack |= {"thorough": True, "verdict": "not kept"}
+    assert verdict_of(found | {"attack": attack}).level == BAD
 
 
 @pytest.mark.parametrize("name", ["two_link", "panda", "gantry.urdf"])

@@ -128,12 +128,5 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)
-    plural = "trajectory" if figures["trajectories"] == 1 else "trajectories"
-    limited = max(figures["at_torque_limit_fraction"])
-    tell(
-        console,
-        f"{figures['samples']} samples of {figures['trajectories']} {plural} of {title}",
-        [f"at a torque limit in at most {limited:.1%} of the samples of a joint"],
-        [shown],
-        verbose=verbose,
-    )
+    verdict = verdict_of(figures)
+    tell(console, f"{title}: {verdict.said}", verdict.more, [shown], verbose=verbose)

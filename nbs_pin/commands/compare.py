@@ -307,12 +307,9 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
         values = (figures["relative_error"], *([] if along is None else [along]))
         shown.add_row(name, *(_number(of[key]) for of in values))
     low, high = figures["mass_ratio"]
-    error = figures["relative_error"]
-    verdict = (
-        f"{title}: its torques are off by {_percent(error['inverse'])} of the true ones "
-        f"(M {_percent(error['mass_matrix'])}, C v {_percent(error['coriolis'])}, G {_percent(error['gravity'])})"
-    )
+    verdict = verdict_of(figures)
     lines = (
+        *verdict.more,
         f"torque nMSE {_number(figures['torque_nmse'])}; least eigenvalue of the model's M "
         f"{_number(figures['eigenvalue_margin_kgm2'])} kg·m²; {_number(low)} M ≤ model's M ≤ {_number(high)} M",
         f"torque × {figures['scale_factor']:.6g} fits best, with a relative error of {_number(figures['scale_error'])}",
@@ -320,11 +317,7 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
         f"(integrator alone {_number(figures['energy_drift_floor'])})",
         *_mismatch_lines(figures),
     )
-    tell(console, verdict, lines, [shown], verbose=verbose)
-
-
-def _percent(share: float | None) -> str:
-    return "not finite" if share is None else f"{100.0 * share:.2g} %"
+    tell(console, f"{title}: {verdict.said}", lines, [shown], verbose=verbose)
 
 
 def _mismatch_lines(figures: dict[str, Any]) -> list[str]:

@@ -206,19 +206,8 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)
-    tell(console, _verdict(title, figures), _lines(figures), [shown], verbose=verbose)
-
-
-def _verdict(title: str, figures: dict[str, Any]) -> str:
-    """The joint with the largest torque error, beside how much its torque varies."""
-    held_out = figures["rms_test_torque_error_Nm"]
-    errors, where = (figures["rms_torque_error_Nm"], "the data") if held_out is None else (held_out, "held-out data")
-    worst = max(range(len(errors)), key=lambda i: errors[i] / max(figures["torque_deviation_Nm"][i], 1e-300))
-    joint, unit = figures["joints"][worst], figures["units"]["torque"][worst]
-    return (
-        f"{title}: on {where} the torque of {joint}, the worst joint, is off by {errors[worst]:.3g} {unit} RMS, where "
-        f"it varies by {figures['torque_deviation_Nm'][worst]:.3g} {unit}"
-    )
+    verdict = verdict_of(figures)
+    tell(console, f"{title}: {verdict.said}", [*verdict.more, *_lines(figures)], [shown], verbose=verbose)
 
 
 def _lines(figures: dict[str, Any]) -> list[str]:

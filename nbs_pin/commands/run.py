@@ -31,7 +31,7 @@ from nbs_pin.runtime.drive import Driven, Live, drive
 from nbs_pin.runtime.franka_arm import FrankaArm
 from nbs_pin.runtime.guard import Guard
 from nbs_pin.runtime.ur_arm import URArm
-from nbs_pin.simulation import metrics
+from nbs_pin.simulation import metrics, run_figures
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 
 FILES = ("run.npz", "tracking.png", "replay.html", SUMMARY)
@@ -56,7 +56,7 @@ def run(options: Run, console: Console, notes: Console) -> int:
         guard = Guard.for_robot(robot, period, compensated=arm.compensated, certificate=_bound(options, law, robot))
     with results.made() as folder, _watching(options, robot, notes) as latest:
         driven = drive(arm, law, robot, motion, duration, guard=guard, watch=latest.append, priority=options.priority)
-        found = figures(driven)
+        found = figures(driven, robot)
         with results.replaced(FILES, found) as draft:
             driven.run.save(draft / FILES[0])
     with drawing(folder / FILES[1]) as path:
@@ -79,11 +79,11 @@ def arm_at(text: str, robot: Robot, motion: DesiredMotion, period: float) -> Arm
     return arm
 
 
-def figures(driven: Driven) -> dict[str, Any]:
+def figures(driven: Driven, robot: Robot) -> dict[str, Any]:
     """What a run on an arm came to, as JSON stores it."""
     work = 1e6 * driven.times.work
     report = driven.report
-    values = metrics.summary(driven.run) if len(driven.run.t) > 2 else {}
+    values = run_figures.figures(driven.run, robot) if len(driven.run.t) > 2 else {}
     return values | {
         "stopped": None if report is None else {"code": report.code.name, "time_s": report.time, "why": report.message},
         **driven.counters._asdict(),

@@ -11,10 +11,12 @@ from rich.text import Text
 from nbs_pin.base.units import measured, several
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import SAVED, OptionError
-from nbs_pin.commands.following import Tracked, figures, not_simulated, track
+from nbs_pin.commands.following import Tracked, not_simulated, track
 from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table, tell
 from nbs_pin.reports.law_charts import plot_laws
+from nbs_pin.reports.verdicts import largest_late_errors, verdict_of
 from nbs_pin.robots.robot import Robot
+from nbs_pin.simulation.run_figures import figures
 
 PICTURE = "comparison.png"
 
@@ -52,7 +54,8 @@ def track_laws(
                 plot_laws({name: tracked.run for name, tracked in done.items()}, path, title=title)
     shown = [_table(found["laws"])]
     left_out = [f"not simulated: {'; '.join(found['not_simulated'])}"] if found["not_simulated"] else []
-    tell(console, _verdict(robot.name, found["laws"]), left_out, shown, verbose=True)
+    verdict = verdict_of(found)
+    tell(console, f"{robot.name}: {verdict.said}", [*verdict.more, *left_out], shown, verbose=True)
     results.show(console, (*files.values(), PICTURE, SUMMARY), "replay", folder / files[next(iter(done))], "--open")
     if interrupted:
         raise KeyboardInterrupt
@@ -64,24 +67,6 @@ def _named(text: str) -> dict[str, str]:
     if len(laws) < len(text.split(",")):
         raise OptionError(f"--controller is '{text}', where two laws have one name; rename a file.")
     return laws
-
-
-def _late(found: Mapping[str, Any]) -> tuple[float, str, str]:
-    """The largest RMS error of a joint in the last 30 %, with its unit, and the joint."""
-    of = zip(found["rms_error_last_30_percent_rad"], found["units"]["position"], found["joints"], strict=True)
-    return max(of)
-
-
-def _verdict(arm: str, found: Mapping[str, Mapping[str, Any]]) -> str:
-    """Which law is off the least in the end, beside the others that follow the motion."""
-    following = [name for name, of in found.items() if of["convergence_time_s"] is not None]
-    if not following:
-        return f"{arm}: none of {', '.join(found)} follows the motion"
-    least, *others = sorted(following, key=lambda name: _late(found[name]))
-    told = (
-        f"{arm}: {least} is off the least, {measured(*_late(found[least])[:2])} RMS in the last 30 % at its worst joint"
-    )
-    return "; ".join([told, *(f"{name} {measured(*_late(found[name])[:2])}" for name in others)])
 
 
 def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -96,8 +81,8 @@ def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
         first="law",
     )
     for name, of in found.items():
-        error, unit, _ = _late(of)
+        late = " and ".join(measured(error, unit) for error, unit, _ in largest_late_errors(of))
         near = "never" if of["convergence_time_s"] is None else f"{of['convergence_time_s']:.3f} s"
-        cells = near, measured(error, unit), f"{of['peak_torque_Nm']:.4g}", f"{of['saturated_fraction']:.2%}"
+        cells = near, late, f"{of['peak_torque_Nm']:.4g}", f"{of['saturated_fraction']:.2%}"
         shown.add_row(Text(name), *cells)
     return shown

@@ -181,22 +181,15 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     )
     shown.add_row(Text("some joint at its limit"), *(_number(on["saturated_fraction"], ".2%") for on in both))
     ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
-    before, after = (_seconds(on["convergence_time_median_s"]) for on in both)
-    verdict = (
-        f"{title}: held-out cost lowered by {_number(figures['held_out_cost_lowered_by'], '.1%')}; half of the fresh "
-        f"starts have converged after {after}, {before} before training"
-    )
+    verdict = verdict_of(figures)
     lines = (
+        *verdict.more,
         f"converged means ‖error‖ < 0.1 {figures['units']['position']} to the end, "
         f"over {figures['fresh_starts']} fresh starts",
         f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
         f"the best after {figures['best_epoch']}",
     )
-    tell(console, verdict, lines, [shown], verbose=verbose)
-
-
-def _seconds(time: float | None) -> str:
-    return "no time" if time is None else f"{time:.3f} s"
+    tell(console, f"{title}: {verdict.said}", lines, [shown], verbose=verbose)
 
 
 def _number(value: float | None, form: str) -> str:

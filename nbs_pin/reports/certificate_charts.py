@@ -29,7 +29,7 @@ from nbs_pin.reports.plotting import (
     stretches,
     thin,
 )  # fmt: skip
-from nbs_pin.reports.verdicts import BAD, GOOD, WARNING, Verdict
+from nbs_pin.reports.verdicts import BAD, Verdict, monitor_level
 from nbs_pin.robots.robot import configuration_difference
 
 _DASHED, _DOTTED = (0, (5, 3)), (0, (1, 2))
@@ -58,9 +58,9 @@ def plot_monitor(
     its terms; and when each assumption failed. Saturated stretches are shaded, exceeded bounds are marked. units: of
     every joint's error; title and settings: above it, with the verdict.
     """
-    rows, verdict = max(len(monitored.failures), 1), monitored.verdict
-    level = BAD if not monitored.is_kept else WARNING if monitored.broken else GOOD
-    heading = Heading(title, settings, Verdict(level, f"{verdict[0].upper()}{verdict[1:]}."))
+    rows = max(len(monitored.failures), 1)
+    level = monitor_level(is_kept=monitored.is_kept, broken=monitored.broken)
+    heading = Heading(title, settings, Verdict(level, monitored.verdict))
     with picture(path, 11.0, 8.6 + 0.34 * rows, heading=heading) as figure:
         heights = [2.6, 1.8, 3.0, 0.35 + 0.34 * rows]
         storage, error, terms, flags = figure.subplots(4, 1, sharex=True, height_ratios=heights)
@@ -89,7 +89,7 @@ def plot_certificate(
     settings and a verdict may stand below it.
     """
     if certificate.void:
-        verdict = Verdict(BAD, f"The bounds are void, as these conditions fail: {'; '.join(certificate.void)}.")
+        verdict = Verdict(BAD, f"the bounds are void, as these conditions fail: {'; '.join(certificate.void)}")
     arm = "" if certificate.robot is None else f"{certificate.robot.name}, "
     heading = Heading(f"{arm}{certificate.disturbance}: {certificate.label}", settings, verdict)
     size = (6.4, 4.6) if attack is None else (11.0, 5.0)

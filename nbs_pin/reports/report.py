@@ -54,7 +54,7 @@ class _Result:
 
     @property
     def verdict(self) -> Verdict:
-        return verdict_of(self.figures)
+        return verdict_of(self.figures, interrupted=self.summary.get("interrupted") is True)
 
 
 def report(folders: Sequence[Path], path: Path) -> Path:
@@ -128,12 +128,11 @@ def _arm(result: _Result) -> str:
 
 
 def _card(result: _Result) -> str:
-    level, text = result.verdict
     facts = [law_in_words(result.run), *settings_in_words(result.run)] if result.run is not None else []
     said = html.escape(" · ".join(facts))
     name = html.escape(result.label)
-    lines = f'<h2>{name}</h2><p>{html.escape(text)}</p><p class="soft">{said}</p>'
-    return f'<section class="card {level}">{lines}</section>'
+    lines = f'<h2>{name}</h2><p>{html.escape(result.verdict.text)}</p><p class="soft">{said}</p>'
+    return f'<section class="card {result.verdict.level}">{lines}</section>'
 
 
 def _comparison(results: Sequence[_Result]) -> str:
