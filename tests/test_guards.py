@@ -50,7 +50,7 @@ def test_what_the_arm_cannot_do_is_refused_unless_asked_for(ur5, law, fault):
         assert np.abs(simulated(robot, law, check=False).tau).max() <= 1.0
 
 
-def test_a_law_of_another_arm_is_refused(ur5, law):
+def test_a_law_of_another_arm_is_refused(ur5, law, tmp_path):
     """Another arm is a mistake; another mass, load or friction is what a law may not know."""
     for other, said in (
         ("ur10", "joint 'shoulder_lift_joint' is of another"),
@@ -60,6 +60,10 @@ def test_a_law_of_another_arm_is_refused(ur5, law):
         wrong = nbs.PD.for_robot(nbs.load_robot(other, **lock))
         with pytest.raises(nbs.ArgumentError, match=f"the law is for {other} and the plant is ur5: {said}"):
             simulated(ur5, wrong)
+    turned = nbs.load_robot("two_link").urdf.path.read_text().replace('xyz="0 -1 0"', 'xyz="0 1 0"', 1)
+    (tmp_path / "two_link.urdf").write_text(turned)
+    with pytest.raises(nbs.ArgumentError, match="joint 'joint1' is of another"):
+        simulated(nbs.load_robot("two_link"), nbs.PD.for_robot(nbs.load_robot(tmp_path / "two_link.urdf")))
     simulated(ur5.with_payload("tool0", 2.0).with_armature(0.1).with_friction(0.5), law)
     simulated(nbs.load_robot("ur5", base_rpy=[0.5, 0.0, 1.0], base_xyz=[0.0, 0.0, 1.0]), law)
     simulated(ur5, law.compile())

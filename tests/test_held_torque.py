@@ -404,6 +404,26 @@ def test_no_state_of_the_bounds_is_further_from_a_reference_than_the_margins(nam
     np.testing.assert_array_equal(faster.velocity, margins.velocity)
 
 
+def test_margins_are_refused_where_the_bounds_are_not_those_of_every_reference():
+    robot = nbs.load_robot("two_link")
+    law, still, box = nbs.NeuralBackstepping.for_robot(robot), nbs.Hold([0.0, 0.0]), np.full(2, 1.0)
+    sticky = nbs.JointFriction(viscous=[3.0, 3.0], coulomb=[0.0, 0.0])
+    slow = nbs.certify(law, box, friction=sticky, reference=still)
+    heavier = nbs.certify(law, box, robot=robot.with_payload("tip", 3.0))
+    for certificate, said in (
+        (slow, "viscous friction of joint 'joint1' for a slower reference"),
+        (nbs.certify(law, box, reference=still, period=2.5e-4), "with held torques are those of one reference"),
+        (heavier, "the model differs from the arm"),
+        (nbs.certify(law, np.zeros(2)), "allows no disturbance"),
+    ):
+        with pytest.raises(nbs.ArgumentError, match=said):
+            nbs.certified_margins(certificate, acceleration=2.0, velocity=2.0)
+    fast = nbs.certify(law, box, friction=sticky)
+    margins = nbs.certified_margins(fast, acceleration=2.0, velocity=2.0)
+    plain = nbs.certified_margins(nbs.certify(law, box), acceleration=2.0, velocity=2.0)
+    assert (margins.effort > plain.effort).all()
+
+
 def test_a_path_with_certified_margins_leaves_the_arm_within_its_limits():
     """A tool path in the least time, followed under torques at the edge of the box: no limit is reached."""
     robot = nbs.load_robot("two_link").with_effort_limit([60.0, 40.0])
@@ -415,6 +435,8 @@ def test_a_path_with_certified_margins_leaves_the_arm_within_its_limits():
     with pytest.raises(nbs.ArgumentError, match="are left for the motion"):
         nbs.tool_motion(robot.with_effort_limit(30.0), path, "tip", margins=margins, **options)
     motion = nbs.tool_motion(robot, path, "tip", margins=margins, **options)
+    sampled = motion(np.linspace(0.0, motion.duration, 2001))
+    assert np.abs(sampled.v).max() <= 1.5
     plant, steps = nbs.DynamicsPlant(nbs.PinocchioDynamics(robot)), np.ceil(motion.duration / 2.5e-4)
     for push in (box, -box):
         wave = nbs.SquareWave(push, frequency=9.0)

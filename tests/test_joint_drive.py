@@ -187,6 +187,12 @@ def test_what_is_given_by_name_is_added_to_the_file_and_one_number_takes_its_pla
     np.testing.assert_array_equal(one.armature, [0.5, 0.5])
     assert sum(body.mass for body in one.model.inertias) == pytest.approx(4.0)
     assert nbs.load_robot(one.source, **one.options).sha256 == one.sha256
+    every = nbs.load_robot(file, armature={"*": 1.0, "j2": 2.0}, limits={"*": {"effort": 50.0}})
+    np.testing.assert_array_equal(every.armature, [1.0, 2.0])
+    np.testing.assert_array_equal(every.effort_limit, [50.0, 50.0])
+    again = nbs.load_robot(every.source, **every.options)
+    assert again.sha256 == every.sha256
+    np.testing.assert_array_equal(again.effort_limit, every.effort_limit)
     file.write_text('description = "panda"\nlock = ["panda_joint7"]\n')  # beside the fingers, which panda locks
     assert nbs.load_robot(file).joint_names == nbs.load_robot("panda").joint_names[:6]
 

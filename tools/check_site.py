@@ -1,5 +1,6 @@
 """Checks that a built site loads nothing from elsewhere and has no dead link: python tools/check_site.py FOLDER."""
 
+import re
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -36,7 +37,7 @@ def faults(site: Path) -> list[str]:
     found = [f"{site} has no page"] if not pages else []
     for path, page in pages.items():
         where = path.relative_to(site)
-        found += [f"{where} loads {target}" for target in page.loads if urlsplit(target).scheme in ("http", "https")]
+        found += [f"{where} loads {target}" for target in page.loads if urlsplit(target).netloc]
         for target in {*page.loads, *page.links}:
             parts = urlsplit(target)
             if parts.scheme or parts.netloc:
@@ -50,7 +51,7 @@ def faults(site: Path) -> list[str]:
             elif parts.fragment and file in pages and unquote(parts.fragment) not in pages[file].anchors:
                 found.append(f"{where} links to {target}, which has no such anchor")
     for sheet in site.rglob("*.css"):
-        if "url(http" in sheet.read_text() or "@import" in sheet.read_text():
+        if re.search(r"url\(\s*['\"]?(?:https?:)?//", sheet.read_text()) or "@import" in sheet.read_text():
             found.append(f"{sheet.relative_to(site)} loads from another machine")
     return found
 

@@ -37,11 +37,13 @@ def certified_margins(certificate: Certificate, acceleration: Any, velocity: Any
         velocity: Largest |v_d| [rad/s]; None takes the velocity limits of the arm.
 
     Returns:
-        Margins for `tool_motion`; an effort margin is inf where nothing bounds the torque.
+        Margins for `tool_motion`. That the motion is no faster than `velocity` and `acceleration` say is for the caller
+        to see to: `fastest` takes the same acceleration, and limits of the arm bound the velocity.
 
     Raises:
-        ArgumentError: If the certificate is of another kind of loop, or the arm states no velocity limit and none is
-            given.
+        ArgumentError: If the bounds of the certificate are not those of every such reference (a model that is not the
+            arm's, held torques, viscous friction counted for a slower one), nothing bounds a joint, or the arm states
+            no velocity limit and none is given.
 
     Example:
         >>> import nbs_pin as nbs
@@ -51,26 +53,45 @@ def certified_margins(certificate: Certificate, acceleration: Any, velocity: Any
         True
     """
     robot, law, constants = certificate.robot, certificate.controller, certificate.constants
-    why_not = why_no_arm_bounds(law, robot)
-    if certificate.bodies is not None or certificate.mismatch is not None:
-        why_not = "not where the model differs from the arm"
+    why_not = why_no_arm_bounds(law, robot) or _why_not(certificate)
     if why_not or robot is None:
-        raise ArgumentError(f"certified_margins bounds no torque: {why_not}; certify another law or arm.")
+        raise ArgumentError(f"certified_margins bounds no motion of the arm: {why_not}.")
     fastest = _one_each(robot, "velocity", robot.velocity_limit if velocity is None else velocity)
     if not np.isfinite(fastest).all():
         joint = robot.joint_names[int(np.argmin(np.isfinite(fastest)))]
+        raise ArgumentError(f"joint '{joint}' of {robot.name} has no velocity limit; give velocity=… too.")
+    friction = certificate.friction
+    if friction.gap.viscous.any() and (fastest > friction.speed).any():
+        joint = robot.joint_names[int(np.argmax(fastest > friction.speed))]
         raise ArgumentError(
-            f"joint '{joint}' of {robot.name} has no velocity limit; give certified_margins a velocity."
+            f"the certificate counts the viscous friction of joint '{joint}' for a slower reference than the velocity "
+            "given; certify without a reference, or give a lower velocity."
         )
     arm = CoriolisBounds.of(robot, constants)
     motion = _within(arm, constants.floor, fastest, _one_each(robot, "acceleration", acceleration))
-    begin = 0.0 if certificate.start is None else certificate.start.storage
-    level = max(begin, certificate.storage)
-    friction = certificate.comparison
-    loop = SampledLaw(law, constants, arm, motion, friction.t, friction.alpha, np.zeros(robot.nv), 0.0, 0.0)
+    level = max(certificate.storage, 0.0 if certificate.start is None else certificate.start.storage)
+    t, alpha = certificate.comparison.t, certificate.comparison.alpha
+    loop = SampledLaw(law, constants, arm, motion, t, alpha, np.zeros(robot.nv), 0.0, 0.0)
     asked = Asked(law, constants, *Curvature.with_diagonal(loop, level), level)
     position = certificate.joint_errors if certificate.overshoot is None else certificate.overshoot[1]
-    return Margins(position, speed_bound(asked, arm), torque_bound(asked, arm, motion, half=0.0))
+    effort, speed = torque_bound(asked, arm, motion, half=0.0), speed_bound(asked, arm)
+    if not np.isfinite([position, speed, effort]).all():
+        raise ArgumentError(
+            f"nothing bounds the velocities or torques of {robot.name} in every pose; lock joints that slide behind "
+            "others, or take a law with bounded stiffness (potential 'smooth')."
+        )
+    return Margins(position, speed, effort)
+
+
+def _why_not(certificate: Certificate) -> str:
+    """Why the bounds of a certificate are not those of every reference of an arm; empty if they are."""
+    if certificate.bodies is not None or certificate.mismatch is not None or certificate.model_error.lines:
+        return "the model differs from the arm; certify a law with the model of the arm"
+    if certificate.held is not None and certificate.held.is_proved:
+        return "its bounds with held torques are those of one reference; certify without a period"
+    if not certificate.storage > 0.0:
+        return "the certificate allows no disturbance; certify for one above 0"
+    return ""
 
 
 def _one_each(robot: Robot, what: str, values: JointArray) -> JointArray:

@@ -8,7 +8,7 @@ from nbs_pin.robots.visuals import tips
 
 
 def tip_bound(robot: Robot, joint_errors: Float[np.ndarray, " n"], error: float) -> float:
-    """Greatest distance of any tip from its place at the reference [m], in every configuration; inf if there is none.
+    """Greatest distance of any tip from its place at the reference [m], in every pose; inf if nothing bounds it.
 
     A joint that turns by e moves the tip along an arc of at most r|e|, where r is the greatest length of the chain
     behind the joint, and one that slides by |e|. From the reference to the arm one joint after the other moves, so
@@ -32,5 +32,6 @@ def tip_bound(robot: Robot, joint_errors: Float[np.ndarray, " n"], error: float)
             behind += float(np.linalg.norm(model.jointPlacements[joint].translation))
             joint = model.parents[joint]
         together = np.inf if slides else float(np.linalg.norm(levers)) * error
-        worst = max(worst, min(float(levers @ joint_errors), together))
+        found = min(float(levers @ joint_errors), together)
+        worst = np.inf if np.isnan(found) else max(worst, found)
     return worst

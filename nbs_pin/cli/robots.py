@@ -16,6 +16,6 @@ class Robots:
     """
 
     robot: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")] = None
-    """The arm to describe: a name, or the path of a description."""
+    """The arm to describe: a name, or the path of a description; without it, all arms are listed."""
     arm: OfArm = field(default_factory=ArmOptions)
     """How the arm is read."""

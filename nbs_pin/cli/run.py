@@ -48,7 +48,7 @@ class Run(Followed, Reported):
     live: bool = False
     """Show the arm in the browser meanwhile, on this machine only."""
     priority: bool = True
-    """Ask for a real-time priority, where the system grants it."""
+    """A real-time priority is asked for, where the system grants it, unless --no-priority is given."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), default("out/run-ROBOT")] = None
     """Folder for the results."""
     force: bool = False

@@ -62,7 +62,7 @@ _DESCRIPTION = (
     "`nbs-pin --version` prints the version, `nbs-pin --tyro-print-completion bash` (or zsh) a script for completion. "
     "Commands print their verdict first and the tables behind it with -v. "
     "Exit codes: 0 success, 2 bad input, 3 no promise from certify or verify, "
-    "4 stopped by the guard or a row of faults not passed, 130 interrupted."
+    "4 stopped by the guard or a row of faults not passed, 130 or 143 interrupted."
 )
 
 

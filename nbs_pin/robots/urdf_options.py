@@ -115,7 +115,8 @@ def layered(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
     """Arguments of `load_robot` with others over them.
 
     What is given by joint, link or name is added to what lies under it and comes before it, an empty list or dict
-    clears that, and everything else takes its place: a single number for all joints too.
+    clears that, and everything else takes its place: a single number for all joints too. What is given for every joint
+    ("*") comes before what lies under it for one.
 
     Raises:
         ArgumentError: If one that is added is of another type or out of range.
@@ -127,7 +128,11 @@ def layered(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
         convert: Callable[[Any], dict[str, Any]] = partial(_by_joint, name) if name in DRIVE else _CONVERT[name]
         lower, upper = convert(under[name]), convert(over[name])
         if name == "limits":
+            every = upper.get(ALL, {}).keys()
+            lower = {joint: {k: x for k, x in limits.items() if k not in every} for joint, limits in lower.items()}
             upper = {joint: {**lower.get(joint, {}), **limits} for joint, limits in upper.items()}
+        elif name in DRIVE and ALL in upper:
+            lower = {}
         merged[name] = {**lower, **upper} if upper else {}
     return merged
 

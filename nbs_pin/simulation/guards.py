@@ -78,13 +78,13 @@ def _check_law(controller: Controller, robot: Robot) -> None:
 def _alike(one: pin.Model, other: pin.Model, joint: int) -> bool:
     """Whether the joint is at the same place on the same link, about or along the same axis.
 
-    Of joints on the base only the kind is compared: how an arm is mounted is not part of it.
+    Of joints on the base only kind and axis are compared: how an arm is mounted is not part of it.
     """
     axes = [np.asarray(model.createData().joints[joint].S).ravel() for model in (one, other)]
     if one.parents[joint] != other.parents[joint]:
         return False
     if one.parents[joint] == 0:
-        return bool(axes[0][:3].any() == axes[1][:3].any())
+        return bool(np.abs(axes[0] - axes[1]).max() <= _TURNED)
     apart = one.jointPlacements[joint].actInv(other.jointPlacements[joint])
     turned = np.abs(axes[0] - apart.action @ axes[1]).max() > _TURNED
     return bool(np.linalg.norm(apart.translation) <= _NEAR and not turned)
