@@ -10,6 +10,7 @@ from rich.console import Console
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design
 from nbs_pin.certificates.certificate_file import is_in_its_file, write_certificate
@@ -22,7 +23,7 @@ from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import print_certificate
-from nbs_pin.commands.results import SUMMARY, Results, drawing
+from nbs_pin.commands.results import Results, drawing
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.friction import JointFriction

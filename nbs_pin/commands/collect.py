@@ -7,10 +7,11 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, column, units_of
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
+from nbs_pin.commands.results import Results, drawing, keywords, table, tell
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import torque_limits

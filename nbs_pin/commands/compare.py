@@ -16,10 +16,11 @@ from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, several, units_of
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.values import SAVED, OptionError
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
+from nbs_pin.commands.results import Results, drawing, keywords, table, tell
 from nbs_pin.controllers.gains import gains_for_robot
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping

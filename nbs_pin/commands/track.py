@@ -13,8 +13,8 @@ from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_numbers
 from nbs_pin.commands.following import not_simulated, track
 from nbs_pin.commands.inputs import arm_of
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
-from nbs_pin.commands.track_laws import track_laws
+from nbs_pin.commands.results import Results, drawing, keywords, table, tell
+from nbs_pin.commands.track_laws import FILES, PICTURE, files_in, track_laws
 from nbs_pin.motions.by_name import motion_of
 from nbs_pin.reports.plotting import plot_tracking
 from nbs_pin.reports.replay import replay
@@ -22,8 +22,6 @@ from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.run_figures import figures
 
-FILES = ("run.npz", "tracking.png", "replay.html", SUMMARY)
-"""Files of `write_results`."""
 _NOTICEABLE = 3.0  # compilation times above this are printed [s]; machine code from disk takes less
 
 
@@ -49,16 +47,17 @@ def run(options: Track, console: Console, notes: Console) -> None:
     if "," in options.controller:
         track_laws(options, robot, given, results, console, notes)
         return
-    results = results.check(FILES, options.force, whole={"interrupted": False})
+    results = results.check((*FILES, PICTURE), options.force, whole={"interrupted": False})
     with results.made() as folder:
         recorded, compile_time, wall_time, interrupted = track(robot, **given, progress=True)
-        recorded.info.update(reference=options.reference, **results.facts)
+        recorded.info.update(reference=options.reference, interrupted=interrupted, **results.facts)
         found = figures(recorded, robot) | {"joint_stops": options.joint_stops}
         found["not_simulated"] = not_simulated(robot, options.joint_friction)
         with notes.status(f"writing run, picture and replay into {folder}"):
             times = {"compile_time_s": compile_time, "wall_time_s": wall_time}
             write_results(recorded, results, robot, found, seed=options.seed, interrupted=interrupted, **times)
-    title, verdict = f"{robot.name}, {options.controller} in {options.plant}", verdict_of(found)
+    title = f"{robot.name}, {options.controller} in {options.plant}"
+    verdict = verdict_of(found, interrupted=interrupted)
     lines = (*verdict.more, *_lines(found, compile_time, wall_time))
     tell(console, f"{title}: {verdict.said}", lines, [_table(title, found)], verbose=options.verbose)
     results.show(console, FILES, "replay", results.folder, "--open")
@@ -67,12 +66,12 @@ def run(options: Track, console: Console, notes: Console) -> None:
 
 
 def write_results(run: Run, results: Results, robot: Robot, figures: dict[str, Any], **more: Any) -> None:
-    """Write `FILES`, the run and summary.json first; a picture that cannot be drawn is told in a warning.
+    """Write `track_laws.FILES`, the run and summary.json first; a picture that cannot be drawn is told in a warning.
 
     `more` are further entries of summary.json. Raises OSError if something cannot be written.
     """
     folder = results.folder
-    with results.replaced(FILES, figures, **more) as draft:
+    with results.replaced(files_in(folder), figures, **more) as draft:
         run.save(draft / FILES[0])
     with drawing(folder / FILES[1]) as path:
         plot_tracking(run, path, robot=robot)

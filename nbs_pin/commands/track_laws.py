@@ -8,17 +8,28 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nbs_pin.base.summaries import RUN, SUMMARY, runs_of_laws, summary_in
 from nbs_pin.base.units import measured, several
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import SAVED, OptionError
 from nbs_pin.commands.following import Tracked, not_simulated, track
-from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table, tell
+from nbs_pin.commands.results import Results, drawing, sha256_of, table, tell
 from nbs_pin.reports.law_charts import plot_laws
 from nbs_pin.reports.verdicts import largest_late_errors, verdict_of
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.run_figures import figures
 
+FILES = (RUN, "tracking.png", "replay.html", SUMMARY)
+"""What `nbs-pin track` writes with one law."""
 PICTURE = "comparison.png"
+"""The picture of several laws."""
+
+
+def files_in(folder: Path) -> tuple[str, ...]:
+    """What may be in the folder from a track before, with one law or several, whose place new results take."""
+    found = summary_in(folder).get("figures")
+    laws = found.get("laws") if isinstance(found, Mapping) else None
+    return (*FILES, PICTURE, *runs_of_laws(laws if isinstance(laws, Mapping) else ()).values())
 
 
 def track_laws(
@@ -27,8 +38,8 @@ def track_laws(
     """Track with every law, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     laws = _named(options.controller)
     results.facts["settings"] |= {f"{name}_sha256": sha256_of(Path(law)) for name, law in laws.items() if law != name}
-    files = {name: f"run-{name}.npz" for name in laws}
-    results = results.check((*files.values(), PICTURE, SUMMARY), options.force, whole={"interrupted": False})
+    files = runs_of_laws(laws)
+    results = results.check((*FILES, *files.values(), PICTURE), options.force, whole={"interrupted": False})
     done: dict[str, Tracked] = {}
     with results.made() as folder:
         for name, law in laws.items():
@@ -38,15 +49,16 @@ def track_laws(
                 if not done:
                     raise
                 break
-            done[name].run.info.update(reference=options.reference, **results.facts)
+            one = results.facts | {"settings": results.facts["settings"] | {"controller": law}}
+            done[name].run.info.update(reference=options.reference, interrupted=done[name].interrupted, **one)
             if done[name].interrupted:
                 break
         interrupted = len(done) < len(laws) or any(tracked.interrupted for tracked in done.values())
         found: dict[str, Any] = {"laws": {name: figures(tracked.run, robot) for name, tracked in done.items()}}
         found["not_simulated"] = not_simulated(robot, options.joint_friction)
-        earlier = [path.name for path in folder.glob("run-*.npz")]
         with notes.status(f"writing runs and picture into {folder}"):
-            with results.replaced((*files.values(), *earlier, PICTURE), found, interrupted=interrupted) as draft:
+            names = dict.fromkeys((*files.values(), *files_in(folder)))
+            with results.replaced(tuple(names), found, interrupted=interrupted) as draft:
                 for name, tracked in done.items():
                     tracked.run.save(draft / files[name])
             with drawing(folder / PICTURE) as path:
@@ -54,7 +66,7 @@ def track_laws(
                 plot_laws({name: tracked.run for name, tracked in done.items()}, path, title=title)
     shown = [_table(found["laws"])]
     left_out = [f"not simulated: {'; '.join(found['not_simulated'])}"] if found["not_simulated"] else []
-    verdict = verdict_of(found)
+    verdict = verdict_of(found, interrupted=interrupted)
     tell(console, f"{robot.name}: {verdict.said}", [*verdict.more, *left_out], shown, verbose=True)
     results.show(console, (*files.values(), PICTURE, SUMMARY), "replay", folder / files[next(iter(done))], "--open")
     if interrupted:

@@ -164,10 +164,11 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
 
 def _heading(run: Run, robot: Robot | None) -> Heading:
     """Arm, law and settings, and what the errors of one start amount to, if they can be summed up."""
+    title, stopped = f"{arm_in_words(run)}: {law_in_words(run)}", {"stopped": run.info.get("stopped")}
     if len(run.t) < 3 or not np.isfinite(run.q).all():
-        return Heading(f"{arm_in_words(run)}: {law_in_words(run)}", settings_in_words(run))
-    verdict = verdict_of(figures(run, robot))
-    return Heading(f"{arm_in_words(run)}: {law_in_words(run)}", settings_in_words(run), verdict)
+        return Heading(title, settings_in_words(run), verdict_of(stopped) if stopped["stopped"] else None)
+    verdict = verdict_of(figures(run, robot) | stopped, interrupted=run.info.get("interrupted") is True)
+    return Heading(title, settings_in_words(run), verdict)
 
 
 def _draw_tool(figure: Figure, row: np.ndarray, run: Run, robot: Robot, tool: dict[str, Any]) -> None:

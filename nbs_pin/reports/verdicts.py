@@ -16,6 +16,8 @@ _IN_TIME = 0.7
 """Share of the time by which an arm must have converged: one that is near its motion later may only be passing it."""
 _USABLE = 0.1
 """Torque error over the standard deviation of the torque below which a learned model is good."""
+_CONSTANT = 100.0
+"""That ratio above which it says nothing, as the torque hardly varies."""
 
 
 class Verdict(NamedTuple):
@@ -66,8 +68,13 @@ def largest_late_errors(figures: Mapping[str, Any]) -> list[tuple[float, str, st
 
 
 def shares(errors: Sequence[float | None], deviations: Sequence[float | None]) -> list[float]:
-    """Each torque error over the standard deviation of that torque: inf for an error where the torque is constant."""
-    pairs = [(_number(e), _number(d)) for e, d in zip(errors, deviations, strict=True)]
+    """Each torque error over the standard deviation of that torque.
+
+    A deviation counts as at least 1e-9 of the largest, so that where a torque is constant an error of rounding is none,
+    and any other is many times what it should be.
+    """
+    least = 1e-9 * max(map(_number, deviations), default=0.0)
+    pairs = [(_number(e), max(_number(d), least)) for e, d in zip(errors, deviations, strict=True)]
     return [e / d if d > 0.0 else math.inf if e > 0.0 else 0.0 for e, d in pairs]
 
 
@@ -206,7 +213,7 @@ def _learned(figures: Mapping[str, Any]) -> Verdict:
         measured(_number(values[worst]), units[worst]) if values else ""
         for values in (errors, figures["torque_deviation_Nm"], (figures.get("details") or {}).get("noise_Nm"))
     )
-    share = f", {100.0 * of_deviation[worst]:.2g} % of that" if math.isfinite(of_deviation[worst]) else ""
+    share = f", {100.0 * of_deviation[worst]:.2g} % of that" if of_deviation[worst] < _CONSTANT else ""
     said = f"on {where} the torque of {joints[worst]}, the worst joint, is off by {off} RMS"
     share = f", where it varies by {deviation}{share}"
     level = GOOD if of_deviation[worst] < _USABLE else WARNING if of_deviation[worst] < 1.0 else BAD
@@ -216,13 +223,15 @@ def _learned(figures: Mapping[str, Any]) -> Verdict:
 def _trained(figures: Mapping[str, Any]) -> Verdict:
     """How far the cost on held-out motions fell, and when fresh motions converge."""
     share = figures["held_out_cost_lowered_by"]
-    before, after = (figures[when]["convergence_time_median_s"] for when in ("before", "after"))
+    duration = figures["fresh_duration_s"]
+    times = (_number(figures[when]["convergence_time_median_s"]) for when in ("before", "after"))
+    before, after = (time if time <= _IN_TIME * duration else None for time in times)
     if share is None:
         cost = "the held-out cost is not finite"
     else:
         cost = f"held-out cost {'lowered' if share >= 0.0 else 'raised'} by {abs(share):.1%}"
     if after is None:
-        then = "half of the fresh starts or more do not converge"
+        then = f"half of the fresh starts or more do not converge in the first {_IN_TIME:.0%} of {duration:g} s"
         then += "" if before is None else f", where half had converged after {before:.3f} s before training"
         return Verdict(WARNING if before is None and share is not None and share > 0.0 else BAD, f"{cost}; {then}")
     earlier = "fewer did at all" if before is None else f"{before:.3f} s"
@@ -246,6 +255,11 @@ def _collected(figures: Mapping[str, Any]) -> Verdict:
     return Verdict(GOOD if covered[least] >= 0.5 else WARNING, said, (limited,))
 
 
+def _benched(figures: Mapping[str, Any]) -> Verdict:
+    told = ", ".join(f"{time:.3g} µs of {what}" for what, time in figures["control_step_p50_us"].items())
+    return Verdict(NOTE, f"one control step takes, in the median, {told}" if told else "no control step was timed")
+
+
 def _percent(share: float | None) -> str:
     return "not finite" if share is None else f"{100.0 * share:.2g} %"
 
@@ -253,11 +267,12 @@ def _percent(share: float | None) -> str:
 _JUDGES: dict[str, Callable[[Mapping[str, Any]], Verdict]] = {
     "laws": _laws,
     "rms_error_late_rad": _tracking,
-    "missed_share": _tracking,
     "certificate": _certificate,
     "relative_error": _compared,
     "rms_test_torque_error_Nm": _learned,
     "held_out_cost_lowered_by": _trained,
     "covered_range_fraction": _collected,
+    "control_step_p50_us": _benched,
+    "stopped": _tracking,
 }
-"""By a figure that only the results of one command have."""
+"""By a figure that only the results of one command have; the last, of a run too short for others, only comes then."""
