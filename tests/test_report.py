@@ -79,6 +79,14 @@ def test_a_folder_without_summary_is_refused_and_an_arm_that_is_gone_is_named(fo
     assert "no/such.urdf" in text
 
 
+def open_with_arms(browser, page, count):
+    browser.open(page, "#t=0.5")
+    built = (
+        f"new Promise(done => {{ const look = () => report.scenes.length === {count} ? done(0) : setTimeout(look, 50); "
+    )
+    browser.evaluate(f"{built} look(); }})")
+
+
 @pytest.mark.browser
 @pytest.mark.parametrize(("width", "height", "dark"), [(1280, 800, False), (390, 844, True)])
 def test_charts_and_arms_of_several_runs_share_one_time(folders, width, height, dark, tmp_path):
@@ -87,9 +95,7 @@ def test_charts_and_arms_of_several_runs_share_one_time(folders, width, height, 
     page = report(folders, tmp_path / "a.html")
     with closing(Browser(width, height)) as browser:
         browser.resize(width, height, dark=dark)
-        browser.open(page, "#t=0.5")
-        built = "new Promise(done => { const look = () => report.scenes.length === 2 ? done(0) : setTimeout(look, 50); "
-        browser.evaluate(f"{built} look(); }})")
+        open_with_arms(browser, page, 2)
         runs = [nbs.Run.load(folder / "run.npz") for folder in folders]
         for scene, run in enumerate(runs):
             pose = browser.evaluate(f"report.scenes[{scene}].pose('tip')")
