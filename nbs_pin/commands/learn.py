@@ -115,7 +115,7 @@ def data_and_arm(
 def learn(data: Dataset, model: str, robot: Robot | None, seed: int = 0, **settings: Any) -> Learned:
     """The model that `fit` learns from the data, with its settings and errors, and the data held out as a test."""
     train, test = split_data(data, settings.pop("held_out", None), seed)
-    found: Any = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
+    found = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
     joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
     return Learned(found, found.report, found.friction, train, test, joints, tuple(data.prismatic.tolist()))
 
