@@ -18,6 +18,7 @@ from nbs_pin.benchmarks.bench import Row
 from nbs_pin.certificates.tip_bound import tip_bound
 from nbs_pin.cli.shell import parse
 from nbs_pin.commands.reproduce import PARTS
+from nbs_pin.reports import plotting
 from nbs_pin.reports.captions import settings_in_words
 from nbs_pin.reports.markdown import Section
 from nbs_pin.reports.report import report
@@ -147,6 +148,27 @@ def data(tmp_path_factory):
     return folder / "data.npz"
 
 
+def headings(monkeypatch):
+    """The headings of all pictures that are drawn from now on."""
+    drawn, draw = [], plotting._head
+    monkeypatch.setattr(plotting, "_head", lambda figure, heading: (drawn.append(heading), draw(figure, heading)))
+    return drawn
+
+
+def test_a_picture_has_the_verdict_of_the_page(monkeypatch, tmp_path):
+    robot, drawn = nbs.load_robot("two_link"), headings(monkeypatch)
+    run = moving_run(robot)
+    away = nbs.Run(**{**vars(run), "q": run.q_ref + 20.0, "q_ref": run.q_ref + 20.0})
+    nbs.plot_tracking(away, tmp_path / "a.png", robot=robot)
+    assert drawn[0].verdict == verdict_of(tracking_figures(away, robot))
+    assert drawn[0].verdict.level == WARNING
+    assert "Joint1 left its range by " in drawn[0].verdict.text
+    why = {"code": "TIME", "time_s": 0.25, "why": "a sample is late."}
+    for noted, level in (({"stopped": why}, BAD), ({"interrupted": True}, WARNING)):
+        nbs.plot_tracking(nbs.Run(**{**vars(run), "q": run.q_ref, "info": noted}), tmp_path / "a.png", robot=robot)
+        assert drawn.pop().verdict.level == level
+
+
 REPORTED = {
     "track": "track two_link --duration 0.1",
     "several laws": "track two_link --controller nbs,pid --duration 0.1",
@@ -171,6 +193,7 @@ def test_every_command_reports_the_verdict_that_it_prints(command, data, tmp_pat
     monkeypatch.setattr("nbs_pin.benchmarks.bench.bench", lambda *_, **__: iter(rows))
     section = Section("A part", "Text.", {"figure": 1.0})
     monkeypatch.setitem(PARTS, "fair", lambda *_: [section])
+    drawn = headings(monkeypatch)
     words = REPORTED[command].replace("DATA", str(data)).split()
     printed = printed_by(*words, "--report", "--out", tmp_path / "a[b]")
     assert str(tmp_path / "a[b]" / "report.html") in printed.splitlines()
@@ -180,6 +203,7 @@ def test_every_command_reports_the_verdict_that_it_prints(command, data, tmp_pat
     assert html.escape(verdict.text) in page
     assert verdict.said in printed or command == "reproduce"
     assert f"nbs-pin {words[0]}" in told["command"]
+    assert verdict in [heading.verdict for heading in drawn] or command in ("compare", "reproduce")
     assert ('"runs":[]' not in page) == (command in ("track", "several laws", "certify", "run"))
 
 

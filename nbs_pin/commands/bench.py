@@ -14,6 +14,7 @@ from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.results import Results, drawing, table, tell
 from nbs_pin.reports.charts import plot_scaling
+from nbs_pin.reports.plotting import Heading
 from nbs_pin.reports.verdicts import verdict_of
 
 PICTURE = "joints.png"
@@ -59,6 +60,7 @@ def run(options: Bench, console: Console, notes: Console) -> None:
             rows.append(row)
             status.update(f"measured {row.key}")
     found = {"control_step_p50_us": _steps(rows)}
+    verdict = verdict_of(found)
     results = Results(options.out, bench.summary(rows), report=options.report)
     with results.replaced((PICTURE,), found):
         pass  # the summary is all the data
@@ -66,10 +68,10 @@ def run(options: Bench, console: Console, notes: Console) -> None:
     lines = {"compiled law": "p50_us", "two RNEA": "two_rnea_us"}
     series = {name: [figures[key] for figures in chain] for name, key in lines.items()}
     with drawing(options.out / PICTURE) as path:
-        plot_scaling([figures["joints"] for figures in chain], series, path)
+        heading = Heading("serial chains: cost of one control step", [results.facts["machine"]["processor"]], verdict)
+        plot_scaling([figures["joints"] for figures in chain], series, path, heading)
     kinds = [what for what in _COLUMNS if any(row.what == what for row in rows)]
     tables = [_shown(what, _COLUMNS[what], [row for row in rows if row.what == what]) for what in kinds]
-    verdict = verdict_of(found)
     tell(console, verdict.said, verdict.more, tables, verbose=options.verbose)
     if known is not None:
         console.print(_moved(bench.compare(rows, known)))

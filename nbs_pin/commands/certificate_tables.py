@@ -2,13 +2,12 @@
 
 from typing import Any
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from nbs_pin.base.units import SLIDING, column, units
-from nbs_pin.commands.results import tell
+from nbs_pin.commands.results import tell, titled
 from nbs_pin.reports.verdicts import verdict_of
 
 _ERRORS = ("rad", "m", "rad, m")
@@ -63,7 +62,7 @@ def _print_grounds(console: Console, figures: dict[str, Any]) -> None:
 
 
 def _table(title: str, *headings: str) -> Table:
-    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    table = titled(title)
     for k, heading in enumerate(headings):
         wraps = k == 0 or heading == "because"
         table.add_column(Text(heading), justify="left" if wraps or heading == "known" else "right", no_wrap=not wraps,

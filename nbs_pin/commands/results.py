@@ -205,9 +205,14 @@ def keywords(options: Any, function: Callable[..., Any]) -> dict[str, Any]:
     }
 
 
+def titled(title: str, *, heads: bool = True) -> Table:
+    """A table without columns, in the style of all tables."""
+    return Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", show_header=heads)
+
+
 def table(title: str, *headings: str, first: str = "joint") -> Table:
     """A table with one column of text, which may wrap, and columns of numbers."""
-    made = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    made = titled(title)
     made.add_column(first, overflow="fold")
     for heading in headings:
         made.add_column(Text(heading), justify="right", no_wrap=True)

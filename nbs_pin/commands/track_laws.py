@@ -14,7 +14,9 @@ from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import SAVED, OptionError
 from nbs_pin.commands.following import Tracked, not_simulated, track
 from nbs_pin.commands.results import Results, drawing, sha256_of, table, tell
+from nbs_pin.reports.captions import settings_in_words
 from nbs_pin.reports.law_charts import plot_laws
+from nbs_pin.reports.plotting import Heading
 from nbs_pin.reports.verdicts import largest_late_errors, verdict_of
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.run_figures import figures
@@ -56,17 +58,18 @@ def track_laws(
         interrupted = len(done) < len(laws) or any(tracked.interrupted for tracked in done.values())
         found: dict[str, Any] = {"laws": {name: figures(tracked.run, robot) for name, tracked in done.items()}}
         found["not_simulated"] = not_simulated(robot, options.joint_friction)
+        verdict = verdict_of(found, interrupted=interrupted)
         with notes.status(f"writing runs and picture into {folder}"):
             names = dict.fromkeys((*files.values(), *files_in(folder)))
             with results.replaced(tuple(names), found, interrupted=interrupted) as draft:
                 for name, tracked in done.items():
                     tracked.run.save(draft / files[name])
             with drawing(folder / PICTURE) as path:
-                title = f"{robot.name} · {options.reference} · {1e3 * options.period:g} ms · {options.plant}"
-                plot_laws({name: tracked.run for name, tracked in done.items()}, path, title=title)
+                runs = {name: tracked.run for name, tracked in done.items()}
+                settings = settings_in_words(next(iter(runs.values())))
+                plot_laws(runs, path, Heading(f"{robot.name}: {', '.join(runs)}", settings, verdict))
     shown = [_table(found["laws"])]
     left_out = [f"not simulated: {'; '.join(found['not_simulated'])}"] if found["not_simulated"] else []
-    verdict = verdict_of(found, interrupted=interrupted)
     tell(console, f"{robot.name}: {verdict.said}", [*verdict.more, *left_out], shown, verbose=True)
     results.show(console, (*files.values(), PICTURE, SUMMARY), "replay", folder / files[next(iter(done))], "--open")
     if interrupted:
