@@ -213,6 +213,18 @@ def test_what_stopped_the_guard_is_bad_on_page_and_picture():
         assert verdict_of(figures) == (BAD, "the guard stopped the arm after 0.25 s: a sample is late", ())
 
 
+def test_a_sample_that_is_not_finite_is_no_number_and_no_convergence():
+    """As a drive records it when its encoder fails."""
+    robot = nbs.load_robot("two_link")
+    run = moving_run(robot)
+    q = run.q_ref.copy()
+    q[-2] = np.nan
+    figures = tracking_figures(nbs.Run(**{**vars(run), "q": q}), robot)
+    json.dumps(figures, allow_nan=False)
+    assert verdict_of(figures).level == WARNING
+    assert "inf rad" in verdict_of(figures).said
+
+
 def near_from(run, time):
     """The run, with an error of 1 rad until then and none after."""
     return nbs.Run(**{**vars(run), "q": run.q_ref + np.where(run.t < time, 1.0, 0.0)[:, None]})

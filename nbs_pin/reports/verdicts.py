@@ -98,15 +98,16 @@ def _tracking(figures: Mapping[str, Any]) -> Verdict:
         tool = figures["tool"]
         kinds = {"position": "m"} | ({"orientation": "rad"} if tool["orientation"] == "hold" else {})
         errors = [
-            f"{kind} {measured(tool[f'rms_{kind}_error_{unit}'], unit)} RMS, at most "
-            f"{measured(tool[f'peak_{kind}_error_{unit}'], unit)}"
+            f"{kind} {measured(_number(tool[f'rms_{kind}_error_{unit}']), unit)} RMS, at most "
+            f"{measured(_number(tool[f'peak_{kind}_error_{unit}']), unit)}"
             for kind, unit in kinds.items()
         ]
         more.append(f"'{tool['frame']}' along the {tool['path']} is off in {'; '.join(errors)}")
     cut, late_cut = (float(np.mean(figures[name])) for name in ("saturated_fraction", "saturated_fraction_late"))
     late = f"{late_cut:.2%} after {figures['late_after_s']:g} s"
     more.append(f"some joint was at its effort limit {cut:.2%} of the time, {late}" if cut else "no torque was cut")
-    beyond = zip(joints, figures.get("outside_position_range_rad", [0.0] * len(joints)), units, strict=True)
+    excesses = map(_number, figures.get("outside_position_range_rad", [0.0] * len(joints)))
+    beyond = zip(joints, excesses, units, strict=True)
     left = [f"{joint} left its range by {measured(excess, unit)}" for joint, excess, unit in beyond if excess > 0.0]
     return Verdict(WARNING if level == GOOD and (left or late_cut) else level, said, (*more, *left))
 
