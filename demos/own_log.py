@@ -29,6 +29,7 @@ def main(arm: str = "panda", samples: int = 2000, out: Path = Path("out/demo/log
 
     data = nbs.load_log(out / "log.csv", robot=robot)
     model = nbs.fit(data, "identified", robot=robot, friction=True, seed=0)
+    assert model.friction is not None
     explained = nbs.inverse_dynamics(model, data.q, data.v, data.a) + model.friction.torque(data.v)
     left = float(np.sqrt(np.mean((data.tau - explained) ** 2)))
     friction = float(np.abs(model.friction.viscous - 0.5).max())

@@ -1,6 +1,7 @@
 """The demos run and show what their first lines promise; apart, without the shape checks that slow a loop down."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +31,11 @@ def test_every_demo_says_first_what_to_see():
     assert len(demos) >= 5
     for demo in demos:
         assert '"""' in demo.read_text()[:3], demo.name
+
+
+def test_every_demo_is_run_here():
+    run = set(re.findall(r'run_demo\(\s*"(\w+)"', Path(__file__).read_text()))
+    assert run == {demo.stem for demo in DEMOS.glob("*.py")}
 
 
 def test_three_arms_meet_their_reference_and_leave_replays(tmp_path):
@@ -128,3 +134,19 @@ def test_arms_nobody_tuned_follow_their_motions(tmp_path):
     errors, printed = run_demo("many_arms", tmp_path, "main(('two_link', 'z1'), duration=1.5)")
     assert max(errors.values()) < 1e-4
     assert printed.count("of a torque limit") == 2
+
+
+def test_a_chain_learned_from_motions_is_the_arm_and_a_network_is_not(tmp_path):
+    found, printed = run_demo("learned_model", tmp_path, "main('two_link', samples=300, iterations=5)")
+    assert found["chain"] < 1e-8
+    assert found["network"] > 1e-3
+    assert found["tracking"] < 1e-5
+    assert printed.count("torque off by") == 2
+
+
+def test_the_row_of_the_paper_is_in_the_spread_and_its_index_is_most_of_the_error(tmp_path):
+    rows, _ = run_demo("paper_row", tmp_path, "main(seeds=2).tolist()")
+    for shifted, aligned, convergence, _ in rows:
+        assert 1e-6 < shifted < 2e-6
+        assert shifted > 10.0 * aligned
+        assert 4.0 < convergence < 8.0

@@ -36,7 +36,7 @@ def test_the_verdict_comes_first_and_the_table_when_asked_for(tmp_path):
     figures = summary(tmp_path / "a")["figures"]
     worst = max(figures["rms_error_last_30_percent_rad"])
     assert brief[0] == full[0]
-    assert brief[0].startswith("two_link follows the motion ")
+    assert brief[0].startswith("two_link, nbs in mujoco: converged: from ")
     assert measured(worst, "rad") in brief[0]
     assert not any(line.split()[:1] == ["joint1"] for line in brief)
     assert sum(line.split()[:1] == ["joint1"] for line in full) == 1

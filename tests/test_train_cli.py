@@ -2,6 +2,7 @@
 
 import os
 import pty
+import shlex
 import signal
 import subprocess
 import sys
@@ -151,6 +152,38 @@ def test_ctrl_c_at_any_moment_and_resume_are_one_training(folder, tmp_path, caps
     assert "--resume to continue it" in refusal(train(tmp_path / "parts", *options), capsys)
     assert train(tmp_path / "parts", *options, "--resume") == 0
     assert outcome(tmp_path / "parts") == outcome(whole)
+
+
+def next_command(printed):
+    """The words of the command that the last line names."""
+    return shlex.split(printed.splitlines()[-1].removeprefix("next: nbs-pin "))
+
+
+def test_the_next_command_can_be_typed_as_it_is(tmp_path, capsys, monkeypatch):
+    """Of a training with options of the arm and in a folder taken by itself: go on after Ctrl-C, then track."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out" / "train-two_link").mkdir(parents=True)
+    (tmp_path / "out" / "train-two_link" / "summary.json").write_text("{}")
+    calls, cost = [], trainer.running_cost
+
+    def counted(*arguments):
+        calls.append(1)
+        if len(calls) == 6:
+            raise KeyboardInterrupt
+        return cost(*arguments)
+
+    monkeypatch.setattr(trainer, "running_cost", counted)
+    options = ["--payload", "0.5", "--limits", "joint1.upper=3", "--effort-limit", "90"]
+    assert cli.main(["train", "two_link", *QUICK, *options]) == 130
+    again = next_command(capsys.readouterr().out)
+    assert "--resume" in again
+    assert cli.main(again) == 0
+    assert not summary(tmp_path / "out" / "train-two_link-2")["interrupted"]
+    on = next_command(capsys.readouterr().out)
+    assert cli.main([*on, "--duration", "0.05", "--out", "out/tracked"]) == 0
+    run = nbs.Run.load(tmp_path / "out" / "tracked" / "run.npz")
+    assert run.effort_limit.tolist() == [90.0, 90.0]
+    assert run.robot_options["payload"]
 
 
 def test_resuming_what_is_done_changes_nothing(folder, tmp_path, capsys):

@@ -1,12 +1,17 @@
-"""The summary of a folder of results: what made them, and their figures."""
+"""The summary of a folder of results: what made them, their figures, and the names of the files with the runs."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-SUMMARY, REPORT = "summary.json", "report.html"
-"""Names of the summary and of the page that shows the results."""
+SUMMARY, REPORT, RUN = "summary.json", "report.html", "run.npz"
+"""Names of the summary, of the page that shows the results, and of the run of one law."""
+
+
+def runs_of_laws(laws: Iterable[str]) -> dict[str, str]:
+    """Names of the runs of several laws on one motion."""
+    return {law: f"run-{law}.npz" for law in laws}
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:

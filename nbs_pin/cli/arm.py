@@ -187,6 +187,17 @@ class ArmOptions:
             flags = " and ".join(f"--{_FLAGS.get(name, name).replace('_', '-')}" for name in self.given())
             raise OptionError(f"{flags} was given, but no arm is loaded here; {remedy}.")
 
+    def typed(self) -> list[str]:
+        """The options that were given, as words of the shell."""
+        words = []
+        for name, value in vars(self).items():
+            flag = f"--{name.replace('_', '-')}"
+            if value is True:
+                words.append(flag)
+            elif value != type(self).__dataclass_fields__[name].default:
+                words += [f"{flag}={item}" for item in (value if isinstance(value, tuple) else (value,))]
+        return words
+
     def given(self) -> dict[str, Any]:
         """The arguments of `load_robot` that were given."""
         given = {

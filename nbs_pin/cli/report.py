@@ -28,4 +28,4 @@ class Report:
     open: bool = False
     """Open the page in the browser."""
     force: bool = False
-    """Overwrite the file that --out names."""
+    """Overwrite the page of other folders, or the file that --out names."""

@@ -6,16 +6,19 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
-from nbs_pin.base.files import replaced_together
-from nbs_pin.base.summaries import REPORT, SUMMARY, summary_text
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.benchmarks import bench
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import drawing, table, tell
+from nbs_pin.commands.results import Results, drawing, table, tell
 from nbs_pin.reports.charts import plot_scaling
-from nbs_pin.reports.report import report
+from nbs_pin.reports.plotting import Heading
+from nbs_pin.reports.verdicts import verdict_of
 
+PICTURE = "joints.png"
+"""The picture that is written beside summary.json."""
 _COLUMNS = {
     "control step": {
         "p50\n[µs]": "p50_us",
@@ -56,33 +59,32 @@ def run(options: Bench, console: Console, notes: Console) -> None:
         for row in bench.bench(options.arms, calls=options.calls, long=options.long):
             rows.append(row)
             status.update(f"measured {row.key}")
-    picture = options.out / "joints.png"
-    with replaced_together(options.out, [SUMMARY, REPORT, picture.name]) as draft:
-        (draft / SUMMARY).write_text(summary_text(bench.summary(rows)), encoding="utf-8")
+    found = {"control_step_p50_us": _steps(rows)}
+    verdict = verdict_of(found)
+    results = Results(options.out, bench.summary(rows), report=options.report)
+    with results.replaced((PICTURE,), found):
+        pass  # the summary is all the data
     chain = [row.figures for row in rows if row.what == "joints"]
     lines = {"compiled law": "p50_us", "two RNEA": "two_rnea_us"}
     series = {name: [figures[key] for figures in chain] for name, key in lines.items()}
-    with drawing(picture):
-        plot_scaling([figures["joints"] for figures in chain], series, picture)
-    if options.report:
-        report([options.out], options.out / REPORT)
+    with drawing(options.out / PICTURE) as path:
+        heading = Heading("serial chains: cost of one control step", [results.facts["machine"]["processor"]], verdict)
+        plot_scaling([figures["joints"] for figures in chain], series, path, heading)
     kinds = [what for what in _COLUMNS if any(row.what == what for row in rows)]
     tables = [_shown(what, _COLUMNS[what], [row for row in rows if row.what == what]) for what in kinds]
-    tell(console, _verdict(rows), (), tables, verbose=options.verbose)
+    tell(console, verdict.said, verdict.more, tables, verbose=options.verbose)
     if known is not None:
         console.print(_moved(bench.compare(rows, known)))
-    written = [str(options.out / SUMMARY), str(picture), *([str(options.out / REPORT)] if options.report else [])]
-    console.print(*written, sep="\n", highlight=False)
+    results.show(console, (SUMMARY, PICTURE))
 
 
-def _verdict(rows: list[bench.Row]) -> str:
-    """The time of one control step of the first law of every arm."""
+def _steps(rows: list[bench.Row]) -> dict[str, float]:
+    """The time of one control step of the first law of every arm [µs]."""
     steps: dict[str, bench.Row] = {}
     for row in rows:
         if row.what == "control step":
             steps.setdefault(row.arm, row)
-    told = (f"{arm} {row.figures['p50_us']:.3g} µs ({row.how})" for arm, row in steps.items())
-    return f"one control step, median: {', '.join(told)}" if steps else f"{len(rows)} rows measured"
+    return {f"{row.how} on {arm}": row.figures["p50_us"] for arm, row in steps.items()}
 
 
 def _read(path: Path) -> Any:
@@ -98,7 +100,7 @@ def _shown(what: str, columns: dict[str, str], rows: list[bench.Row]) -> Table:
     shown = table(what, "what", *columns, first="arm")
     for row in rows:
         values = (row.figures.get(column) for column in columns.values())
-        shown.add_row(row.arm, row.how, *("" if value is None else f"{value:.4g}" for value in values))
+        shown.add_row(Text(row.arm), Text(row.how), *("" if value is None else f"{value:.4g}" for value in values))
     return shown
 
 
@@ -107,5 +109,5 @@ def _moved(moved: list[tuple[str, str, float, float]]) -> Table | str:
         return "no figure changed by more than 10 %"
     shown = table("changed by more than 10 %", "figure", "before", "now", "now / before", first="row")
     for key, name, before, now in moved:
-        shown.add_row(key, name, f"{before:.4g}", f"{now:.4g}", f"{now / before:.2f}" if before else "")
+        shown.add_row(Text(key), name, f"{before:.4g}", f"{now:.4g}", f"{now / before:.2f}" if before else "")
     return shown

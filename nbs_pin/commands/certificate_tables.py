@@ -1,15 +1,14 @@
 """A certificate as tables on the console."""
 
-import math
 from typing import Any
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.units import SLIDING, column, measured, units
-from nbs_pin.commands.results import tell
+from nbs_pin.base.units import SLIDING, column, units
+from nbs_pin.commands.results import tell, titled
+from nbs_pin.reports.verdicts import verdict_of
 
 _ERRORS = ("rad", "m", "rad, m")
 """Units of the error bounds, which have a table of their own."""
@@ -35,31 +34,16 @@ _GAINS = {
 """Columns of a design per joint: the figures, and the fields of `JointUnits` that say in what they are."""
 
 
-def print_certificate(console: Console, law: str, figures: dict[str, Any], *, verbose: bool) -> None:
+def print_certificate(console: Console, figures: dict[str, Any], *, verbose: bool) -> None:
     """Print the promise, and all that it rests on if wanted; `figures` from `commands.certify.figures`."""
-    tell(console, headline(law, figures), verbose=verbose)
+    verdict = verdict_of(figures)
+    tell(console, verdict.said, verbose=verbose)
     if figures["design"] is not None:
         console.print(_design(figures))
     if verbose:
         _print_grounds(console, figures)
-    for text in _closing(figures):
+    for text in verdict.more:
         console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def headline(law: str, figures: dict[str, Any]) -> str:
-    """In one sentence what is promised of every joint, how that is known, and for which clock."""
-    certificate = figures["certificate"]
-    errors = certificate["joint_overshoots_rad"] or certificate["joint_errors_rad"]
-    worst: dict[str, float] = {}
-    for error, unit in zip(errors, certificate["units"], strict=True):
-        worst[unit] = max(worst.get(unit, 0.0), math.inf if error is None else error)
-    strays = " or ".join(measured(error, unit) for unit, error in worst.items())
-    start = "the start given" if certificate["joint_overshoots_rad"] else "a start on the motion"
-    told = (
-        f"no joint of {figures['arm'] or 'the arm'} strays more than {strays} from its motion under "
-        f"{certificate['disturbance']} ({law}, from {start}, in {certificate['clock']})"
-    )
-    return f"NOT PROMISED: that {told}" if certificate["void"] else f"{certificate['label']}: {told}"
 
 
 def _print_grounds(console: Console, figures: dict[str, Any]) -> None:
@@ -78,7 +62,7 @@ def _print_grounds(console: Console, figures: dict[str, Any]) -> None:
 
 
 def _table(title: str, *headings: str) -> Table:
-    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    table = titled(title)
     for k, heading in enumerate(headings):
         wraps = k == 0 or heading == "because"
         table.add_column(Text(heading), justify="left" if wraps or heading == "known" else "right", no_wrap=not wraps,
@@ -155,30 +139,6 @@ def _design(figures: dict[str, Any]) -> Table:
     for joint, *cells in zip(figures["certificate"]["joints"], *(cells for _, cells in columns), strict=True):
         table.add_row(Text(joint), *cells)
     return table
-
-
-def _closing(figures: dict[str, Any]) -> list[str]:
-    certificate, found, watched = figures["certificate"], figures["attack"], figures["monitor"]
-    lines = [certificate["unproved_hold"]] if certificate["unproved_hold"] else []
-    if found is not None:
-        how = f"{found['found_by']}, {found['duration_s']:.3g} s at {1e3 * found['period_s']:g} ms"
-        search = how if found["thorough"] else f"{how}; waves alone, --attack searches further"
-        lines.append(f"worst found by {search}")
-        if found["exceeds"]:
-            lines.append(f"BOUND EXCEEDED; the check of this motion against the certificate: {found['verdict']}")
-    if figures["attack_diverged"] is not None:
-        lines.append(f"no worst motion to compare with the bounds: {figures['attack_diverged']}")
-    if watched is not None:
-        lines.append(f"the run: {watched['verdict']}")
-    return [*lines, *(f"of no use: {text}" for text in figures["useless"]), standing(certificate)]
-
-
-def standing(certificate: dict[str, Any]) -> str:
-    """How the bounds are known and what they assume, or the conditions that fail, so that the bounds are void."""
-    if certificate["void"]:
-        failed = "; ".join(certificate["void"])
-        return f"{certificate['label']}: the bounds are void, as these conditions fail: {failed}"
-    return f"{certificate['label']}, under the assumptions that are not checked"
 
 
 def _with_unit(value: float | None, unit: str) -> str:

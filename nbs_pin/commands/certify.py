@@ -10,6 +10,7 @@ from rich.console import Console
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design
 from nbs_pin.certificates.certificate_file import is_in_its_file, write_certificate
@@ -22,7 +23,7 @@ from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import print_certificate
-from nbs_pin.commands.results import SUMMARY, Results, drawing
+from nbs_pin.commands.results import Results, drawing
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.friction import JointFriction
@@ -60,8 +61,7 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         result = assess(controller, task, thorough=options.attack, run=watched, proposal=proposal, progress=True)
         with notes.status(f"drawing the picture into {folder}"):
             found, written = write_results(result, results, as_file=options.json)
-    law = Path(options.controller).name if options.controller.endswith(SAVED) else "a law built for it"
-    print_certificate(console, law, found, verbose=options.verbose)
+    print_certificate(console, found, verbose=options.verbose)
     results.show(console, written, *(("verify", folder / CERTIFICATE) if options.json else ()))
     return NO_PROMISE if result.certificate.void else 0
 
@@ -215,7 +215,9 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
     certificate stays in the folder.
     Raises OSError if they cannot be written.
     """
-    found, folder = figures(result), results.folder
+    given, folder = results.facts["settings"], results.folder
+    saved = given["controller"].endswith(SAVED)
+    found = {"law": Path(given["controller"]).name if saved else "a law built for it"} | figures(result)
     with results.replaced((FILES[1], DESIGNED, CERTIFICATE, ARM, FILES[0], MONITOR), found) as draft:
         if result.attack is not None:
             result.attack.run.save(draft / FILES[1])
@@ -226,8 +228,7 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
             robot = result.certificate.robot
             if robot is not None and not is_in_its_file(robot):
                 (draft / ARM).write_bytes(robot.urdf.without_geometry())
-    given = results.facts["settings"]
-    law = ("controller",) if given["controller"].endswith(SAVED) else ("law", "bandwidth")
+    law = ("controller",) if saved else ("law", "bandwidth")
     settings = chosen(given, *law, "period", "friction", "unknown_payload", "delay", "encoder_bits", "seed")
     with drawing(folder / FILES[0]) as path:
         plot_certificate(result.certificate, result.attack, path, settings=settings,

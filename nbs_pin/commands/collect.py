@@ -7,10 +7,11 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, column, units_of
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
+from nbs_pin.commands.results import Results, drawing, keywords, table, tell
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import torque_limits
@@ -128,12 +129,5 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)
-    plural = "trajectory" if figures["trajectories"] == 1 else "trajectories"
-    limited = max(figures["at_torque_limit_fraction"])
-    tell(
-        console,
-        f"{figures['samples']} samples of {figures['trajectories']} {plural} of {title}",
-        [f"at a torque limit in at most {limited:.1%} of the samples of a joint"],
-        [shown],
-        verbose=verbose,
-    )
+    verdict = verdict_of(figures)
+    tell(console, f"{title}: {verdict.said}", verdict.more, [shown], verbose=verbose)

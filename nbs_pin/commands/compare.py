@@ -16,10 +16,11 @@ from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, several, units_of
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.values import SAVED, OptionError
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
+from nbs_pin.commands.results import Results, drawing, keywords, table, tell
 from nbs_pin.controllers.gains import gains_for_robot
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -307,12 +308,9 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
         values = (figures["relative_error"], *([] if along is None else [along]))
         shown.add_row(name, *(_number(of[key]) for of in values))
     low, high = figures["mass_ratio"]
-    error = figures["relative_error"]
-    verdict = (
-        f"{title}: its torques are off by {_percent(error['inverse'])} of the true ones "
-        f"(M {_percent(error['mass_matrix'])}, C v {_percent(error['coriolis'])}, G {_percent(error['gravity'])})"
-    )
+    verdict = verdict_of(figures)
     lines = (
+        *verdict.more,
         f"torque nMSE {_number(figures['torque_nmse'])}; least eigenvalue of the model's M "
         f"{_number(figures['eigenvalue_margin_kgm2'])} kg·m²; {_number(low)} M ≤ model's M ≤ {_number(high)} M",
         f"torque × {figures['scale_factor']:.6g} fits best, with a relative error of {_number(figures['scale_error'])}",
@@ -320,11 +318,7 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
         f"(integrator alone {_number(figures['energy_drift_floor'])})",
         *_mismatch_lines(figures),
     )
-    tell(console, verdict, lines, [shown], verbose=verbose)
-
-
-def _percent(share: float | None) -> str:
-    return "not finite" if share is None else f"{100.0 * share:.2g} %"
+    tell(console, f"{title}: {verdict.said}", lines, [shown], verbose=verbose)
 
 
 def _mismatch_lines(figures: dict[str, Any]) -> list[str]:

@@ -6,11 +6,12 @@ from typing import Any
 
 from rich.console import Console
 
+from nbs_pin.base.summaries import SUMMARY, summary_text
 from nbs_pin.certificates.certify import certify
 from nbs_pin.cli.export import Export
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.inputs import law_of
-from nbs_pin.commands.results import SUMMARY, Results, summary_text
+from nbs_pin.commands.results import Results
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.friction import JointFriction

@@ -8,12 +8,13 @@ from rich.console import Console
 
 from nbs_pin.base.files import replaced_together
 from nbs_pin.base.plain import plain
+from nbs_pin.base.summaries import SUMMARY, summary_text
 from nbs_pin.base.versions import versions
 from nbs_pin.benchmarks.faults import MATRIX, matrix
 from nbs_pin.cli.exit_codes import STOPPED
 from nbs_pin.cli.faults import Faults
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import SUMMARY, summary_text, table
+from nbs_pin.commands.results import table
 
 
 def run(options: Faults, console: Console, notes: Console) -> int:
@@ -50,5 +51,5 @@ def run(options: Faults, console: Console, notes: Console) -> int:
     console.print(shown)
     wall = time.perf_counter() - began
     console.print(f"{len(rows) - failed} of {len(rows)} rows passed, {options.seeds} trials each, in {wall:.0f} s")
-    console.print(str(options.out / SUMMARY), highlight=False)
+    console.print(str(options.out / SUMMARY), highlight=False, markup=False, soft_wrap=True)
     return STOPPED if failed else 0

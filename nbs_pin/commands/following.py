@@ -1,4 +1,4 @@
-"""An arm that follows a motion under one law, and the figures of its run: the work of `nbs-pin track`."""
+"""An arm that follows a motion under one law: the work of `nbs-pin track`."""
 
 import time
 from collections.abc import Sequence
@@ -12,7 +12,6 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.npz import LARGEST
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import ROW_ARRAYS, Reference, Run
-from nbs_pin.base.units import by_quantity
 from nbs_pin.commands.inputs import law_of
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
@@ -20,13 +19,11 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.motions.disturbances import Disturbance
 from nbs_pin.motions.references import DesiredMotion, Sinusoid, check_reference
 from nbs_pin.robots.robot import Robot
-from nbs_pin.simulation import metrics
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.loop import LONGEST_PLANT_STEP
 from nbs_pin.simulation.plant import Plant
 from nbs_pin.simulation.registry import build_plant
 from nbs_pin.simulation.simulate import stream
-from nbs_pin.simulation.tool_errors import tool_errors, tool_of
 
 _ROWS_OF_ARRAYS = 8  # arrays of a Run with one number per row and joint
 
@@ -112,25 +109,6 @@ def track(
     run = _joined(blocks)
     interrupted = len(run.t) <= round(duration / period)
     return Tracked(run, before - begun, time.perf_counter() - before, interrupted)
-
-
-def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
-    """`metrics.summary` of the run and the RMS error over its last 30 %, as JSON can store them.
-
-    With a robot, also how far each joint left its position range, as the plants have no joint stops, and how far the
-    tool was from its path, if it followed one. `units` says in what the numbers of each joint are: those of one that
-    slides are in m and N, whatever the key says.
-    """
-    values = metrics.summary(run)
-    values["units"] = by_quantity(run.slides)
-    values["rms_error_last_30_percent_rad"] = metrics.rms_error(run, 0.7 * float(run.t[-1])).tolist()
-    if robot is not None:
-        beyond = np.maximum(robot.lower - run.q, run.q - robot.upper).reshape(-1, run.nv)
-        values["outside_position_range_rad"] = np.maximum(beyond.max(axis=0), 0.0).tolist()
-        tool = tool_of(run)
-        if tool is not None:
-            values["tool"] = tool | tool_errors(run, robot).figures()
-    return values
 
 
 def not_simulated(robot: Robot, joint_friction: str) -> list[str]:

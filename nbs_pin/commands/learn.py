@@ -13,9 +13,10 @@ from rich.text import Text
 from nbs_pin.base.doors import own_arm
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, column, several, units
 from nbs_pin.cli.learn import Learn
-from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table, tell
+from nbs_pin.commands.results import Results, drawing, sha256_of, table, tell
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
@@ -58,8 +59,9 @@ def run(options: Learn, console: Console, notes: Console) -> None:
                 save(result.model, draft / FILES[0], info={"learned": results.facts | {"interrupted": interrupted}})
             with drawing(folder / FILES[1]) as path:
                 settings = chosen(results.facts["settings"], "loss", "optimiser", "held_out", "seed")
-                plot_learning(result, path, Heading(f"{name}: {options.model}, learned", settings, verdict_of(found)))
-    _print(console, f"{name}, {options.model}", found, verbose=options.verbose)
+                verdict = verdict_of(found, interrupted=interrupted)
+                plot_learning(result, path, Heading(f"{name}: {options.model}, learned", settings, verdict))
+    _print(console, f"{name}, {options.model}", found, verbose=options.verbose, interrupted=interrupted)
     known = robot is not None and not interrupted
     results.show(console, FILES, *(("compare", results.folder / FILES[0]) if known else ()))
     if interrupted:
@@ -113,7 +115,7 @@ def data_and_arm(
 def learn(data: Dataset, model: str, robot: Robot | None, seed: int = 0, **settings: Any) -> Learned:
     """The model that `fit` learns from the data, with its settings and errors, and the data held out as a test."""
     train, test = split_data(data, settings.pop("held_out", None), seed)
-    found: Any = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
+    found = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
     joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
     return Learned(found, found.report, found.friction, train, test, joints, tuple(data.prismatic.tolist()))
 
@@ -191,7 +193,7 @@ def _errors(result: Learned, data: Dataset) -> np.ndarray:
     return np.sqrt(np.square(torque_errors(result.model, data, result.friction)).mean(axis=0))
 
 
-def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool) -> None:
+def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool, interrupted: bool) -> None:
     """Print how good the model is, and a row per joint."""
     test, viscous, of = figures["rms_test_torque_error_Nm"], figures["viscous_friction"], figures["units"]
     none = ["none"] * len(figures["joints"])
@@ -206,19 +208,8 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)
-    tell(console, _verdict(title, figures), _lines(figures), [shown], verbose=verbose)
-
-
-def _verdict(title: str, figures: dict[str, Any]) -> str:
-    """The joint with the largest torque error, beside how much its torque varies."""
-    held_out = figures["rms_test_torque_error_Nm"]
-    errors, where = (figures["rms_torque_error_Nm"], "the data") if held_out is None else (held_out, "held-out data")
-    worst = max(range(len(errors)), key=lambda i: errors[i] / max(figures["torque_deviation_Nm"][i], 1e-300))
-    joint, unit = figures["joints"][worst], figures["units"]["torque"][worst]
-    return (
-        f"{title}: on {where} the torque of {joint}, the worst joint, is off by {errors[worst]:.3g} {unit} RMS, where "
-        f"it varies by {figures['torque_deviation_Nm'][worst]:.3g} {unit}"
-    )
+    verdict = verdict_of(figures, interrupted=interrupted)
+    tell(console, f"{title}: {verdict.said}", [*verdict.more, *_lines(figures)], [shown], verbose=verbose)
 
 
 def _lines(figures: dict[str, Any]) -> list[str]:

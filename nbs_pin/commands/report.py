@@ -18,7 +18,7 @@ def run(options: Report, console: Console, notes: Console) -> None:
     page = options.out or (first if len(options.folders) == 1 else first.parent) / REPORT
     if page.is_dir():
         raise OptionError(f"--out '{page}' is a folder; give a file such as '{page / REPORT}'.")
-    if options.out and page.exists() and not options.force:
+    if (options.out or len(options.folders) > 1) and page.exists() and not options.force:
         raise OptionError(f"'{page}' exists; give another --out, or --force to replace it.")
     with notes.status(f"drawing {page}"):
         report(options.folders, page)

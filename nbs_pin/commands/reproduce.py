@@ -6,9 +6,10 @@ from typing import Any
 
 from rich.console import Console
 
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.benchmarks import fair
 from nbs_pin.cli.reproduce import Reproduce
-from nbs_pin.commands.results import SUMMARY, Results, tell
+from nbs_pin.commands.results import Results, tell
 from nbs_pin.reports.markdown import page
 from nbs_pin.reproduction import certificate_study, learned_loop, model_study, paper
 

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from nbs_pin.base.doors import typed_command
 from nbs_pin.base.files import replaced_together
-from nbs_pin.base.summaries import REPORT, SUMMARY as SUMMARY, summary_in, summary_text as summary_text
+from nbs_pin.base.summaries import REPORT, SUMMARY, summary_in, summary_text
 from nbs_pin.base.versions import versions
 from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import OptionError
@@ -133,12 +133,13 @@ class Results:
     def show(self, console: Console, names: Iterable[str], *following: str | Path) -> None:
         """Print the paths of the results that exist, one per line, and the arguments of a command to go on with.
 
-        The report is written before, if it is wanted.
+        The report is written before, if it is wanted, within `drawing`.
         """
         if self.report:
             from nbs_pin.reports.report import report  # which loads the drawing of arms
 
-            report([self.folder], self.folder / REPORT)
+            with drawing(self.folder / REPORT) as path:
+                report([self.folder], path)
         for name in (*names, REPORT):
             if (self.folder / name).exists():
                 console.print(str(self.folder / name), soft_wrap=True, highlight=False, markup=False)
@@ -204,9 +205,14 @@ def keywords(options: Any, function: Callable[..., Any]) -> dict[str, Any]:
     }
 
 
+def titled(title: str, *, heads: bool = True) -> Table:
+    """A table without columns, in the style of all tables."""
+    return Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", show_header=heads)
+
+
 def table(title: str, *headings: str, first: str = "joint") -> Table:
     """A table with one column of text, which may wrap, and columns of numbers."""
-    made = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    made = titled(title)
     made.add_column(first, overflow="fold")
     for heading in headings:
         made.add_column(Text(heading), justify="right", no_wrap=True)

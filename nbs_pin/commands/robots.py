@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.units import TURNING, units, with_units
+from nbs_pin.base.units import TURNING, column, units
 from nbs_pin.cli.robots import Robots
 from nbs_pin.commands.results import next_step
 from nbs_pin.robots.catalogue import ROBOT_NAMES
@@ -66,10 +66,9 @@ def _show(robot: Robot, console: Console) -> None:
     }
     cells = []
     for (heading, quantity), texts in columns.items():
-        given = units(quantity, robot.prismatic)
-        head = f"{heading}\n[{given[0]}]" if len(set(given)) == 1 else heading
+        head, told = column(heading, texts, units(quantity, robot.prismatic))
         shown.add_column(Text(head), justify="right", no_wrap=True)
-        cells.append(with_units(texts, given))
+        cells.append(told)
     for name, *row in zip(robot.joint_names, *cells, strict=True):
         shown.add_row(Text(name), *row)
     console.print(shown)

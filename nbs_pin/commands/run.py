@@ -12,12 +12,13 @@ from rich.text import Text
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.certify import certify
 from nbs_pin.cli.exit_codes import STOPPED
 from nbs_pin.cli.run import Run
 from nbs_pin.commands.inputs import law_of
-from nbs_pin.commands.results import SUMMARY, Results, drawing, table
+from nbs_pin.commands.results import Results, drawing, table, tell
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.motions.by_name import motion_of
@@ -25,12 +26,13 @@ from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.reports.live import LiveView
 from nbs_pin.reports.plotting import plot_tracking
 from nbs_pin.reports.replay import replay
+from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot, configuration_difference, load_robot
 from nbs_pin.runtime.arms import ArmInterface, PlantArm
 from nbs_pin.runtime.drive import Driven, Live, drive, guard_for
 from nbs_pin.runtime.franka_arm import FrankaArm
 from nbs_pin.runtime.ur_arm import URArm
-from nbs_pin.simulation import metrics
+from nbs_pin.simulation import metrics, run_figures
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 
 FILES = ("run.npz", "tracking.png", "replay.html", SUMMARY)
@@ -55,14 +57,15 @@ def run(options: Run, console: Console, notes: Console) -> int:
         guard = guard_for(arm, robot, certificate=_bound(options, law, robot))
     with results.made() as folder, _watching(options, robot, notes) as latest:
         driven = drive(arm, law, robot, motion, duration, guard=guard, watch=latest.append, priority=options.priority)
-        found = figures(driven)
+        found = figures(driven, robot)
+        driven.run.info.update(reference=options.reference, stopped=found["stopped"], **results.facts)
         with results.replaced(FILES, found) as draft:
             driven.run.save(draft / FILES[0])
     with drawing(folder / FILES[1]) as path:
         plot_tracking(driven.run, path, robot=robot)
     with drawing(folder / FILES[2]) as path:
         replay(driven.run, path, robot)
-    _print(console, f"{robot.name} at {options.at}, {options.controller}", driven, found)
+    _print(console, f"{robot.name}, {options.controller} at {options.at}", driven, found)
     results.show(console, FILES)
     return 0 if driven.report is None else STOPPED
 
@@ -78,11 +81,11 @@ def arm_at(text: str, robot: Robot, motion: DesiredMotion, period: float) -> Arm
     return arm
 
 
-def figures(driven: Driven) -> dict[str, Any]:
+def figures(driven: Driven, robot: Robot) -> dict[str, Any]:
     """What a run on an arm came to, as JSON stores it."""
     work = 1e6 * driven.times.work
     report = driven.report
-    values = metrics.summary(driven.run) if len(driven.run.t) > 2 else {}
+    values = run_figures.figures(driven.run, robot) if len(driven.run.t) > 2 else {}
     return values | {
         "stopped": None if report is None else {"code": report.code.name, "time_s": report.time, "why": report.message},
         **driven.counters._asdict(),
@@ -164,13 +167,13 @@ def _print(console: Console, title: str, driven: Driven, found: dict[str, Any]) 
     peaks = np.abs(driven.run.tau).max(axis=0)
     for name, e, peak, most in zip(driven.run.joint_names, error, peaks, driven.run.effort_limit, strict=True):
         shown.add_row(Text(name), f"{e:.2e}", f"{peak:.4g}", f"{most:.4g}")
-    console.print(shown)
+    verdict = verdict_of(found)
     lines = [
+        *verdict.more,
         f"guard: {driven.mode.name}" + ("" if driven.report is None else f", {driven.report}"),
         f"held {found['held']}, late {found['late']}, overruns {found['overruns']}, saturated {found['saturated']}",
         f"periods missed {found['missed_share']:.3%}; work p50 {found['work_p50_us']:.0f} µs, p99 "
         f"{found['work_p99_us']:.0f} µs, longest {found['work_max_us']:.0f} µs"
         + (", with real-time priority" if found["real_time_priority"] else ""),
     ]
-    for line in lines:
-        console.print(line, highlight=False, markup=False)
+    tell(console, f"{title}: {verdict.said}", lines, [shown], verbose=True)

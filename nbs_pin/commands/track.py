@@ -8,20 +8,20 @@ from rich.text import Text
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.records import Run
-from nbs_pin.base.units import column, measured, several
+from nbs_pin.base.units import column
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_numbers
-from nbs_pin.commands.following import figures, not_simulated, track
+from nbs_pin.commands.following import not_simulated, track
 from nbs_pin.commands.inputs import arm_of
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
-from nbs_pin.commands.track_laws import track_laws
+from nbs_pin.commands.results import Results, drawing, keywords, table, tell
+from nbs_pin.commands.track_laws import FILES, PICTURE, files_in, track_laws
 from nbs_pin.motions.by_name import motion_of
 from nbs_pin.reports.plotting import plot_tracking
 from nbs_pin.reports.replay import replay
+from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot
+from nbs_pin.simulation.run_figures import figures
 
-FILES = ("run.npz", "tracking.png", "replay.html", SUMMARY)
-"""Files of `write_results`."""
 _NOTICEABLE = 3.0  # compilation times above this are printed [s]; machine code from disk takes less
 
 
@@ -47,30 +47,31 @@ def run(options: Track, console: Console, notes: Console) -> None:
     if "," in options.controller:
         track_laws(options, robot, given, results, console, notes)
         return
-    results = results.check(FILES, options.force, whole={"interrupted": False})
+    results = results.check((*FILES, PICTURE), options.force, whole={"interrupted": False})
     with results.made() as folder:
         recorded, compile_time, wall_time, interrupted = track(robot, **given, progress=True)
-        recorded.info.update(reference=options.reference, **results.facts)
+        recorded.info.update(reference=options.reference, interrupted=interrupted, **results.facts)
         found = figures(recorded, robot) | {"joint_stops": options.joint_stops}
         found["not_simulated"] = not_simulated(robot, options.joint_friction)
         with notes.status(f"writing run, picture and replay into {folder}"):
             times = {"compile_time_s": compile_time, "wall_time_s": wall_time}
             write_results(recorded, results, robot, found, seed=options.seed, interrupted=interrupted, **times)
-    title = f"{options.controller} in {options.plant}"
-    tell(console, verdict(robot.name, title, found), _lines(found, compile_time, wall_time), [_table(title, found)],
-         verbose=options.verbose)  # fmt: skip
+    title = f"{robot.name}, {options.controller} in {options.plant}"
+    verdict = verdict_of(found, interrupted=interrupted)
+    lines = (*verdict.more, *_lines(found, compile_time, wall_time))
+    tell(console, f"{title}: {verdict.said}", lines, [_table(title, found)], verbose=options.verbose)
     results.show(console, FILES, "replay", results.folder, "--open")
     if interrupted:
         raise KeyboardInterrupt
 
 
 def write_results(run: Run, results: Results, robot: Robot, figures: dict[str, Any], **more: Any) -> None:
-    """Write `FILES`, the run and summary.json first; a picture that cannot be drawn is told in a warning.
+    """Write `track_laws.FILES`, the run and summary.json first; a picture that cannot be drawn is told in a warning.
 
     `more` are further entries of summary.json. Raises OSError if something cannot be written.
     """
     folder = results.folder
-    with results.replaced(FILES, figures, **more) as draft:
+    with results.replaced(files_in(folder), figures, **more) as draft:
         run.save(draft / FILES[0])
     with drawing(folder / FILES[1]) as path:
         plot_tracking(run, path, robot=robot)
@@ -84,17 +85,6 @@ def _start(options: Track, nv: int) -> list[float] | None:
     if start is not None and len(start) != nv:
         raise OptionError(f"--start '{options.start}' has {len(start)} numbers for {nv} joints; give one per joint.")
     return start
-
-
-def verdict(arm: str, title: str, figures: dict[str, Any]) -> str:
-    """Whether the arm follows its motion, since when, and how far the worst joint is off in the end."""
-    errors, units = figures["rms_error_last_30_percent_rad"], figures["units"]["position"]
-    worst = max(range(len(errors)), key=errors.__getitem__)
-    time, norm = figures["convergence_time_s"], f"‖error‖ < 0.1 {several(units)} to the end"
-    follows = "does NOT follow the motion" if time is None else "follows the motion"
-    since = f"nowhere {norm}" if time is None else f"{norm} from {time:.3f} s on"
-    off = f"{figures['joints'][worst]}, the worst joint, is off by {measured(errors[worst], units[worst])} RMS"
-    return f"{arm} {follows} ({title}): {since}; in the last 30 % {off}"
 
 
 def _table(title: str, figures: dict[str, Any]) -> Table:
@@ -116,34 +106,12 @@ def _table(title: str, figures: dict[str, Any]) -> Table:
     return shown
 
 
-def _tool_lines(figures: dict[str, Any]) -> list[str]:
-    """The errors of the tool along its path, if it followed one."""
-    if "tool" not in figures:
-        return []
-    tool = figures["tool"]
-    line = (
-        f"'{tool['frame']}' along the {tool['path']}: RMS error {1e3 * tool['rms_position_error_m']:.2g} mm, peak "
-        f"{1e3 * tool['peak_position_error_m']:.2g} mm"
-    )
-    if tool["orientation"] == "hold":
-        line += (
-            f"; orientation {tool['rms_orientation_error_rad']:.2g} rad, peak "
-            f"{tool['peak_orientation_error_rad']:.2g} rad"
-        )
-    return [line]
-
-
 def _lines(figures: dict[str, Any], compile_time: float, wall_time: float) -> list[str]:
-    saturated, late = figures["saturated_fraction"], figures["saturated_fraction_late"]
-    units = figures["units"]["position"]
-    remedy = f": {option('joint_stops', 'keep')} stops it" if figures["joint_stops"] == "drop" else ""
-    outside = zip(figures["joints"], figures["outside_position_range_rad"], units, strict=True)
+    """What was left out of the simulation, and the time that it took."""
+    outside = figures["joint_stops"] == "drop" and any(figures["outside_position_range_rad"])
     return [
-        *_tool_lines(figures),
-        f"some joint at its effort limit: {saturated:.2%} of the time, {late:.2%} after {figures['late_after_s']:g} s",
-        *(f"{joint} left its range by {excess:.3g} {unit}{remedy}"
-          for joint, excess, unit in outside if excess > 0.0),
+        *([f"joints left their ranges, as none stops them: {option('joint_stops', 'keep')} does"] if outside else []),
         *([f"not simulated: {'; '.join(figures['not_simulated'])}"] if figures["not_simulated"] else []),
         *([f"compiled kernels for this machine in {compile_time:.1f} s, once"] if compile_time > _NOTICEABLE else []),
         f"simulated {figures['duration_s']:g} s in {wall_time:.1f} s",
-    ]  # fmt: skip
+    ]

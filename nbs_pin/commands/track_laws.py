@@ -8,15 +8,30 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nbs_pin.base.summaries import RUN, SUMMARY, runs_of_laws, summary_in
 from nbs_pin.base.units import measured, several
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import SAVED, OptionError
-from nbs_pin.commands.following import Tracked, figures, not_simulated, track
-from nbs_pin.commands.results import SUMMARY, Results, drawing, sha256_of, table, tell
+from nbs_pin.commands.following import Tracked, not_simulated, track
+from nbs_pin.commands.results import Results, drawing, sha256_of, table, tell
+from nbs_pin.reports.captions import settings_in_words
 from nbs_pin.reports.law_charts import plot_laws
+from nbs_pin.reports.plotting import Heading
+from nbs_pin.reports.verdicts import largest_late_errors, verdict_of
 from nbs_pin.robots.robot import Robot
+from nbs_pin.simulation.run_figures import figures
 
+FILES = (RUN, "tracking.png", "replay.html", SUMMARY)
+"""What `nbs-pin track` writes with one law."""
 PICTURE = "comparison.png"
+"""The picture of several laws."""
+
+
+def files_in(folder: Path) -> tuple[str, ...]:
+    """What may be in the folder from a track before, with one law or several, whose place new results take."""
+    found = summary_in(folder).get("figures")
+    laws = found.get("laws") if isinstance(found, Mapping) else None
+    return (*FILES, PICTURE, *runs_of_laws(laws if isinstance(laws, Mapping) else ()).values())
 
 
 def track_laws(
@@ -25,8 +40,8 @@ def track_laws(
     """Track with every law, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     laws = _named(options.controller)
     results.facts["settings"] |= {f"{name}_sha256": sha256_of(Path(law)) for name, law in laws.items() if law != name}
-    files = {name: f"run-{name}.npz" for name in laws}
-    results = results.check((*files.values(), PICTURE, SUMMARY), options.force, whole={"interrupted": False})
+    files = runs_of_laws(laws)
+    results = results.check((*FILES, *files.values(), PICTURE), options.force, whole={"interrupted": False})
     done: dict[str, Tracked] = {}
     with results.made() as folder:
         for name, law in laws.items():
@@ -36,23 +51,26 @@ def track_laws(
                 if not done:
                     raise
                 break
-            done[name].run.info.update(reference=options.reference, **results.facts)
+            one = results.facts | {"settings": results.facts["settings"] | {"controller": law}}
+            done[name].run.info.update(reference=options.reference, interrupted=done[name].interrupted, **one)
             if done[name].interrupted:
                 break
         interrupted = len(done) < len(laws) or any(tracked.interrupted for tracked in done.values())
         found: dict[str, Any] = {"laws": {name: figures(tracked.run, robot) for name, tracked in done.items()}}
         found["not_simulated"] = not_simulated(robot, options.joint_friction)
-        earlier = [path.name for path in folder.glob("run-*.npz")]
+        verdict = verdict_of(found, interrupted=interrupted)
         with notes.status(f"writing runs and picture into {folder}"):
-            with results.replaced((*files.values(), *earlier, PICTURE), found, interrupted=interrupted) as draft:
+            names = dict.fromkeys((*files.values(), *files_in(folder)))
+            with results.replaced(tuple(names), found, interrupted=interrupted) as draft:
                 for name, tracked in done.items():
                     tracked.run.save(draft / files[name])
             with drawing(folder / PICTURE) as path:
-                title = f"{robot.name} · {options.reference} · {1e3 * options.period:g} ms · {options.plant}"
-                plot_laws({name: tracked.run for name, tracked in done.items()}, path, title=title)
+                runs = {name: tracked.run for name, tracked in done.items()}
+                settings = settings_in_words(next(iter(runs.values())))
+                plot_laws(runs, path, Heading(f"{robot.name}: {', '.join(runs)}", settings, verdict))
     shown = [_table(found["laws"])]
     left_out = [f"not simulated: {'; '.join(found['not_simulated'])}"] if found["not_simulated"] else []
-    tell(console, _verdict(robot.name, found["laws"]), left_out, shown, verbose=True)
+    tell(console, f"{robot.name}: {verdict.said}", [*verdict.more, *left_out], shown, verbose=True)
     results.show(console, (*files.values(), PICTURE, SUMMARY), "replay", folder / files[next(iter(done))], "--open")
     if interrupted:
         raise KeyboardInterrupt
@@ -64,24 +82,6 @@ def _named(text: str) -> dict[str, str]:
     if len(laws) < len(text.split(",")):
         raise OptionError(f"--controller is '{text}', where two laws have one name; rename a file.")
     return laws
-
-
-def _late(found: Mapping[str, Any]) -> tuple[float, str, str]:
-    """The largest RMS error of a joint in the last 30 %, with its unit, and the joint."""
-    of = zip(found["rms_error_last_30_percent_rad"], found["units"]["position"], found["joints"], strict=True)
-    return max(of)
-
-
-def _verdict(arm: str, found: Mapping[str, Mapping[str, Any]]) -> str:
-    """Which law is off the least in the end, beside the others that follow the motion."""
-    following = [name for name, of in found.items() if of["convergence_time_s"] is not None]
-    if not following:
-        return f"{arm}: none of {', '.join(found)} follows the motion"
-    least, *others = sorted(following, key=lambda name: _late(found[name]))
-    told = (
-        f"{arm}: {least} is off the least, {measured(*_late(found[least])[:2])} RMS in the last 30 % at its worst joint"
-    )
-    return "; ".join([told, *(f"{name} {measured(*_late(found[name])[:2])}" for name in others)])
 
 
 def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -96,8 +96,8 @@ def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
         first="law",
     )
     for name, of in found.items():
-        error, unit, _ = _late(of)
+        late = " and ".join(measured(error, unit) for error, unit, _ in largest_late_errors(of))
         near = "never" if of["convergence_time_s"] is None else f"{of['convergence_time_s']:.3f} s"
-        cells = near, measured(error, unit), f"{of['peak_torque_Nm']:.4g}", f"{of['saturated_fraction']:.2%}"
+        cells = near, late, f"{of['peak_torque_Nm']:.4g}", f"{of['saturated_fraction']:.2%}"
         shown.add_row(Text(name), *cells)
     return shown

@@ -1,18 +1,21 @@
 """`nbs-pin train`: train a controller through the closed loop, and compare before and after on fresh starts."""
 
+import shlex
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.text import Text
 
+from nbs_pin.base.doors import typed_command
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
+from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, several
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import plain_numbers
 from nbs_pin.commands.inputs import arm_of, law_of
-from nbs_pin.commands.results import SUMMARY, Results, drawing, keywords, table, tell
+from nbs_pin.commands.results import Results, drawing, keywords, table, tell
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import Sinusoid, check_reference
@@ -57,12 +60,25 @@ def run(options: Train, console: Console, notes: Console) -> None:
         interrupted = result.training.stopped == "interrupted"
         with notes.status(f"drawing the picture into {folder}"):
             found = write_results(result, results, interrupted=interrupted)
-    _print(console, f"{robot.name}, {options.controller}", found, verbose=options.verbose)
-    resumed = ("train", options.robot, "--resume", "--out", results.folder)
-    tracked = ("track", options.robot, "--controller", results.folder / FILES[0], "--period", f"{options.period:g}")
-    results.show(console, FILES, *(resumed if interrupted else tracked))
+    _print(console, f"{robot.name}, {options.controller}", found, verbose=options.verbose, interrupted=interrupted)
+    results.show(console, FILES, *(_resumed(results.folder) if interrupted else _tracked(options, results.folder)))
     if interrupted:
         raise KeyboardInterrupt
+
+
+def _resumed(folder: Path) -> list[str]:
+    """The command that was typed, as it goes on in the folder: with other settings it would be another training."""
+    typed = [word for word in shlex.split(typed_command())[1:] if word not in ("--force", "--resume")]
+    if not any(word.partition("=")[0] == "--out" for word in typed):
+        typed += ["--out", str(folder)]
+    return [*typed, "--resume"]
+
+
+def _tracked(options: Train, folder: Path) -> list[str]:
+    """The command that tracks with the law, on the arm that it was trained for."""
+    command = ["track", options.robot, "--controller", str(folder / FILES[0]), "--period", f"{options.period:g}"]
+    limit = [] if options.effort_limit is None else ["--effort-limit", f"{options.effort_limit:g}"]
+    return [*command, *limit, *(["--no-effort-limit"] if options.no_effort_limit else []), *options.arm.typed()]
 
 
 class Trained(NamedTuple):
@@ -142,6 +158,7 @@ def figures(result: Trained) -> dict[str, Any]:
             "seconds": training.seconds,
             "units": {name: several(given) for name, given in by_quantity(result.before.slides).items()},
             "fresh_starts": result.before.q.shape[1],
+            "fresh_duration_s": result.before.t[-1],
             "before": fresh_figures(result.before),
             "after": fresh_figures(result.after),
         }
@@ -159,11 +176,11 @@ def write_results(result: Trained, results: Results, *, interrupted: bool) -> di
     with drawing(results.folder / FILES[1]) as path:
         settings = chosen(results.facts["settings"], "bandwidth", "period", "start_error", "cost", "optimiser", "seed")
         title = f"{arm_in_words(result.after)}: {law_in_words(result.after)}, trained"
-        plot_training(*shown, path, Heading(title, settings, verdict_of(numbers)))
+        plot_training(*shown, path, Heading(title, settings, verdict_of(numbers, interrupted=interrupted)))
     return numbers
 
 
-def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool) -> None:
+def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool, interrupted: bool) -> None:
     """Print the gain, and a row per figure, before and after training; `figures` from the function of that name."""
     shown = table(title, "before", "after", first="")
     for name in ("training", "held-out"):
@@ -181,22 +198,15 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     )
     shown.add_row(Text("some joint at its limit"), *(_number(on["saturated_fraction"], ".2%") for on in both))
     ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
-    before, after = (_seconds(on["convergence_time_median_s"]) for on in both)
-    verdict = (
-        f"{title}: held-out cost lowered by {_number(figures['held_out_cost_lowered_by'], '.1%')}; half of the fresh "
-        f"starts have converged after {after}, {before} before training"
-    )
+    verdict = verdict_of(figures, interrupted=interrupted)
     lines = (
+        *verdict.more,
         f"converged means ‖error‖ < 0.1 {figures['units']['position']} to the end, "
         f"over {figures['fresh_starts']} fresh starts",
         f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
         f"the best after {figures['best_epoch']}",
     )
-    tell(console, verdict, lines, [shown], verbose=verbose)
-
-
-def _seconds(time: float | None) -> str:
-    return "no time" if time is None else f"{time:.3f} s"
+    tell(console, f"{title}: {verdict.said}", lines, [shown], verbose=verbose)
 
 
 def _number(value: float | None, form: str) -> str:

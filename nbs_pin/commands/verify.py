@@ -1,13 +1,12 @@
 """`nbs-pin verify`: a certificate file checked again by an independent program."""
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.verify import Verify
-from nbs_pin.commands.results import tell
+from nbs_pin.commands.results import tell, titled
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.verification.stated import FALSE, OPEN, TAKEN, VERIFIED
 from nbs_pin.verification.verify import Verification, verify
@@ -32,7 +31,7 @@ def run(options: Verify, console: Console, notes: Console) -> int:
 
 
 def _table(title: str, found: Verification, status: str) -> Table:
-    table = Table(title=Text(title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", show_header=False)
+    table = titled(title, heads=False)
     table.add_column(overflow="fold")
     table.add_column(overflow="fold")
     style = "bold red" if status in (FALSE, OPEN) else ""

@@ -15,7 +15,7 @@ from nbs_pin.identification.compatibility import arm_fault, other_data_fault
 from nbs_pin.identification.datasets import DATA, Dataset
 from nbs_pin.identification.doubts import doubts
 from nbs_pin.identification.fit_report import FitReport, torque_nmse, zero_torque_nmse
-from nbs_pin.identification.fitters import FitTask
+from nbs_pin.identification.fitters import FitTask, LearnedDynamics
 from nbs_pin.identification.identify import sign_fault
 from nbs_pin.identification.registry import MODELS
 from nbs_pin.robots.robot import ARM, Robot
@@ -45,7 +45,7 @@ def fit(
     friction: bool = False,
     progress: bool = False,
     **settings: Any,
-) -> DynamicsProvider:
+) -> LearnedDynamics:
     """Fit a model of the arm to the data; its `report` is a `FitReport`, its `friction` the learned friction.
 
     Args:

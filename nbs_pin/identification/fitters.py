@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.registry import NETWORKS, make_network
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.identification.chain_fit import fit_chain
@@ -24,6 +23,9 @@ from nbs_pin.identification.network_equations import deviation_of
 from nbs_pin.identification.network_fit import NetworkFit, fit_network
 from nbs_pin.identification.unidentifiable import unidentifiable
 from nbs_pin.robots.robot import Robot
+
+LearnedDynamics: TypeAlias = LagrangianDynamics | IdentifiedDynamics
+"""What `fit` makes: a model with its `friction` and its `report`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,7 @@ class FitTask:
 class Fitted:
     """Result of a fitter."""
 
-    assemble: Callable[[FitReport | None], DynamicsProvider]
+    assemble: Callable[[FitReport | None], LearnedDynamics]
     """Builds the model with its report."""
     friction: JointFriction | None
     parameters: int
@@ -124,7 +126,7 @@ def fit_residual(task: FitTask) -> Fitted:
         make, task.data, task.held_out, seed=task.seed, friction=task.friction, progress=task.progress, **settings
     )
 
-    def assemble(report: FitReport | None) -> DynamicsProvider:
+    def assemble(report: FitReport | None) -> LearnedDynamics:
         network = found.network
         assert isinstance(network, ResidualNetwork)
         return ResidualDynamics(network, found.friction, report)
@@ -132,7 +134,7 @@ def fit_residual(task: FitTask) -> Fitted:
     return _of_network(task, found, assemble)
 
 
-def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport | None], DynamicsProvider]) -> Fitted:
+def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport | None], LearnedDynamics]) -> Fitted:
     names = () if task.robot is None else task.robot.joint_names
     loss = task.settings.get("loss", "torque")
     return Fitted(
@@ -153,7 +155,7 @@ def fit_identified(task: FitTask) -> Fitted:
     found = identify(task.data, _needed(task), friction=task.friction, **settings)
     numbers, report = found.parameters.size, found.report
 
-    def assemble(own: FitReport | None) -> DynamicsProvider:
+    def assemble(own: FitReport | None) -> LearnedDynamics:
         return IdentifiedDynamics(_needed(task), found.parameters, found.friction, found.rotor_inertia, own)
 
     return Fitted(

@@ -47,14 +47,14 @@ def settings_in_words(run: Run) -> list[str]:
     given = given if isinstance(given, Mapping) else {}
     saved = str(given.get("controller", "")).endswith(".nbs")
     phrases = [
-        f"ω = {given['bandwidth']:g} rad/s" if "bandwidth" in given and not saved else "",
+        f"ω = {given['bandwidth']:g} rad/s" if given.get("bandwidth") is not None and not saved else "",
         f"control every {1e3 * run.period:g} ms",
         _motion(run, given),
         _start(given),
         "" if given.get("disturbance") in (None, "none") else f"disturbance {given['disturbance']}",
         *_plant(str(run.info.get("plant") or ""), given),
         *(f"{name.replace('_', ' ')} {_told(value)}" for name, value in (given.get("arm") or {}).items()),
-        f"seed {given['seed']}" if "seed" in given else "",
+        f"seed {given['seed']}" if given.get("seed") is not None else "",
     ]
     return [phrase for phrase in phrases if phrase]
 
@@ -73,7 +73,7 @@ def chosen(settings: Mapping[str, Any], *names: str) -> list[str]:
 
 def _motion(run: Run, given: Mapping[str, Any]) -> str:
     motion = str(run.info.get("reference") or "").rsplit("/", 1)[-1]
-    return f"{motion} at {given['frequency']:g} rad/s" if motion == "sinusoid" and "frequency" in given else motion
+    return f"{motion} at {given['frequency']:g} rad/s" if motion == "sinusoid" and given.get("frequency") else motion
 
 
 def _start(given: Mapping[str, Any]) -> str:

@@ -29,7 +29,7 @@ from nbs_pin.reports.plotting import (
     stretches,
     thin,
 )  # fmt: skip
-from nbs_pin.reports.verdicts import BAD, GOOD, WARNING, Verdict
+from nbs_pin.reports.verdicts import BAD, Verdict, monitor_level
 from nbs_pin.robots.robot import configuration_difference
 
 _DASHED, _DOTTED = (0, (5, 3)), (0, (1, 2))
@@ -58,9 +58,9 @@ def plot_monitor(
     its terms; and when each assumption failed. Saturated stretches are shaded, exceeded bounds are marked. units: of
     every joint's error; title and settings: above it, with the verdict.
     """
-    rows, verdict = max(len(monitored.failures), 1), monitored.verdict
-    level = BAD if not monitored.is_kept else WARNING if monitored.broken else GOOD
-    heading = Heading(title, settings, Verdict(level, f"{verdict[0].upper()}{verdict[1:]}."))
+    rows = max(len(monitored.failures), 1)
+    level = monitor_level(is_kept=monitored.is_kept, broken=monitored.broken)
+    heading = Heading(title, settings, Verdict(level, monitored.verdict))
     with picture(path, 11.0, 8.6 + 0.34 * rows, heading=heading) as figure:
         heights = [2.6, 1.8, 3.0, 0.35 + 0.34 * rows]
         storage, error, terms, flags = figure.subplots(4, 1, sharex=True, height_ratios=heights)
@@ -89,9 +89,9 @@ def plot_certificate(
     settings and a verdict may stand below it.
     """
     if certificate.void:
-        verdict = Verdict(BAD, f"The bounds are void, as these conditions fail: {'; '.join(certificate.void)}.")
+        verdict = Verdict(BAD, f"the bounds are void, as these conditions fail: {'; '.join(certificate.void)}")
     arm = "" if certificate.robot is None else f"{certificate.robot.name}, "
-    heading = Heading(f"{arm}{certificate.disturbance}: {certificate.label}", settings, verdict)
+    heading = Heading(f"{arm}{certificate.disturbance}: {certificate.label}, in {certificate.clock}", settings, verdict)
     size = (6.4, 4.6) if attack is None else (11.0, 5.0)
     with picture(path, *size, heading=heading) as figure:
         if attack is None:
@@ -191,14 +191,17 @@ def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) ->
     axes.barh(at, bounds, height=0.7, color=LIMIT, alpha=0.35, label="void" if certificate.void else "certified")
     found = np.zeros(len(at)) if attack is None else attack.joint_errors
     axes.barh(at, found, height=0.38, color=ERROR, label="worst found")
+    if certificate.overshoot is not None:
+        axes.plot(certificate.overshoot[1], at, "|", color=INK, markersize=14, label="from the start given")
     for y, bound, end, unit in zip(at.tolist(), bounds.tolist(), np.maximum(bounds, found), units, strict=True):
         axes.annotate(f" {measured(bound, unit)}", (end, y), va="center", fontsize=7.5, color=NOTE)
     axes.set_yticks(at, [_plain(name) for name in certificate.joint_names])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
-    axes.set_xlim(0.0, 1.35 * float(max(bounds.max(), found.max())) or 1.0)
+    most = max(bounds.max(), found.max(), 0.0 if certificate.overshoot is None else certificate.overshoot[1].max())
+    axes.set_xlim(0.0, 1.35 * float(most) or 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    title = f"error of each joint, |z1| [{several(units)}]"
+    title = f"error of each joint in the long run, |z1| [{several(units)}]"
     if attack is not None:
         _title(axes, title)
         return

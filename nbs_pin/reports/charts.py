@@ -19,9 +19,11 @@ FAR = 1000.0
 """Motions are not drawn where ‖z1‖ exceeds this [rad]."""
 
 
-def plot_scaling(joints: Sequence[float], series: Mapping[str, Sequence[float]], path: str | Path) -> Path:
+def plot_scaling(
+    joints: Sequence[float], series: Mapping[str, Sequence[float]], path: str | Path, heading: Heading | None = None
+) -> Path:
     """Plot cost [µs] against the number of joints, one line per series, and write the picture; returns its path."""
-    with picture(path, 6.4, 4.0) as figure:
+    with picture(path, 6.4, 4.4, heading=heading) as figure:
         axes = figure.add_subplot()
         for (name, values), colour in zip(series.items(), (ACTUAL, REFERENCE, TORQUE, ERROR), strict=False):
             axes.plot(joints, values, "o-", color=colour, markersize=3.5, label=name)

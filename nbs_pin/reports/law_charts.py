@@ -7,21 +7,21 @@ import numpy as np
 
 from nbs_pin.base.records import Run
 from nbs_pin.base.units import several
-from nbs_pin.reports.plotting import ACTUAL, ERROR, FAST, LIMIT, REFERENCE, TORQUE, picture, thin
+from nbs_pin.reports.plotting import ACTUAL, ERROR, FAST, LIMIT, REFERENCE, TORQUE, Heading, picture, thin
 from nbs_pin.simulation.metrics import squared_error
 
 _COLOURS = (ACTUAL, REFERENCE, TORQUE, FAST, ERROR, "#8c564b", "#17a2b8", "#6c757d")
 _DASHES = ("solid", (0, (5, 2)), (0, (1, 1.2)))
 
 
-def plot_laws(runs: Mapping[str, Run], path: str | Path, *, title: str = "") -> Path:
-    """Plot the error and the torque of several laws on one motion and write the picture (PNG); returns its path.
+def plot_laws(runs: Mapping[str, Run], path: str | Path, heading: Heading | None = None) -> Path:
+    """Plot error and torque of several laws on one motion, write the picture (`plotting.picture`) and return its path.
 
     Left: ‖z1‖ over time, logarithmic. Right: the largest |τ_i| over the joints, as a share of its effort limit, where
     the arm has limits.
     """
     first = next(iter(runs.values()))
-    with picture(path, 11.0, 4.2) as figure:
+    with picture(path, 11.0, 4.2, heading=heading) as figure:
         errors, torques = figure.subplots(1, 2)
         limited = bool(np.isfinite(first.effort_limit).any())
         for k, (name, run) in enumerate(runs.items()):
@@ -39,5 +39,4 @@ def plot_laws(runs: Mapping[str, Run], path: str | Path, *, title: str = "") -> 
         for axes in (errors, torques):
             axes.set(xlabel="time [s]", xlim=(first.t[0], first.t[-1]))
         errors.legend(frameon=False)
-        figure.suptitle(title.replace("$", r"\$"), x=0.008, ha="left", fontsize=12, fontweight="bold", color="#1d2733")
     return Path(path)

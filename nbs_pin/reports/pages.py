@@ -12,6 +12,8 @@ import numpy as np
 
 _PARTS = ("page.css", "clock.js", "charts.js", "scene.js", "uPlot.iife.min.js", "uPlot.min.css", "uPlot.LICENSE")
 """Files beside the templates that every page contains, each at the placeholder of its name."""
+_HEAD = "head.html"
+"""The first lines of every template."""
 
 
 def page(template: str, title: str, data: Mapping[str, Any], **more: str) -> bytes:
@@ -21,15 +23,16 @@ def page(template: str, title: str, data: Mapping[str, Any], **more: str) -> byt
     """
     folder, viewer = importlib.resources.files("nbs_pin.reports") / "assets", _viewer()
     holes = {name: (folder / name).read_text(encoding="utf-8") for name in _PARTS}
-    head, _, holes["uPlot.iife.min.js"] = holes["uPlot.iife.min.js"].partition("\n")  # a comment with its address
+    first, _, holes["uPlot.iife.min.js"] = holes["uPlot.iife.min.js"].partition("\n")  # a comment with its address
     holes |= more | {
         "title": html.escape(title),
-        "licences": html.escape(f"{head}\n{holes['uPlot.LICENSE']}\n\n{viewer['main.min.js.LICENSE.txt']}"),
+        "licences": html.escape(f"{first}\n{holes['uPlot.LICENSE']}\n\n{viewer['main.min.js.LICENSE.txt']}"),
         "meshcat": viewer["main.min.js"],
         # "<" would let a name end the script element
         "data": json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
     }
-    text = (folder / template).read_text(encoding="utf-8")
+    head, text = ((folder / name).read_text(encoding="utf-8") for name in (_HEAD, template))
+    text = text.replace(f"{{{{{_HEAD}}}}}\n", head)  # it has placeholders of its own
     return re.sub(r"\{\{([\w.]+)\}\}", lambda hole: holes[hole[1]], text).encode()
 
 

@@ -23,13 +23,13 @@ from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import ROW_ARRAYS, RUN, Run
-from nbs_pin.base.units import by_quantity
 from nbs_pin.reports.captions import arm_in_words, law_in_words, settings_in_words
 from nbs_pin.reports.verdicts import BAD, GOOD, WARNING, Verdict, verdict_of
 from nbs_pin.robots.named import robot_of
 from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 from nbs_pin.robots.urdf import JointData
-from nbs_pin.simulation.metrics import saturated_fraction, summary
+from nbs_pin.simulation.metrics import saturated_fraction
+from nbs_pin.simulation.run_figures import figures
 from nbs_pin.simulation.tool_errors import tool_errors, tool_of
 
 ACTUAL, REFERENCE, ERROR = "#1f5fbf", "#ff8c1a", "#b3261e"
@@ -138,8 +138,9 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
     fraction = float(saturated_fraction(one))
     decades = [_decades(error[:, [of is other for other in run.units]]) for of in run.units]
     tool = tool_of(run)
+    robot = robot_of(run) if robot is None and tool is not None else robot
     rows = run.nv + (tool is not None)
-    with picture(path, 13.0, 1.15 + 1.5 * rows + (1.5 if tool else 0.0), heading=_heading(one)) as figure:
+    with picture(path, 13.0, 1.15 + 1.5 * rows + (1.5 if tool else 0.0), heading=_heading(one, robot)) as figure:
         heights = [1.0] * run.nv + [2.0] * (tool is not None)
         grid = figure.subplots(rows, 3, sharex=True, squeeze=False, height_ratios=heights)
         for joint, (position_axes, error_axes, torque_axes) in enumerate(grid[: run.nv]):
@@ -156,16 +157,18 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
                                   color=NOTE)  # fmt: skip
         _dress(figure, grid, run, fraction)
         if tool is not None:
-            _draw_tool(figure, grid[-1], one, robot_of(run) if robot is None else robot, tool)
+            assert robot is not None
+            _draw_tool(figure, grid[-1], one, robot, tool)
     return Path(path)
 
 
-def _heading(run: Run) -> Heading:
+def _heading(run: Run, robot: Robot | None) -> Heading:
     """Arm, law and settings, and what the errors of one start amount to, if they can be summed up."""
+    title, stopped = f"{arm_in_words(run)}: {law_in_words(run)}", {"stopped": run.info.get("stopped")}
     if len(run.t) < 3 or not np.isfinite(run.q).all():
-        return Heading(f"{arm_in_words(run)}: {law_in_words(run)}", settings_in_words(run))
-    figures = summary(run) | {"units": by_quantity(run.slides)}
-    return Heading(f"{arm_in_words(run)}: {law_in_words(run)}", settings_in_words(run), verdict_of(figures))
+        return Heading(title, settings_in_words(run), verdict_of(stopped) if stopped["stopped"] else None)
+    verdict = verdict_of(figures(run, robot) | stopped, interrupted=run.info.get("interrupted") is True)
+    return Heading(title, settings_in_words(run), verdict)
 
 
 def _draw_tool(figure: Figure, row: np.ndarray, run: Run, robot: Robot, tool: dict[str, Any]) -> None:

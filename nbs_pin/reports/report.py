@@ -4,7 +4,7 @@ import base64
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from markdown_it import MarkdownIt
 from nbs_pin.base.exceptions import FileFormatError, NbsPinError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import Run
-from nbs_pin.base.summaries import SUMMARY, summary_in
+from nbs_pin.base.summaries import RUN, SUMMARY, runs_of_laws, summary_in
 from nbs_pin.reports.captions import arm_in_words, law_in_words, settings_in_words
 from nbs_pin.reports.pages import page
 from nbs_pin.reports.replay import shown_run
@@ -30,10 +30,9 @@ from nbs_pin.reports.signals import MAX_ROWS
 from nbs_pin.reports.verdicts import Verdict, verdict_of
 from nbs_pin.robots.named import robot_of
 
-_RUN, _PAGE = "run.npz", "report.md"
+_PAGE = "report.md"
 _DRAWN = ("tracking.png",)
 """Pictures that the charts show better."""
-_PER_JOINT = ("rms_error_rad", "rms_error_late_rad", "joint_peak_torque_Nm", "rms_test_torque_error_Nm")
 _MOST_PICTURES = 12e6
 """Pictures in all are at most this large [bytes]; further ones are named."""
 
@@ -45,7 +44,8 @@ class _Result:
     folder: Path
     label: str
     summary: Mapping[str, Any]
-    run: Run | None
+    runs: Mapping[str, Run]
+    """The runs in it, by what they are called on the page."""
 
     @property
     def figures(self) -> Mapping[str, Any]:
@@ -53,8 +53,14 @@ class _Result:
         return found if isinstance(found, Mapping) else {}
 
     @property
+    def parts(self) -> dict[str, Mapping[str, Any]]:
+        """The figures by what they are called on the page: of several laws, those of each."""
+        laws = self.figures.get("laws")
+        return {_of_law(self.label, law): of for law, of in laws.items()} if laws else {self.label: self.figures}
+
+    @property
     def verdict(self) -> Verdict:
-        return verdict_of(self.figures)
+        return verdict_of(self.figures, interrupted=self.summary.get("interrupted") is True)
 
 
 def report(folders: Sequence[Path], path: Path) -> Path:
@@ -74,7 +80,7 @@ def report(folders: Sequence[Path], path: Path) -> Path:
         "heading": html.escape(title),
         "verdicts": "".join(_card(result) for result in results),
         "comparison": _comparison(results),
-        "details": "".join(_details(result, missing.get(result.label, "")) for result in results),
+        "details": "".join(_details(result, missing) for result in results),
         "absent": "" if runs else "absent",
     }
     return write_whole(path, page("report.html", title, {"runs": runs}, **body))
@@ -89,28 +95,37 @@ def _results(folders: Sequence[Path]) -> list[_Result]:
         label = folder.resolve().name
         if label in [result.label for result in results]:
             label = str(folder)
-        run = Run.load(folder / _RUN) if (folder / _RUN).is_file() else None
-        results.append(_Result(folder, label, summary, run))
+        files = {label: RUN} | {_of_law(label, law): file for law, file in runs_of_laws(_laws(summary)).items()}
+        runs = {name: Run.load(folder / file) for name, file in files.items() if (folder / file).is_file()}
+        results.append(_Result(folder, label, summary, runs))
     return results
 
 
+def _laws(summary: Mapping[str, Any]) -> Iterable[str]:
+    found = summary.get("figures")
+    return found["laws"] if isinstance(found, Mapping) and "laws" in found else ()
+
+
+def _of_law(label: str, law: str) -> str:
+    return f"{label}, {law}"
+
+
 def _runs(results: Sequence[_Result]) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """What the page shows of the runs, and why some arms are not drawn, by label."""
-    moved = [result for result in results if result.run is not None]
+    """What the page shows of the runs, and why some arms are not drawn, by what the runs are called."""
+    moved = [(label, run) for result in results for label, run in result.runs.items()]
     shown: list[dict[str, Any]] = []
     missing, built = {}, dict[tuple[str, str], int]()
-    for result in moved:
-        assert result.run is not None
+    for label, run in moved:
         try:
-            one = shown_run(result.run, robot_of(result.run), most=3 * MAX_ROWS // max(3, len(moved)))
+            one = shown_run(run, robot_of(run), most=3 * MAX_ROWS // max(3, len(moved)))
         except NbsPinError as error:
-            missing[result.label] = str(error)
+            missing[label] = str(error)
             continue
-        arm = result.run.robot, result.run.robot_sha256
+        arm = run.robot, run.robot_sha256
         if arm in built:  # the same arm is on the page once
             one["scene"]["commands"] = built[arm]
         built.setdefault(arm, len(shown))
-        shown.append(one | {"label": result.label})
+        shown.append(one | {"label": label})
     return shown, missing
 
 
@@ -120,67 +135,59 @@ def _title(results: Sequence[_Result]) -> str:
 
 
 def _arm(result: _Result) -> str:
-    if result.run is not None:
-        return arm_in_words(result.run)
+    for run in result.runs.values():
+        return arm_in_words(run)
     settings = result.summary.get("settings", {})
     named = next((settings[key] for key in ("robot", "against") if settings.get(key)), result.label)
     return Path(str(named)).stem
 
 
 def _card(result: _Result) -> str:
-    level, text = result.verdict
-    facts = [law_in_words(result.run), *settings_in_words(result.run)] if result.run is not None else []
+    runs = list(result.runs.values())
+    facts = [*dict.fromkeys(map(law_in_words, runs)), *(settings_in_words(runs[0]) if runs else [])]
     said = html.escape(" · ".join(facts))
     name = html.escape(result.label)
-    lines = f'<h2>{name}</h2><p>{html.escape(text)}</p><p class="soft">{said}</p>'
-    return f'<section class="card {level}">{lines}</section>'
+    lines = f'<h2>{name}</h2><p>{html.escape(result.verdict.text)}</p><p class="soft">{said}</p>'
+    return f'<section class="card {result.verdict.level}">{lines}</section>'
 
 
 def _comparison(results: Sequence[_Result]) -> str:
     """Figures of several results in one table, in which a row is a figure."""
-    if len(results) == 1 or not any(result.figures for result in results):
-        return ""
-    worst = {result.label: _with_worst(result.figures) for result in results}
-    return f"<h2>Side by side</h2>{numbers_table(worst)}"
+    parts = {label: figures for result in results for label, figures in result.parts.items()}
+    return f"<h2>Side by side</h2>{numbers_table(parts)}" if len(parts) > 1 and any(parts.values()) else ""
 
 
-def _with_worst(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """The figures, of those per joint the largest."""
-    per_joint: dict[str, Any] = {name: figures.get(name) for name in _PER_JOINT}
-    largest = {f"largest_{name}": max(values) for name, values in per_joint.items() if _is_flat(values)}
-    return {**largest, **figures}
-
-
-def _is_flat(values: Any) -> bool:
-    return isinstance(values, list) and bool(values) and not isinstance(values[0], list)
-
-
-def _details(result: _Result, missing: str) -> str:
-    figures, summary = result.figures, result.summary
+def _details(result: _Result, missing: Mapping[str, str]) -> str:
+    figures, summary, lost = result.figures, result.summary, [name for name in result.runs if name in missing]
     parts = [f"<h2>{html.escape(result.label)}</h2>"]
-    if missing:
-        parts.append(f'<p class="warning">The arm is not drawn and the run has no charts: {html.escape(missing)}</p>')
+    for name in lost:
+        whose = f"{html.escape(name)}: " if len(result.runs) > 1 else ""
+        why = f"The arm is not drawn and the run has no charts: {html.escape(missing[name])}"
+        parts.append(f'<p class="warning">{whose}{why}</p>')
     if "certificate" in figures:
         parts.append(certificate_tables(figures))
-    parts.append(joints_table(figures))
+    for label, of in result.parts.items():
+        parts.append(f"<h3>{html.escape(label)}</h3>" if len(result.parts) > 1 else "")
+        parts.append(joints_table(of))
     if isinstance(summary.get("rows"), list):
         parts.append(bench_table(summary["rows"]))
-    pictures = _pictures(result.folder)
+    pictures = _pictures(result.folder, () if lost or not result.runs else _DRAWN)
     if (result.folder / _PAGE).is_file():
         parts.append(_written(result.folder / _PAGE, pictures))
     parts += [
         f"<figure>{image}<figcaption>{html.escape(name)}</figcaption></figure>" for name, image in pictures.items()
     ]
-    parts.append(folded("all figures", numbers_table({"value": figures})))
+    named = result.parts if len(result.parts) > 1 else {"value": figures}
+    parts.append(folded("all figures", numbers_table(named)))
     parts.append(_origin(summary))
     return f"<section>{''.join(parts)}</section>"
 
 
-def _pictures(folder: Path) -> dict[str, str]:
-    """The pictures in the folder by name, each within the page."""
+def _pictures(folder: Path, left_out: Sequence[str]) -> dict[str, str]:
+    """The other pictures in the folder by name, each within the page."""
     found, left = {}, _MOST_PICTURES
     for picture in sorted(folder.glob("*.png")):
-        if picture.name in _DRAWN and (folder / _RUN).is_file():
+        if picture.name in left_out:
             continue
         content, name = picture.read_bytes(), html.escape(picture.name)
         if len(content) > left:

@@ -122,7 +122,7 @@ def attempt(
         return Trial(*case, time.perf_counter() - began, **judge.torque_errors(mlp.torque))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*friction would explain")  # leaving it out is what is studied
-        found: Any = fit(data, model, seed, robot=robot, friction=friction, **settings)
+        found = fit(data, model, seed, robot=robot, friction=friction, **settings)
     if found.report.stopped == "interrupted":
         raise KeyboardInterrupt
     errors = judge.torque_errors(motor_torque(found, found.friction)) | judge.model_errors(found)

@@ -24,8 +24,9 @@ function createCharts(root, runs, clock, shown, height) {
       return Array.from(run.columns.times, (_, row) => all[row * width + k]);
     };
   }
-  const joints = runs[0].joints, tips = runs[0].signals.tips;
-  const sizeOf = (k) => Math.max(...runs.map((run) => (run.joints[k] ? Math.hypot(...run.column("error", k)) : 0)));
+  const joints = matched(runs.map((run) => run.joints.map((joint) => joint.name)));
+  const tips = matched(runs.map((run) => run.signals.tips));
+  const sizeOf = (k) => Math.max(...runs.map((run, r) => (joints[k].at[r] < 0 ? 0 : Math.hypot(...run.column("error", joints[k].at[r])))));
   const worst = () => joints.reduce((most, _, k) => (sizeOf(k) > sizeOf(most) ? k : most), 0);
   const chosen = new Set(several ? [worst()] : joints.map((_, k) => k));
   let tip = 0, plots = [], zooming = false;
@@ -87,11 +88,11 @@ function createCharts(root, runs, clock, shown, height) {
   }
 
   function linesOf(signal, run, index) {   // label, colour, values and dashes of every line of a run
-    const picked = signal.parts[0][0] === "tip" ? [tip] : [...chosen].sort((a, b) => a - b).filter((k) => k < run.joints.length);
-    return picked.flatMap((k) => signal.parts.map(([name, change, dash]) => ({
-      label: several ? run.label : name === "tip" ? tips[k] : run.joints[k].name, dash: dash ?? (several && index > 9 ? [2, 2] : undefined),
-      colour: several ? colour(index) : name === "tip" ? themed("--ink") : colour(k), unit: signal.unit ?? run.joints[k][signal.of],
-      values: run.column(name, k).map((x) => (x = change ? change(x) : x, signal.log && !(x > 0) ? null : x)),
+    const all = signal.parts[0][0] === "tip" ? tips : joints, picked = all === tips ? [tip] : [...chosen].sort((a, b) => a - b);
+    return picked.filter((k) => all[k].at[index] >= 0).flatMap((k) => signal.parts.map(([name, change, dash]) => ({
+      label: several ? run.label : all[k].name, dash: dash ?? (several && index > 9 ? [2, 2] : undefined),
+      colour: several ? colour(index) : all === tips ? themed("--ink") : colour(k), unit: signal.unit ?? run.joints[all[k].at[index]][signal.of],
+      values: run.column(name, all[k].at[index]).map((x) => (x = change ? change(x) : x, signal.log && !(x > 0) ? null : x)),
       width: dash ? 1 : 1.3,
     })));
   }
@@ -116,9 +117,9 @@ function createCharts(root, runs, clock, shown, height) {
     const between = (t) => Math.min(bbox.left + bbox.width, Math.max(bbox.left, plot.valToPos(t, "x", true)));
     ctx.save();
     ctx.fillStyle = colours;
-    for (const run of runs) {
+    for (const [r, run] of runs.entries()) {
       for (const k of chosen) {
-        for (const [begin, end] of run.signals.saturated[k] ?? []) {
+        for (const [begin, end] of run.signals.saturated[joints[k].at[r]] ?? []) {
           const x = between(begin), wide = between(end) - x;
           if (end > plot.scales.x.min && begin < plot.scales.x.max) ctx.fillRect(x, bbox.top, Math.max(wide, 2 * devicePixelRatio), bbox.height);
         }
@@ -186,7 +187,7 @@ function createCharts(root, runs, clock, shown, height) {
 
   function tipChoice() {
     const select = document.createElement("select");
-    tips.forEach((name, k) => select.add(new Option(name, k, k === tip, k === tip)));
+    tips.forEach(({name}, k) => select.add(new Option(name, k, k === tip, k === tip)));
     select.style.height = "22px";
     select.setAttribute("aria-label", "tip");
     select.onchange = () => { tip = Number(select.value); draw(); };
@@ -241,6 +242,16 @@ function createCharts(root, runs, clock, shown, height) {
   }).observe(root);
   draw();
   return {draw, setTip(k) { tip = k; draw(); }, get plots() { return plots.map(({plot}) => plot); }};
+}
+
+// What several runs call their joints or tips, and where each run has it (−1: nowhere): by name where all runs have the same
+// names, in whatever order, and by place in arms that differ.
+function matched(lists) {
+  const [first] = lists, alike = lists.every((names) => names.length === first.length && first.every((name) => names.includes(name)));
+  return Array.from({length: Math.max(...lists.map((names) => names.length))}, (_, k) => ({
+    name: [...new Set(alike ? [first[k]] : lists.flatMap((names) => names[k] ?? []))].join(" / "),
+    at: lists.map((names) => (alike ? names.indexOf(first[k]) : k < names.length ? k : -1)),
+  }));
 }
 
 function powers(low, high) {   // of ten, at most five of them

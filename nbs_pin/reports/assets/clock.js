@@ -61,9 +61,14 @@ function createBar(root, clock, step, keys = {}) {
     label.textContent = `${now.toFixed(2)} / ${clock.end.toFixed(2)} s`;
   });
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || /^(SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
-    const moves = {ArrowLeft: () => step(-1), ArrowRight: () => step(1), Home: () => clock.start, End: () => clock.end};
-    if (event.key === " " && event.target.tagName !== "SUMMARY") { event.preventDefault(); clock.toggle(); }
+    if (event.defaultPrevented || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+    const on = event.target, typed = on.isContentEditable || /^(SELECT|TEXTAREA)$/.test(on.tagName);
+    if (typed || on.tagName === "INPUT" && !/^(range|checkbox)$/.test(on.type)) return;
+    // Space presses what has the focus, and Home and End scroll a page that is longer than the window.
+    const pressed = /^(BUTTON|SUMMARY|A)$/.test(on.tagName) || on.type === "checkbox";
+    const scrolls = on !== slider && document.documentElement.scrollHeight > innerHeight;
+    const moves = {ArrowLeft: () => step(-1), ArrowRight: () => step(1), ...(scrolls ? {} : {Home: () => clock.start, End: () => clock.end})};
+    if (event.key === " " && !pressed) { event.preventDefault(); clock.toggle(); }
     if (moves[event.key]) { event.preventDefault(); clock.pause(); clock.seek(moves[event.key]()); }
     if (keys[event.key]) keys[event.key]();
   });

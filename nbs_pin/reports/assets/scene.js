@@ -21,7 +21,7 @@ function createScene(box, run, clock, room = () => ({left: 0, top: 0, bottom: 0}
   if (!document.createElement("canvas").getContext("webgl2") && !document.createElement("canvas").getContext("webgl")) {
     box.innerHTML = `<p class="absent">${NO_3D}</p>`;
     const nothing = () => {};
-    return {...shared, is3D: false, aim: nothing, showGhost: nothing, showTraces: nothing, chooseTip: nothing, picture: nothing, canvas: null, pose: () => null};
+    return {...shared, is3D: false, aim: nothing, showGhost: nothing, showTraces: nothing, chooseTip: nothing, picture: nothing, canvas: null, pose: () => null, shown: () => []};
   }
 
   // --- meshcat's commands in order, then light, ground and the reference arm
@@ -99,7 +99,7 @@ function createScene(box, run, clock, room = () => ({left: 0, top: 0, bottom: 0}
   // --- the traces of the tip: where it was, and the path or the trace of the reference
   const dark = new THREE.LineBasicMaterial({transparent: true, opacity: .9});
   const pale = new THREE.LineBasicMaterial({transparent: true, opacity: .55});
-  let traces = [];
+  let traces = [], ghostShown = true, tracesShown = true;
 
   function trace(tip, arm, material) {
     const point = new THREE.Vector3(), turn = new THREE.Quaternion(), points = new Float32Array(3 * times.length);
@@ -121,12 +121,18 @@ function createScene(box, run, clock, room = () => ({left: 0, top: 0, bottom: 0}
     return new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({color: themed("--path"), transparent: true, opacity: .8}));
   }
   function chooseTip(k) {
-    const shown = traces.map((line) => line.visible), tip = data.tips[k];
+    const tip = data.tips[k];
     viewer.scene.remove(...traces);
     traces = [trace(tip, 0, dark), k === 0 && tube ? tube : trace(tip, 1, pale)];
-    traces.forEach((line, i) => { line.visible = shown[i] ?? true; });
     viewer.scene.add(...traces);
+    uncover();
     show();
+  }
+  function uncover() {   // the trace of the reference belongs to both switches; the path that was asked for, to one
+    ghost.visible = ghostShown;
+    traces[0].visible = tracesShown;
+    traces[1].visible = tracesShown && (ghostShown || traces[1] === tube);
+    viewer.set_dirty();
   }
 
   function dress() {
@@ -193,8 +199,9 @@ function createScene(box, run, clock, room = () => ({left: 0, top: 0, bottom: 0}
 
   return {
     ...shared, is3D: true, chooseTip, aim(again = false) { moved &&= !again; aim(); },
-    showGhost(is) { ghost.visible = is; if (traces[1] !== tube) traces[1].visible = is; viewer.set_dirty(); },
-    showTraces(is) { traces.forEach((line) => { line.visible = is; }); viewer.set_dirty(); },
+    showGhost(is) { ghostShown = is; uncover(); },
+    showTraces(is) { tracesShown = is; uncover(); },
+    shown: () => [ghost, ...traces].map((object) => object.visible),
     canvas: viewer.renderer.domElement,
     picture(done) { viewer.render(); viewer.renderer.domElement.toBlob(done, "image/png"); },
     pose(link, arm = "actual") {   // the link's pose in the robot's base frame, 16 numbers, column-major
