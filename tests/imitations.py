@@ -32,6 +32,7 @@ public:
   virtual CallbackReturn on_activate(const rclcpp_lifecycle::State &) = 0;
   virtual return_type update_and_write_commands(const rclcpp::Time &, const rclcpp::Duration &) = 0;
   std::shared_ptr<Node> get_node() const { return std::make_shared<Node>(); }
+  unsigned int get_update_rate() const { return 1000; }
   template <typename T> T auto_declare(const std::string &, const T & given) { return given; }
 protected:
   virtual std::vector<hardware_interface::CommandInterface> on_export_reference_interfaces() = 0;
@@ -73,8 +74,10 @@ struct Driven : LAW::Controller {
     for (int i = 0; i < LAW::n; i++) { q[i] = r[i] = 0.1 * i; v[i] = 0.1 * (LAW::n + i); }
     r[0] = 0.3;
     LAW_start(&own, zero);
+    LAW_torque(&own, q, zero, q, zero, zero, 0.001, tau);
+    LAW_start(&own, tau);
     LAW_step(&own, q, v, r, zero, zero, 0.001, tau);
-    if (update_and_write_commands({}, {0.001}) != controller_interface::return_type::OK) return false;
+    if (update_and_write_commands({}, {0.005}) != controller_interface::return_type::OK) return false;
     for (int i = 0; i < LAW::n; i++) if (command[i] != tau[i]) return false;
     state[0] = std::nan("");
     for (int k = 0; k < 19; k++)
