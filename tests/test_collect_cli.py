@@ -60,7 +60,7 @@ def test_the_table_is_the_summary(tmp_path, capsys):
     assert run(tmp_path / "x") == 0
     printed, figures = capsys.readouterr().out, summary(tmp_path / "x")["figures"]
     for joint in range(2):
-        row = next(line for line in printed.splitlines() if figures["joints"][joint] in line).split()
+        (row,) = (row for row in map(str.split, printed.splitlines()) if row[:1] == [figures["joints"][joint]])
         assert row[1:3] == [f"{figures[key][joint]:.3g}" for key in ("q_least_rad", "q_most_rad")]
         assert row[-1] == f"{figures['at_torque_limit_fraction'][joint]:.1%}"
     assert "80 samples of 2 trajectories" in printed
