@@ -5,6 +5,7 @@ Run as a program. It prints its address, takes one fault per line ("drop 10", "l
 slow machine loses no packet that is not meant to be lost.
 """
 
+import itertools
 import json
 import queue
 import struct
@@ -25,7 +26,7 @@ LOST = 20  # commands in a row without which the arm stops by itself
 class Wire(FrankaRobotServer):
     def __init__(self, robot):
         super().__init__(robot, LocalHostnames())
-        self.sent, self.heard, self.answered, self.silent = [], False, True, 0
+        self.sent, self.heard, self.answered, self.silent, self.begun = [], False, True, 0, False
         self.drop = self.late = self.deaf = 0
         self.reflex = False
         self.waiting = []
@@ -35,7 +36,7 @@ class Wire(FrankaRobotServer):
         return self._FrankaRobotServer__control_mode is ControlMode.TORQUE
 
     def _handle_udp_command(self, data):
-        self.heard = True
+        self.heard = self.begun = True
         self.sent.append(struct.unpack("<7d", data[-57:-1]))
         if self.deaf > 0:
             self.deaf -= 1
@@ -50,7 +51,8 @@ class Wire(FrankaRobotServer):
         while moving and self.answered and not self.heard and self.udp_connected and time.monotonic() < until:
             self._process_udp_commands()
             self._post_process_commands()
-        self.silent = self.silent + 1 if moving else 0
+        self.begun = self.begun and moving  # a client that is slow to begin has lost nothing
+        self.silent = self.silent + 1 if self.begun else 0
         if self.silent > LOST:
             self.stop_by_reflex()
 
@@ -104,7 +106,8 @@ class Wire(FrankaRobotServer):
 
 def main():
     lines = queue.Queue()
-    threading.Thread(target=lambda: [lines.put(line) for line in sys.stdin], daemon=True).start()
+    said = itertools.chain(sys.stdin, ["quit"])
+    threading.Thread(target=lambda: [lines.put(line) for line in said], daemon=True).start()
     q = [float(x) for x in sys.argv[1].split(",")]
     with MujocoSimulator() as sim:
         wire = Wire(sim.add_robot(initial_q=q))
