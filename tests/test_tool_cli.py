@@ -8,6 +8,7 @@ import pytest
 
 import nbs_pin as nbs
 from nbs_pin import cli
+from nbs_pin.base.units import measured
 from nbs_pin.motions.by_name import motion_of
 from nbs_pin.reports import plotting
 from tests.commands import printed_by, refusal, summary
@@ -45,7 +46,8 @@ def test_the_run_knows_its_path_and_the_summary_its_error(circle):
     centre = 0.5 * (asked.min(axis=0) + asked.max(axis=0))
     np.testing.assert_allclose(np.linalg.norm(asked - centre, axis=-1), 0.3, atol=1e-4)
     np.testing.assert_allclose(asked[0], asked[-1], atol=1e-9)
-    assert f"'tip' along the circle of radius 0.3 m: RMS error {1e3 * tool['rms_position_error_m']:.2g} mm" in printed
+    off = measured(tool["rms_position_error_m"], "m")
+    assert f"'tip' along the circle of radius 0.3 m is off in position {off} RMS" in printed
 
 
 def test_the_errors_of_the_tool_are_those_of_its_distance_and_angle(circle):
