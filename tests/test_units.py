@@ -53,7 +53,7 @@ def test_units_are_those_of_the_quantities():
 def test_track_prints_stores_and_draws_the_units_of_each_joint(tracked, tmp_path, monkeypatch):
     folder, printed = tracked
     check_rows(printed)
-    assert "‖error‖ < 0.1 rad, m to the end" in printed
+    assert "‖error‖ stays below 0.1 rad, m" in printed
     assert summary(folder)["figures"]["units"]["torque"] == ["N", "N·m", "N·m"]
     run = nbs.Run.load(folder / "run.npz")
     assert run.prismatic.tolist() == [True, False, False]
