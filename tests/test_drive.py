@@ -118,6 +118,23 @@ def test_ctrl_c_brakes_the_arm_wherever_it_comes(place):
     assert speeds[-1] < 0.3 * max(speeds[last - 10 : last])
 
 
+def test_ctrl_c_ends_an_arm_that_does_not_answer(monkeypatch):
+    monkeypatch.setattr("nbs_pin.runtime.drive._STUCK", 0.0)
+    stopped, plain = [], simulated()
+
+    def read(arm):  # as a driver that waits for its arm
+        for _ in range(3):
+            signal.raise_signal(signal.SIGINT)
+        pytest.fail("the second Ctrl-C was not raised")
+
+    before = signal.getsignal(signal.SIGINT)
+    arm = Wrapped(plain, read=read, stop=lambda inner: stopped.append(inner))
+    with pytest.raises(KeyboardInterrupt):
+        nbs.drive(arm, LAW, ROBOT, MOTION, 2.0)
+    assert stopped == [plain]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 def test_a_loop_in_another_thread_leaves_ctrl_c_alone():
     before, seen = signal.getsignal(signal.SIGINT), []
     work = threading.Thread(

@@ -30,6 +30,7 @@ from nbs_pin.runtime.guarded import FaultReport, Guarded, Sample, Seen
 BRAKING = 0.5
 """How long a stopped arm is braked before control is given up [s]."""
 _PRIORITY, _REHEARSED = 50, 5
+_STUCK = 2.0  # after the first Ctrl-C, when one ends an arm that does not answer [s]; braking takes 0.5 s
 _CHECKED = 20_000  # instants at most at which the motion is compared with the limits
 
 
@@ -285,12 +286,25 @@ class _Loop:
 
 @contextlib.contextmanager
 def _interrupts(ask: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C asks, in place of an exception anywhere in a period, which would leave the arm with its last torque."""
+    """Ctrl-C asks, in place of an exception anywhere in a period, which would leave the arm with its last torque.
+
+    One that comes `_STUCK` after the first is raised: braking has had its time, so the driver does not return.
+    """
     before = signal.getsignal(signal.SIGINT)
     if before is None or threading.current_thread() is not threading.main_thread():
         yield  # signals come to the main thread alone, and a handler that is not Python's could not be restored
         return
-    signal.signal(signal.SIGINT, lambda number, frame: ask())
+    first = math.inf
+
+    def interrupt(number: int, frame: Any) -> None:
+        nonlocal first
+        now = time.monotonic()
+        if now - first >= _STUCK:
+            raise KeyboardInterrupt
+        first = min(first, now)
+        ask()
+
+    signal.signal(signal.SIGINT, interrupt)
     try:
         yield
     finally:
