@@ -8,7 +8,7 @@ import nbs_pin as nbs
 from nbs_pin.base.claims import Label
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.loads import gravity_error, payload, tool_frame, total
+from nbs_pin.certificates.loads import gravity_error, payload, total
 
 ARMS = ("two_link", "panda", "ur5", "kinova")
 

@@ -66,7 +66,7 @@ class Task:
     payload: float | None = None
     """Payload that the model does not include [kg]."""
     link: str | None = None
-    """The link that carries the payload; None takes `loads.tool_frame`."""
+    """The link that carries the payload; None takes `places.tool_frame`."""
     friction: JointFriction | None = None
     """Joint friction of the arm; None as in `certify`."""
     gravity_error: float | None = None

@@ -17,6 +17,7 @@ from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.sampled_motion import INSTANTS, SampledMotion
 from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.robots.places import place_of, tool_frame
 from nbs_pin.robots.robot import Robot
 
 MARGIN = 1.5
@@ -97,28 +98,6 @@ def total(*parts: Admissible) -> Admissible:
     if not boxes:
         return Admissible(radius=radius, claims=claims)
     return Admissible(box=sum(boxes, np.full(len(boxes[0]), radius)), claims=claims)
-
-
-def tool_frame(robot: Robot) -> str:
-    """The link fixed to the last joint that is farthest from it, where a tool or payload usually is."""
-    frames = [f for f in robot.model.frames if f.type == pin.FrameType.BODY and f.parentJoint == robot.nv]
-    return str(max(frames, key=lambda f: float(np.linalg.norm(f.placement.translation))).name)
-
-
-def place_of(robot: Robot, frame: str | None, position: Float[np.ndarray, "3"] | None = None) -> tuple[int, np.ndarray]:
-    """The joint that carries a point of a link, its origin by default, and the point in that joint's frame [m].
-
-    Raises:
-        ArgumentError: If the link does not exist or moves with no joint, or the position is not three numbers.
-    """
-    name = tool_frame(robot) if frame is None else frame
-    bodies = {f.name: f for f in robot.model.frames if f.type == pin.FrameType.BODY and f.parentJoint > 0}
-    if name not in bodies:
-        raise ArgumentError(f"{robot.name} has no moving link '{name}'; give one of {', '.join(bodies)}.")
-    at = np.zeros(3) if position is None else floats("position", position)
-    if at.shape != (3,) or not np.isfinite(at).all():
-        raise ArgumentError(f"position is {position}, expected three finite numbers [m]; correct it.")
-    return int(bodies[name].parentJoint), np.array(bodies[name].placement.act(at))
 
 
 def longest_levers(robot: Robot, joint: int, at: Float[np.ndarray, "3"]) -> JointArray:

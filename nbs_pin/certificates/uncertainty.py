@@ -7,7 +7,7 @@ import pinocchio as pin
 from jaxtyping import Float, Int
 
 from nbs_pin.base.arguments import a, check_fields, checked, maybe, number, text
-from nbs_pin.certificates.loads import place_of
+from nbs_pin.robots.places import place_of
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
 from nbs_pin.robots.robot import ARM, Robot
 
@@ -30,7 +30,7 @@ class Payload:
     radius: float = 0.0
     """Radius of the ball about the origin of the link [m]; 0 for a point."""
     link: str | None = None
-    """The link that carries it; None takes the arm's end (`loads.tool_frame`)."""
+    """The link that carries it; None takes the arm's end (`places.tool_frame`)."""
 
     def __post_init__(self) -> None:
         check_fields(

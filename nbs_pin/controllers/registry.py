@@ -12,6 +12,7 @@ _LAWS = "nbs_pin.controllers"
 LAWS: dict[str, Entry] = {
     "nbs": Entry(f"{_LAWS}.neural_backstepping:NeuralBackstepping.for_robot"),
     "nbs-paper": Entry(f"{_LAWS}.neural_backstepping:paper_controller_for"),
+    "adaptive": Entry(f"{_LAWS}.adaptive_law:AdaptiveLaw.for_robot"),
     "slotine-li": Entry(f"{_LAWS}.slotine_li:SlotineLi.for_robot"),
     "sliding-mode": Entry(f"{_LAWS}.sliding_mode:SlidingMode.for_robot"),
     "computed-torque": Entry(f"{_LAWS}.computed_torque:ComputedTorque.for_robot"),

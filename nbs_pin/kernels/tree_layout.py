@@ -59,7 +59,7 @@ def pack_tree(links: Sequence[Link], gravity: np.ndarray) -> Packed:
     for i, link in enumerate(links):
         if not 0 <= link.parent <= i:
             raise ArgumentError(f"link {i} has parent {link.parent}; give links with parents first, 0 for the base.")
-        frame, parent = _frame_along(link.axis), frames[link.parent]
+        frame, parent = frame_along(link.axis), frames[link.parent]
         frames.append(frame)
         rotation, position = parent.T @ link.rotation @ frame, parent.T @ link.position
         centre, inertia = frame.T @ link.centre, frame.T @ link.inertia @ frame
@@ -76,7 +76,7 @@ def tree_workspace(part: Packed) -> int:
     return (n + 1) * ROW + 2 * n
 
 
-def _frame_along(axis: np.ndarray) -> np.ndarray:
+def frame_along(axis: np.ndarray) -> np.ndarray:
     """A rotation that takes z to the direction of the axis."""
     z = np.asarray(axis) / np.linalg.norm(axis)
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)

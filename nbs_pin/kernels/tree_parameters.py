@@ -21,7 +21,7 @@ COLUMNS, TURN, SHIFT, INERTIA, ROTOR = 17, 0, 3, 6, 16
 
 
 @kernel
-def _inertia_bars(joint: Joint, a: float, mu: float, bar: Vec) -> None:
+def inertia_bars(joint: Joint, a: float, mu: float, bar: Vec) -> None:
     """u·F + o·N of one body, F = m a + Bh and N = h × a + Σ m x × Bx, is linear in m, h, E and the armature."""
     row = joint.row
     u, a_, (x, y, z) = get(row, U), get(row, A), get(row, SPIN)
@@ -45,7 +45,7 @@ def _joint_row(motion: Motion, mu: Vec, tree: Packed, work: Vec, bars: Vec) -> N
     for i in range(tree.layout[TREE_SIZE] - 1, -1, -1):
         joint, q, v, a = joint_of(i, tree, work), motion.q[i], motion.v[i], motion.a[i]
         bar = bars[BASE + COLUMNS * i : BASE + COLUMNS * (i + 1)]
-        _inertia_bars(joint, a, mu[i], bar)
+        inertia_bars(joint, a, mu[i], bar)
         bodies.couple(joint)
         bodies.joint_bars(joint, v, v)
         x, y, z = bodies.turn_bar(joint, v, v, a, mu[i])

@@ -68,11 +68,11 @@ def described_robot(description: Any) -> Settings | None:
 
 
 def _robot_in(description: Any) -> Any:
-    """The described arm; that of a law is its model's, that of a model correcting another is the other's."""
+    """The described arm; that of a law is its model's, that of one about another the other's, that of a model correcting another is the other's."""
     kind = _kind_of(description)
     if "robot" in kind.parts:
         return description["robot"]
-    inner = [description[name] for name in ("dynamics", "network", "nominal") if name in kind.parts]
+    inner = [description[name] for name in ("dynamics", "network", "nominal", "law") if name in kind.parts]
     return _robot_in(inner[0]) if inner else None
 
 

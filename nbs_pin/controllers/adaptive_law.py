@@ -1,0 +1,235 @@
+"""A law with a Lyapunov function whose model adapts to the arm: an unknown load, links, friction, rotors, offsets."""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from torch import nn
+
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, flag, maybe, number, numbers, text, texts
+from nbs_pin.base.arrays import Array, Vectors, array_namespace, as_vectors, constant_like, finite_result
+from nbs_pin.base.checks import told
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.known_code import defines
+from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import joints_told
+from nbs_pin.base.storable import storable
+from nbs_pin.controllers.adapting_model import AdaptingModel
+from nbs_pin.controllers.compiled_adaptive import AdaptiveMemory, CompiledAdaptiveLaw, checked_period, read_memory
+from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.estimates import Estimate
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.unknowns import ADAPTS, Unknowns, unknown_links, unknown_load, unknown_numbers
+from nbs_pin.controllers.update_rates import update_rates
+from nbs_pin.dynamics.friction import FRICTION, JointFriction
+from nbs_pin.dynamics.pinocchio_tree import pack_model
+from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
+from nbs_pin.dynamics.rigid_tree import RigidTree
+from nbs_pin.kernels.adaptation import pack_adaptive
+from nbs_pin.kernels.layout import Packed
+from nbs_pin.kernels.tree_layout import BASE, BODY, MASS
+from nbs_pin.robots.robot import ARM, Robot
+
+_LOAD = 0.25  # largest load as a share of the arm's mass
+_TRANSITION = 0.01  # speed scale of Coulomb friction where the law feeds none forward [rad/s]
+
+
+@storable(
+    ("adapts", "frame", "links", "load_mass", "load_radius", "gain", "leak", "period", "rates"), parts=("law",)
+)
+class AdaptiveLaw(Controller, nn.Module):
+    """A backstepping or sliding law whose model learns what it does not know while the arm moves.
+
+    τ = law + Y(q, v, v_r, a_r)(π̂ − π_model). Every unknown body has P̂ = K X̂ Kᵀ with X̂ = (1 + e^−Q)⁻¹, which every
+    symmetric Q makes a body that can exist, and Q̇ = −γ KᵀLK − σ(Q − Q₀), tr(LP) = z2ᵀY(P). With the Fermi–Dirac
+    divergence d of X from X̂, V_a = V + Σ d/γ decreases as V does where the model is exact, for every weight of the law
+    (docs/theory.md §9). While a torque is at the effort limit the estimates wait.
+
+    Args:
+        law: A law with a Lyapunov function, such as NeuralBackstepping, with the model that is believed at first.
+        adapts: Any of "load", "links", "friction", "rotors", "offsets" (constant torques: integral action).
+        frame: Link that carries the load; None takes the arm's end.
+        links: Joints whose bodies adapt with "links"; none takes all.
+        load_mass: Largest load [kg]; None takes a quarter of the arm's mass.
+        load_radius: The load lies within this distance of the frame's origin [m].
+        gain: Speed of adaptation: at 1, a sampled step on the arm at rest costs at most half of what damping takes.
+        leak: σ [1/s], at which estimates return to the first ones; 0 for none.
+        period: Longest control period h [s] that γ is stable for.
+        rates: γ of every unknown, in place of those that `gain` gives.
+
+    Raises:
+        ArgumentError: For a law without a Lyapunov function or an arm, an unknown name, or a number out of range.
+
+    Example:
+        >>> import nbs_pin as nbs
+        >>> robot = nbs.load_robot("panda")
+        >>> law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), ["load", "friction"], load_mass=4.0)
+        >>> memory = law.initial_memory([0.0] * 7)
+        >>> round(law.estimate(memory).load_mass, 3)
+        0.008
+    """
+
+    @checked(
+        law=a(LyapunovLaw, "a law with a Lyapunov function, such as NeuralBackstepping.for_robot(robot)"),
+        adapts=texts,
+        frame=maybe(text),
+        load_mass=maybe(number(above=0.0, unit="kg")),
+        load_radius=number(above=0.0, most=100.0, unit="m"),
+        gain=number(above=0.0, most=1e6),
+        leak=number(least=0.0, unit="1/s"),
+        period=PERIOD,
+    )
+    def __init__(
+        self,
+        law: LyapunovLaw,
+        adapts: Sequence[str] = ("load",),
+        *,
+        frame: str | None = None,
+        links: Sequence[str] = (),
+        load_mass: float | None = None,
+        load_radius: float = 0.1,
+        gain: float = 1.0,
+        leak: float = 0.0,
+        period: float = 0.001,
+        rates: Any = None,
+    ) -> None:
+        super().__init__()
+        robot = law.dynamics.robot
+        if robot is None:
+            raise ArgumentError("AdaptiveLaw was given a law whose model has no arm; give one made for a robot.")
+        wrong = [name for name in adapts if name not in ADAPTS]
+        if wrong or not len(adapts) or len(set(adapts)) < len(adapts):
+            raise ArgumentError(f"AdaptiveLaw: adapts is {told(list(adapts))}; give some of {', '.join(ADAPTS)}, once.")
+        self.law, self.robot = law, robot
+        self.adapts, self.frame, self.links = tuple(map(str, adapts)), frame, tuple(map(str, links))
+        mass = sum(body.mass for body in list(robot.model.inertias)[1:])
+        self.load_mass = _LOAD * mass if load_mass is None else load_mass
+        self.load_radius, self.gain, self.leak, self.period = load_radius, gain, leak, period
+        self.rates = self._rates(rates)
+
+    @classmethod
+    @checked(robot=ARM, dynamics=maybe(MODEL), bandwidth=BANDWIDTH, period=PERIOD, friction=maybe(FRICTION), seed=SEED)
+    def for_robot(
+        cls,
+        robot: Robot,
+        dynamics: DynamicsProvider | None = None,
+        *,
+        adapts: Sequence[str] = ("load", "friction", "rotors"),
+        bandwidth: float = 8.0,
+        period: float = 0.001,
+        friction: JointFriction | None = None,
+        seed: int = 0,
+    ) -> "AdaptiveLaw":
+        """An adaptive law around `NeuralBackstepping.for_robot` with the same arguments."""
+        settings = {"bandwidth": bandwidth, "period": period, "friction": friction, "seed": seed}
+        return cls(NeuralBackstepping.for_robot(robot, dynamics, **settings), adapts, period=period)
+
+    @property
+    def nv(self) -> int:
+        """Number of joints."""
+        return self.law.nv
+
+    def _facts(self) -> Iterable[str]:
+        return self.robot.name, joints_told(self.nv), f"{type(self.law).__name__} adapts {', '.join(self.adapts)}"
+
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        """What adapts, with the bounds and the first estimates of it."""
+        robot, tree, bodies, own = self.robot, self._believed, [], []
+        zero, friction = np.zeros(self.nv), self.law.friction
+        known = (zero, zero) if friction is None else (friction.viscous, friction.coulomb)
+        if "load" in self.adapts:
+            bodies.append(unknown_load(robot, self.frame, self.load_mass, self.load_radius))
+        if "links" in self.adapts:
+            bodies += unknown_links(robot, tree, self.links)
+        for kind in self.adapts:
+            if kind not in ("load", "links"):
+                own += unknown_numbers(robot, tree, kind, *known)
+        return Unknowns(tuple(bodies), tuple(own), _TRANSITION if friction is None else friction.transition)
+
+    @cached_property
+    def _believed(self) -> Packed:
+        """The rigid tree of the model; raises ArgumentError unless it is one with the arm's own geometry."""
+        tree, own = self.law.dynamics.packed_tree(), pack_model(self.robot.model)
+        same = tree is not None and np.array_equal(tree.layout, own.layout)
+        if tree is None or not same or not np.allclose(_geometry(tree), _geometry(own), rtol=0.0, atol=1e-12):
+            kind = type(self.law.dynamics).__name__
+            raise ArgumentError(f"AdaptiveLaw cannot adapt a {kind}; give a law with a rigid model of the same arm.")
+        return tree
+
+    @cached_property
+    def _tree(self) -> tuple[RigidTree, np.ndarray]:
+        return RigidTree.of(self._believed), -self._believed.weights[:3]
+
+    def _rates(self, rates: Any) -> np.ndarray:
+        if rates is None:
+            return update_rates(self.law, self.unknowns, *self._tree, gain=self.gain, period=self.period)
+        given = numbers(least=0.0)("AdaptiveLaw: rates", rates)
+        count = len(self.unknowns.bodies) + len(self.unknowns.numbers)
+        if given.shape != (count,):
+            raise ArgumentError(f"AdaptiveLaw: rates has shape {given.shape}, expected ({count},), one per unknown.")
+        return np.array(given)
+
+    def initial_memory(self, q: Vectors) -> AdaptiveMemory:
+        """The first estimates, with the array type and the leading axes of q."""
+        (q,) = as_vectors(self.nv, q=q)
+        zero = 0.0 * q
+        return AdaptiveMemory(constant_like(q, self.unknowns.start) + zero[..., :1], zero, zero)
+
+    def step(
+        self, memory: AdaptiveMemory, q: Vectors, v: Vectors, reference: Reference, period: float
+    ) -> tuple[Vectors, AdaptiveMemory]:
+        """τ [N·m] for the next period [s], and the estimates after it; differentiable for tensors.
+
+        Raises:
+            ArgumentError: For a longer period than the law's own, for which γ may not be stable, or wrong shapes.
+        """
+        period = checked_period(period, self.period)
+        duals, given = read_memory(memory, self.unknowns.start.size, self.nv, q, v, reference)
+        z2_last, z2_before, q, v, *aim = given
+        e = self.law.errors(q, v, *aim)
+        a_r = e.a_r - self.law.inertial_rate * e.z2
+        now = self._now(duals, q, v, e.v_r, a_r)
+        tau = self.law.torque(q, v, *aim) + now.torque()
+        tau = finite_result("the torque", tau, *given, duals)
+        xp = array_namespace(q)
+        free = xp.all(abs(tau) <= constant_like(q, self.robot.effort_limit), axis=-1)[..., None]
+        after = xp.where(free, now.moved(z2_before, self.rates, self.leak, period), now.duals.flat())
+        return tau, AdaptiveMemory(after, e.z2, z2_last)
+
+    def _now(self, duals: Array, q: Array, v: Array, v_r: Array, a_r: Array) -> AdaptingModel:
+        return AdaptingModel.of(self.unknowns, *self._tree, duals, q, v, v_r, a_r)
+
+    @checked(memory=maybe(a(AdaptiveMemory, "what initial_memory or step returned")))
+    def estimate(self, memory: AdaptiveMemory | None = None) -> Estimate:
+        """What is believed of the unknowns with this memory; None is the start."""
+        duals = self.unknowns.start if memory is None else np.asarray(memory.duals, dtype=float)
+        return Estimate(self.robot, self._believed, self.unknowns, duals)
+
+    @property
+    def packable(self) -> bool:
+        """Whether the kernel implements this law and the one that it is about; False for a subclass."""
+        return defines(self, "packed_law") and self.law.packable
+
+    @checked(numpy=flag)
+    def packed_law(self, *, numpy: bool = True) -> Packed:
+        """Constants and weights of the law, its model and the unknowns (`kernels/adaptation.py`)."""
+        if not self.packable:
+            return super().packed_law(numpy=numpy)
+        return pack_adaptive(self.law.packed_law(), self._believed, self.unknowns.packed(self.rates, self.leak))
+
+    def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
+        """The law as machine code (`Controller.compile`)."""
+        if not self.packable:
+            return self
+        law = self.law.packed_law()
+        return CompiledAdaptiveLaw(
+            law, self._believed, self.unknowns, self.rates, self.leak, self.period, self.robot.effort_limit
+        )
+
+
+def _geometry(tree: Packed) -> np.ndarray:
+    """Gravity and the placements of the joints."""
+    return np.append(tree.weights[:BASE], tree.weights[BASE:].reshape(-1, BODY)[:, :MASS])

@@ -1,0 +1,40 @@
+"""How fast an adaptive law may learn: rates γ at which a sampled step is stable."""
+
+import numpy as np
+
+from nbs_pin.base.arrays import JointArray
+from nbs_pin.controllers.adapting_model import AdaptingModel
+from nbs_pin.controllers.gains import sample_configurations
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.controllers.unknowns import Unknowns
+from nbs_pin.dynamics.rigid_tree import RigidTree
+
+_STATES = 200
+_SPEED, _START = 0.25, 0.5  # share of the velocity limits, and time in which all of it is reached [s]
+
+
+def update_rates(
+    law: LyapunovLaw, unknowns: Unknowns, tree: RigidTree, gravity: np.ndarray, *, gain: float, period: float
+) -> JointArray:
+    """γ of every unknown [1/J]: at gain 1, a step of all costs at most half of z2ᵀ(ωM + D₀)z2 in usual motions.
+
+    A step from Q to Q − γhS costs (γh)²‖S‖²/8 of divergence, as the conjugate of the Fermi–Dirac entropy, tr log(1 + e^Q),
+    has a Hessian ≤ ¼, so Σ γh‖S‖²/8 of V̇ (docs/theory.md §9). S is linear in z2: with ℓ² = max λ(SᵀS, ωM + D₀) for every
+    unknown and λ = max λ(Σ SᵀS/ℓ², ωM + D₀), γ = gain·4/(h ℓ² λ). The largest are over sampled poses, velocities up to
+    a quarter of the limits and accelerations that reach the limits in half a second.
+    """
+    n, robot, count = law.nv, law.dynamics.robot, len(unknowns.bodies)
+    assert robot is not None
+    rng, q = np.random.default_rng(0), sample_configurations(robot, _STATES)
+    speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, np.pi)
+    v, a = rng.uniform(-_SPEED, _SPEED, q.shape) * speed, rng.uniform(-1.0, 1.0, q.shape) * speed / _START
+    now = AdaptingModel.of(unknowns, tree, gravity, np.tile(unknowns.start, (_STATES, 1)), q, v, v, a)
+    units = [now.slopes(np.tile(unit, (_STATES, 1))) for unit in np.eye(n)]
+    bodies = np.stack([unit.bodies.reshape(_STATES, count, 16) for unit in units], axis=-1)
+    numbers = np.stack([unit.numbers for unit in units], axis=-1)
+    forms = np.concatenate([bodies.swapaxes(-1, -2) @ bodies, numbers[..., :, None] * numbers[..., None, :]], axis=1)
+    root = np.linalg.cholesky(law.inertial_rate * law.dynamics.mass_matrix(q) + law.lyapunov().floor)[:, None]
+    forms = np.linalg.solve(root, np.linalg.solve(root, forms).swapaxes(-1, -2))
+    sizes = np.linalg.eigvalsh(forms)[..., -1].max(axis=0)
+    together = np.linalg.eigvalsh((forms / sizes[:, None, None]).sum(axis=1))[..., -1].max()
+    return np.asarray(gain * 4.0 / (period * sizes * together))
