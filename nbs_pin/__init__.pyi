@@ -25,9 +25,11 @@ from .certificates.online_monitor import Watch as Watch
 from .certificates.propose import Proposal as Proposal, propose as propose
 from .certificates.reference_margins import certified_margins as certified_margins
 from .certificates.uncertainty import Payload as Payload, Uncertainty as Uncertainty
+from .controllers.adaptive_law import AdaptiveLaw as AdaptiveLaw
 from .controllers.computed_torque import ComputedTorque as ComputedTorque
 from .controllers.controller import Controller as Controller, MemorylessController as MemorylessController
 from .controllers.damping import Damping as Damping
+from .controllers.estimates import Estimate as Estimate
 from .controllers.lyapunov_law import LyapunovLaw as LyapunovLaw
 from .controllers.model_law import ModelLaw as ModelLaw
 from .controllers.neural_backstepping import (

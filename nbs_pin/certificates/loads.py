@@ -10,7 +10,7 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.checks import PerJoint, floats, positive
+from nbs_pin.base.checks import PerJoint, positive
 from nbs_pin.base.claims import Claim, Group, Label
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference

@@ -7,8 +7,8 @@ import pinocchio as pin
 from jaxtyping import Float, Int
 
 from nbs_pin.base.arguments import a, check_fields, checked, maybe, number, text
-from nbs_pin.robots.places import place_of
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
+from nbs_pin.robots.places import place_of
 from nbs_pin.robots.robot import ARM, Robot
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from nbs_pin.base.arguments import PERIOD
 from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors, finite_result, is_torch_array
@@ -46,7 +47,7 @@ class CompiledAdaptiveLaw(Controller):
     """
 
     def __init__(
-        self, law: Packed, tree: Packed, unknowns: Unknowns, rates: JointArray, leak: float, period: float,
+        self, law: Packed, tree: Packed, unknowns: Unknowns, rates: Float[np.ndarray, " unknowns"], leak: float, period: float,
         limit: JointArray,
     ) -> None:  # fmt: skip
         self._given = law, tree, unknowns, rates, leak, period, limit

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.shown import Shown
 from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
@@ -18,6 +17,8 @@ from nbs_pin.kernels.layout import NumberCode, Packed
 from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY
 from nbs_pin.robots.robot import Robot
 
+_NO_MASS = 1e-3  # [kg]
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimate(Shown):
@@ -27,8 +28,8 @@ class Estimate(Shown):
         >>> import nbs_pin as nbs
         >>> law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(nbs.load_robot("panda")), load_mass=4.0)
         >>> estimate = law.estimate()
-        >>> float(estimate.load_mass), estimate.load_centre
-        (0.008, array([0., 0., 0.]))
+        >>> bool(abs(estimate.load_mass) < 1e-9), estimate.load_centre
+        (True, array([0., 0., 0.]))
         >>> estimate.dynamics().robot.name
         'panda'
     """
@@ -48,14 +49,14 @@ class Estimate(Shown):
 
     @property
     def load_mass(self) -> Float[np.ndarray, "*batch"]:
-        """Mass of the load [kg], 0 where none adapts."""
+        """Mass of the load [kg], 0 where none adapts; negative where the link seems lighter than in the model."""
         return np.asarray(self._load_body[..., 3, 3])
 
     @property
     def load_centre(self) -> Float[np.ndarray, "*batch 3"]:
-        """Centre of mass of the load in the frame that carries it [m]."""
+        """Centre of mass of the load in the frame that carries it [m]; 0 for a load below a gram."""
         p = self._load_body
-        return np.asarray(p[..., :3, 3] / np.maximum(p[..., 3, 3], 1e-12)[..., None])
+        return np.asarray(p[..., :3, 3] / np.where(np.abs(p[..., 3, 3]) > _NO_MASS, p[..., 3, 3], np.inf)[..., None])
 
     @property
     def load_inertia(self) -> Float[np.ndarray, "*batch 3 3"]:
@@ -114,14 +115,14 @@ class Estimate(Shown):
         for body, p in zip(self.unknowns.bodies, self._bodies(), strict=True):
             if body.frame is not None:
                 back = np.linalg.inv(body.frame)
-                return np.asarray(back @ p @ back.T)
+                return np.asarray(back @ (p - body.known) @ back.T)
         return np.zeros((*self.duals.shape[:-1], 4, 4))
 
     def _bodies(self) -> list[np.ndarray]:
         x, _ = logistic_and_cut(Duals.of(self.duals, len(self.unknowns.bodies)).bodies)
         return [body.factor @ x[..., k, :, :] @ body.factor.T for k, body in enumerate(self.unknowns.bodies)]
 
-    def _numbers(self, code: NumberCode) -> JointArray:
+    def _numbers(self, code: NumberCode) -> Float[np.ndarray, "*batch n"]:
         found = np.zeros((*self.duals.shape[:-1], self.robot.nv))
         for number, dual in zip(
             self.unknowns.numbers, np.moveaxis(self.duals[..., -len(self.unknowns.numbers) :], -1, 0), strict=True

@@ -12,7 +12,8 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.controllers.gains import effective_inertia, largest_inertia
+from nbs_pin.controllers.gains import effective_inertia, gains_for_robot, largest_inertia
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.pinocchio_tree import tree_frames
 from nbs_pin.kernels.adaptation import PER_BODY, PER_NUMBER
@@ -25,11 +26,13 @@ from nbs_pin.robots.robot import Robot
 ADAPTS = ("load", "links", "friction", "rotors", "offsets")
 """What a law can adapt: a load at a frame, bodies of links, joint friction, rotor inertia, constant torques."""
 _UPPER = np.triu_indices(4)
-_LEAST_LOAD = 1e-3  # first estimate of a load, as a share of the largest
+_LEAST_SHARE = 1e-4  # what every direction of a body begins with, where the model has less, as a share of the largest
 _REACH = 2.0  # a link's largest body, as a multiple of the one that the model has
 _LENGTH, _SPREAD = 0.05, 0.02  # what a link's largest body has besides, so that a point mass is within it [m, share]
-_FRICTION, _FIRST = 0.1, 1e-3  # largest Coulomb friction and offset as a share of the effort, first estimate of that
-_ROTOR, _FIRST_ROTOR = 0.25, 0.05  # largest rotor inertia, of the arm's largest; first, of the least inertia at a joint
+_FRICTION = 0.1  # largest Coulomb friction and offset, as a share of the effort limit
+_BEND = 1e-5  # friction may seem to be below zero by what bends a joint by this much [rad, m]
+_ROTOR, _LIGHTER = 0.25, 0.2  # largest rotor, of the arm's largest inertia; how much lighter the joints may seem
+_ANY = 1e-3  # a bandwidth [rad/s], on which the stiffness does not depend
 _UNLIMITED = 100.0  # effort [N·m] of a joint that states none
 _FAST = np.pi  # velocity [rad/s] of a joint that states none
 
@@ -99,20 +102,20 @@ def triangle_matrices(duals: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def unknown_load(robot: Robot, frame: str | None, mass: float, radius: float) -> UnknownBody:
-    """A load of at most `mass` [kg] within `radius` [m] of the origin of a link; None takes the arm's end.
+def unknown_load(robot: Robot, tree: Packed, frame: str | None, mass: float, radius: float) -> UnknownBody:
+    """The body of a link with a load of at most `mass` [kg] within `radius` [m] of its origin; None: the arm's end.
 
-    A point w = (x, 1) with ‖x‖ ≤ r has wᵀ diag(2r², 2r², 2r², 2)⁻¹ w ≤ 1, hence P ⪯ m̄ diag(2r², 2r², 2r², 2).
+    A point w = (x, 1) with ‖x‖ ≤ r has wᵀ diag(2r², 2r², 2r², 2)⁻¹ w ≤ 1, so a load has P ⪯ m̄ diag(2r², 2r², 2r², 2).
     """
     joint, _ = place_of(robot, frame)
     name = tool_frame(robot) if frame is None else frame
     placement = next(f.placement for f in robot.model.frames if f.name == name and f.type == pin.FrameType.BODY)
-    root = np.sqrt(2.0 * mass) * np.diag([radius, radius, radius, 1.0])
     carried = into_tree(robot)[joint - 1] @ placement.homogeneous
-    return UnknownBody(name, joint - 1, carried @ root, _logit(_LEAST_LOAD) * np.eye(4), np.zeros((4, 4)), carried)
+    known, root = model_body(tree, joint - 1), carried * np.sqrt(2.0 * mass) @ np.diag([radius] * 3 + [1.0])
+    return _between(name, joint - 1, known, known + root @ root.T, carried)
 
 
-def unknown_links(robot: Robot, tree: Packed, names: Sequence[str]) -> tuple[UnknownBody, ...]:
+def unknown_links(robot: Robot, tree: Packed, names: Sequence[str]) -> list[UnknownBody]:
     """The bodies behind these joints, all without names, up to twice what the model has; those without mass are left.
 
     Raises ArgumentError for a name that no joint has.
@@ -122,42 +125,51 @@ def unknown_links(robot: Robot, tree: Packed, names: Sequence[str]) -> tuple[Unk
         raise ArgumentError(f"{robot.name} has no joint '{wrong[0]}'; give some of {', '.join(robot.joint_names)}.")
     found = []
     for i, name in enumerate(robot.joint_names):
-        p = model_body(tree, i)
-        if p[3, 3] > 0.0 and (not names or name in names):
-            more = _SPREAD * p[3, 3] * np.diag([_LENGTH**2] * 3 + [0.0])
-            values, vectors = np.linalg.eigh(_REACH * (p + more))
-            factor = vectors * np.sqrt(values)
-            share = np.linalg.solve(factor, np.linalg.solve(factor, p).T)
-            shares, own = np.linalg.eigh(0.5 * (share + share.T))
-            start = (own * _logit(np.clip(shares, 1e-6, 1.0 - 1e-6))) @ own.T
-            found.append(UnknownBody(name, i, factor, start, p))
+        known = model_body(tree, i)
+        if known[3, 3] > 0.0 and (not names or name in names):
+            more = _SPREAD * known[3, 3] * np.diag([_LENGTH**2] * 3 + [0.0])
+            found.append(_between(name, i, known, _REACH * (known + more)))
     if not found:
         raise ArgumentError(f"no link of {robot.name} has mass; adapt a load instead.")
-    return tuple(found)
+    return found
 
 
-def unknown_numbers(robot: Robot, tree: Packed, kind: str, viscous: np.ndarray, coulomb: np.ndarray) -> list[UnknownNumber]:
-    """Friction, rotor inertia or offset of every joint, around what the model has."""
+def _between(
+    name: str, joint: int, known: np.ndarray, largest: np.ndarray, frame: np.ndarray | None = None
+) -> UnknownBody:
+    """A body up to the largest one that begins as the known one."""
+    values, vectors = np.linalg.eigh(largest)
+    factor = vectors * np.sqrt(values)
+    share = np.linalg.solve(factor, np.linalg.solve(factor, known).T)
+    shares, own = np.linalg.eigh(0.5 * (share + share.T))
+    start = (own * _logit(np.clip(shares, _LEAST_SHARE, 1.0 - _LEAST_SHARE))) @ own.T
+    return UnknownBody(name, joint, factor, start, known, frame)
+
+
+def unknown_numbers(
+    robot: Robot, friction: JointFriction | None, tree: Packed, kind: str, period: float
+) -> list[UnknownNumber]:
+    """Friction, rotor inertia or offset of every joint, which begin as what the law has."""
     effort = np.where(np.isfinite(robot.effort_limit), robot.effort_limit, _UNLIMITED)
     speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, _FAST)
-    n, found = robot.nv, []
+    n, zero, largest, dynamics = robot.nv, np.zeros(robot.nv), _FRICTION * effort, PinocchioDynamics(robot)
     if kind == "offsets":
-        return [UnknownNumber(NumberCode.OFFSET, i, -x, 2.0 * x, 0.0, 0.0) for i, x in enumerate(_FRICTION * effort)]
+        return [UnknownNumber(NumberCode.OFFSET, i, -x, 2.0 * x, 0.0, 0.0) for i, x in enumerate(largest)]
     if kind == "friction":
-        largest = _FRICTION * effort
-        for code, width, own in ((NumberCode.VISCOUS, largest / speed, viscous), (NumberCode.COULOMB, largest, coulomb)):
-            found += [_above(code, i, width[i] + 2.0 * own[i], own[i], _FIRST * width[i]) for i in range(n)]
-        return found
-    dynamics = PinocchioDynamics(robot)
-    width, least = _ROTOR * largest_inertia(robot, dynamics).max(), effective_inertia(robot, dynamics)
-    own = np.array([tree.weights[BASE + BODY * i + ARMATURE] for i in range(n)])
-    return [_above(NumberCode.ROTOR, i, width + 2.0 * own[i], own[i], _FIRST_ROTOR * least[i]) for i in range(n)]
+        own = (zero, zero) if friction is None else (friction.viscous, friction.coulomb)
+        below = _BEND * gains_for_robot(robot, dynamics, bandwidth=_ANY, period=period).stiffness
+        kinds = (NumberCode.VISCOUS, largest / speed, own[0]), (NumberCode.COULOMB, largest, own[1])
+        return [_number(code, i, x[i], known[i], below[i]) for code, x, known in kinds for i in range(n)]
+    below = _LIGHTER / n * effective_inertia(robot, dynamics)
+    most = _ROTOR * largest_inertia(robot, dynamics).max()
+    rotors = [tree.weights[BASE + BODY * i + ARMATURE] for i in range(n)]
+    return [_number(NumberCode.ROTOR, i, most, rotors[i], below[i]) for i in range(n)]
 
 
-def _above(code: NumberCode, i: int, width: float, known: float, first: float) -> UnknownNumber:
-    """A number of at least zero that begins at what is known, or at `first` where that is zero."""
-    share = np.clip(max(known, first) / width, 1e-6, 1.0 - 1e-6)
-    return UnknownNumber(code, i, 0.0, float(width), float(_logit(share)), float(known))
+def _number(code: NumberCode, i: int, most: float, known: float, below: float) -> UnknownNumber:
+    """A number from −below to most and twice what is known, which begins as that."""
+    width = most + 2.0 * known + below
+    return UnknownNumber(code, i, -below, width, float(_logit((known + below) / width)), known)
 
 
 def into_tree(robot: Robot) -> np.ndarray:
@@ -177,5 +189,4 @@ def model_body(tree: Packed, i: int) -> np.ndarray:
 
 
 def _logit(x: float | np.ndarray) -> np.ndarray:
-    return np.clip(np.log(x) - np.log1p(-np.asarray(x)), -FARTHEST, FARTHEST)
-
+    return np.asarray(np.clip(np.log(x) - np.log1p(-np.asarray(x)), -FARTHEST, FARTHEST))

@@ -1,27 +1,31 @@
 """How fast an adaptive law may learn: rates γ at which a sampled step is stable."""
 
 import numpy as np
+from jaxtyping import Float
 
-from nbs_pin.base.arrays import JointArray
 from nbs_pin.controllers.adapting_model import AdaptingModel
 from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.unknowns import Unknowns
 from nbs_pin.dynamics.rigid_tree import RigidTree
+from nbs_pin.kernels.layout import NumberCode
 
 _STATES = 200
 _SPEED, _START = 0.25, 0.5  # share of the velocity limits, and time in which all of it is reached [s]
+_SHARES = {NumberCode.VISCOUS: 0.03, NumberCode.COULOMB: 0.3, NumberCode.ROTOR: 0.3, NumberCode.OFFSET: 0.3}
+"""How fast numbers adapt beside bodies: slowly, as each explains an error of its joint at once, rightly or not."""
 
 
 def update_rates(
     law: LyapunovLaw, unknowns: Unknowns, tree: RigidTree, gravity: np.ndarray, *, gain: float, period: float
-) -> JointArray:
-    """γ of every unknown [1/J]: at gain 1, a step of all costs at most half of z2ᵀ(ωM + D₀)z2 in usual motions.
+) -> Float[np.ndarray, " unknowns"]:
+    """γ of every unknown [1/J]: a step of all costs at most `gain` times z2ᵀ(ωM + D₀)z2 in usual motions.
 
-    A step from Q to Q − γhS costs (γh)²‖S‖²/8 of divergence, as the conjugate of the Fermi–Dirac entropy, tr log(1 + e^Q),
-    has a Hessian ≤ ¼, so Σ γh‖S‖²/8 of V̇ (docs/theory.md §9). S is linear in z2: with ℓ² = max λ(SᵀS, ωM + D₀) for every
-    unknown and λ = max λ(Σ SᵀS/ℓ², ωM + D₀), γ = gain·4/(h ℓ² λ). The largest are over sampled poses, velocities up to
-    a quarter of the limits and accelerations that reach the limits in half a second.
+    A step from Q to Q − γhS costs (γh)²‖S‖²/8 of divergence, as the conjugate of the Fermi–Dirac entropy,
+    tr log(1 + e^Q), has a Hessian ≤ ¼, so Σ γh‖S‖²/8 of V̇ (docs/theory.md §9). S is linear in z2: with
+    ℓ² = max λ(SᵀS, ωM + D₀) for every unknown, shares s and λ = max λ(Σ s SᵀS/ℓ², ωM + D₀), γ = gain·8s/(h ℓ² λ). The
+    largest are over sampled poses, velocities up to a quarter of the limits and accelerations that reach the limits in
+    half a second.
     """
     n, robot, count = law.nv, law.dynamics.robot, len(unknowns.bodies)
     assert robot is not None
@@ -36,5 +40,6 @@ def update_rates(
     root = np.linalg.cholesky(law.inertial_rate * law.dynamics.mass_matrix(q) + law.lyapunov().floor)[:, None]
     forms = np.linalg.solve(root, np.linalg.solve(root, forms).swapaxes(-1, -2))
     sizes = np.linalg.eigvalsh(forms)[..., -1].max(axis=0)
-    together = np.linalg.eigvalsh((forms / sizes[:, None, None]).sum(axis=1))[..., -1].max()
-    return np.asarray(gain * 4.0 / (period * sizes * together))
+    shares = np.array([1.0] * count + [_SHARES[number.code] for number in unknowns.numbers]) / sizes
+    together = np.linalg.eigvalsh(np.einsum("k,skij->sij", shares, forms)).max()
+    return np.asarray(gain * 8.0 * shares / (period * together))

@@ -1,7 +1,7 @@
 """Motion of the bodies of a rigid tree as 4×4 matrices: torques that are linear in bodies, for numpy and torch.
 
 A point x of body b lies at T_b(q)(x, 1). With the joint velocities v and w and accelerations a, its acceleration less
-gravity is A_b(x, 1), A_b = Σ ∂_iT a_i + Σ ∂_i∂_jT v_i w_j − [0 | g], and its velocity at μ is U_b(x, 1), U_b = Σ ∂_iT μ_i.
+gravity is A_b(x, 1), A_b = Σ ∂_iT a_i + Σ ∂_i∂_jT v_i w_j − [0 | g]; its velocity at μ is U_b(x, 1), U_b = Σ ∂_iT μ_i.
 For a body with the pseudo-inertia P = ∫ (x, 1)(x, 1)ᵀ dm the power of the torque M a + C(q, v) w + G at μ is therefore
 
     μᵀτ = tr(U P Aᵀ) = tr(L P),  L = ½(UᵀA + AᵀU),

@@ -143,26 +143,26 @@ def move_duals(z2: Vec, period: float, unknown: Packed, own: Packed, signals: Si
     """One step of all duals, after `tree_torque` has left the motion of every body in the end of work."""
     layout, weights = unknown.layout, unknown.weights
     bars, rest = take(work, COLUMNS)
-    l, s, other, rest = take3(rest, 16)
+    power, slope, other, rest = take3(rest, 16)
     tree_work = rest[_MATRICES - 48 :]
     spread(z2, own, tree_work)
     count, leak = layout[BODIES], weights[LEAK]
     for b in range(count):
         w, i = weights[FIRST_BODY + PER_BODY * b :], layout[UNKNOWN + b]
         inertia_bars(joint_of(i, own, tree_work), signals.a_r[i], z2[i], bars)
-        bar_matrix(bars, l)
-        congruent_back(w[:16], l, other, s)
+        bar_matrix(bars, power)
+        congruent_back(w[:16], power, other, slope)
         k = 0
         for r in range(4):
             for c in range(r, 4):
                 d = TRIANGLE * b + k
-                duals[d] = moved(duals[d], w[START + k], w[BODY_RATE], leak, period, s[4 * r + c])
+                duals[d] = moved(duals[d], w[START + k], w[BODY_RATE], leak, period, slope[4 * r + c])
                 k += 1
     for k in range(layout[NUMBERS]):
         code, i = layout[UNKNOWN + count + 2 * k], layout[UNKNOWN + count + 2 * k + 1]
         w, d = weights[FIRST_BODY + PER_BODY * count + PER_NUMBER * k :], TRIANGLE * count + k
-        slope = w[WIDTH] * z2[i] * factor_of(code, signals.v_r[i], signals.a_r[i], weights[TRANSITION])
-        duals[d] = moved(duals[d], w[DUAL], w[RATE], leak, period, slope)
+        felt = w[WIDTH] * z2[i] * factor_of(code, signals.v_r[i], signals.a_r[i], weights[TRANSITION])
+        duals[d] = moved(duals[d], w[DUAL], w[RATE], leak, period, felt)
 
 
 @kernel

@@ -68,7 +68,7 @@ def described_robot(description: Any) -> Settings | None:
 
 
 def _robot_in(description: Any) -> Any:
-    """The described arm; that of a law is its model's, that of one about another the other's, that of a model correcting another is the other's."""
+    """The described arm: of a law that of its model, of a law or model about another that of the other."""
     kind = _kind_of(description)
     if "robot" in kind.parts:
         return description["robot"]
