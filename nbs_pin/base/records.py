@@ -26,6 +26,7 @@ ROW_ARRAYS = ("q", "v", "tau", "tau_command", "disturbance", "q_ref", "v_ref", "
 """Arrays of a run with a number for each instant, start and joint."""
 _PER_JOINT = ("effort_limit", "continuous", "joint_names")
 _JSON = ("robot_options", "info")
+_OPTIONAL = {"prismatic": "b", "estimates": "f"}
 
 
 class Reference(NamedTuple):
@@ -98,6 +99,8 @@ class Run(Shown):
     """Further metadata (controller, plant, seed, versions), stored as JSON."""
     prismatic: Bool[np.ndarray, " n"] | None = None
     """True for joints that slide, with q in [m] and a force tau [N]; None, as in older files, is for no joint."""
+    estimates: Float[np.ndarray, "rows *batch m"] | None = None
+    """What a law that adapts believed before each row, for its `estimate`; None for other laws."""
 
     def __post_init__(self) -> None:
         check_fields(self, period=PERIOD, robot=text, robot_sha256=text, robot_options=mapping, info=mapping)
@@ -112,6 +115,13 @@ class Run(Shown):
                     f"Run: prismatic has shape {slides.shape}, expected {wraps.shape}, one truth value per joint."
                 )
             object.__setattr__(self, "prismatic", slides)
+        if self.estimates is not None:
+            object.__setattr__(self, "estimates", floats("Run: estimates", self.estimates))
+            if self.estimates.shape[:-1] != self.q.shape[:-1]:
+                raise ArgumentError(
+                    f"Run: estimates has shape {self.estimates.shape} beside q of shape {self.q.shape}; give a row of"
+                    " them for each of q."
+                )
         names = tuple(self.joint_names) if isinstance(self.joint_names, tuple | list) else ()
         object.__setattr__(self, "joint_names", names)
         shape = self.q.shape
@@ -131,6 +141,12 @@ class Run(Shown):
     def nv(self) -> int:
         """Number of joints."""
         return int(self.q.shape[-1])
+
+    @property
+    def signals(self) -> dict[str, Any]:
+        """What has a row for each instant besides `t`: `ROW_ARRAYS`, and the estimates if there are any."""
+        own: dict[str, Any] = {name: getattr(self, name) for name in ROW_ARRAYS}
+        return own if self.estimates is None else own | {"estimates": self.estimates}
 
     def _facts(self) -> Iterable[str]:
         starts = math.prod(self.q.shape[1:-1])
@@ -176,7 +192,7 @@ class Run(Shown):
     @checked(rows=count(1, of="rows"))
     def head(self, rows: int) -> "Run":
         """The first rows of the run, all of them if it has fewer."""
-        return dataclasses.replace(self, **{name: getattr(self, name)[:rows] for name in ("t", *ROW_ARRAYS)})
+        return dataclasses.replace(self, t=self.t[:rows], **{name: x[:rows] for name, x in self.signals.items()})
 
     @classmethod
     @checked(path=readable)
@@ -190,7 +206,7 @@ class Run(Shown):
         data = {"robot_options": np.array("{}"), **read_npz(path, names)}  # absent in the oldest run files
         require(data, path, {"format": "U", "t": "f", **dict.fromkeys(ROW_ARRAYS, "f"), "effort_limit": "f"})
         require(data, path, {"continuous": "b", **dict.fromkeys(("joint_names", "robot", "robot_sha256", *_JSON), "U")})
-        require(data, path, {"period": "f", **({"prismatic": "b"} if "prismatic" in data else {})})
+        require(data, path, {"period": "f", **{name: kind for name, kind in _OPTIONAL.items() if name in data}})
         if str(data["format"]) != RUN_FORMAT:
             raise FileFormatError(f"{path}: format '{data['format']}', expected '{RUN_FORMAT}'; record the run again.")
         _check_shapes(path, data)
@@ -205,6 +221,7 @@ class Run(Shown):
             robot_options=parse_json(path, "robot_options", str(data["robot_options"])),
             info=parse_json(path, "info", str(data["info"])),
             prismatic=data.get("prismatic"),
+            estimates=data.get("estimates"),
         )
 
 
@@ -216,6 +233,8 @@ def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
     shape = data["q"].shape
     joints = (*_PER_JOINT, *(["prismatic"] if "prismatic" in data else []))
     expected = dict.fromkeys(ROW_ARRAYS, shape) | dict.fromkeys(joints, shape[-1:]) | {"t": shape[:1], "period": ()}
+    if "estimates" in data:
+        expected["estimates"] = (*shape[:-1], *data["estimates"].shape[-1:])
     for name, wanted in expected.items():
         if len(shape) < 2 or 0 in shape or data[name].shape != wanted:
             raise FileFormatError(
@@ -227,7 +246,7 @@ def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
 def _number_faults(arrays: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
     """What no file of a run may have, by array, with the first row that has it, or 0."""
     faults = {}
-    for name in ("t", *ROW_ARRAYS):
+    for name in ("t", *ROW_ARRAYS, *(["estimates"] if arrays.get("estimates") is not None else [])):
         finite = np.isfinite(arrays[name]).reshape(len(arrays["t"]), -1).all(axis=1)
         if not finite.all():
             faults[name] = "numbers that are not finite", int(np.argmin(finite))

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.progress import tracked
-from nbs_pin.base.records import ROW_ARRAYS, Run
+from nbs_pin.base.records import Run
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
@@ -114,7 +114,7 @@ class LoopEnsemble:
         with torch.no_grad():
             moved = motions(self.controller, batch, self.engine)
         many = recorded(moved, batch, type(self.controller).__name__)
-        return replace(many, **{name: getattr(many, name)[:, 0] for name in ROW_ARRAYS}, info={**many.info, **info})
+        return replace(many, **{name: x[:, 0] for name, x in many.signals.items()}, info={**many.info, **info})
 
     def _errors(self, batch: Batch, tau_d: torch.Tensor | None = None) -> torch.Tensor:
         """z1 (count, rows, n); raises SimulationDiverged if it is not finite."""

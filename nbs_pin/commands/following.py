@@ -11,7 +11,7 @@ from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.npz import LARGEST
 from nbs_pin.base.progress import waiting
-from nbs_pin.base.records import ROW_ARRAYS, Reference, Run
+from nbs_pin.base.records import Reference, Run
 from nbs_pin.commands.inputs import law_of
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
@@ -127,9 +127,9 @@ def not_simulated(robot: Robot, joint_friction: str) -> list[str]:
 
 def _joined(blocks: Sequence[Run]) -> Run:
     """The runs of `stream` as one: each begins at the instant in which the one before ended."""
+    parts = [{"t": run.t, **run.signals} for run in blocks]
     rows: dict[str, Any] = {
-        name: np.concatenate([*(getattr(run, name)[:-1] for run in blocks[:-1]), getattr(blocks[-1], name)])
-        for name in ("t", *ROW_ARRAYS)
+        name: np.concatenate([*(part[name][:-1] for part in parts[:-1]), last]) for name, last in parts[-1].items()
     }
     return replace(blocks[0], **rows)
 

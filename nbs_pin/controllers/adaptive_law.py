@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from torch import nn
 
-from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, flag, maybe, number, numbers, text, texts
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, maybe, number, numbers, text, texts
 from nbs_pin.base.arrays import Array, Vectors, array_namespace, as_vectors, constant_like, finite_result
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
@@ -27,7 +27,6 @@ from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.dynamics.rigid_tree import RigidTree
-from nbs_pin.kernels.adaptation import pack_adaptive
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import BASE, BODY, MASS
 from nbs_pin.robots.robot import ARM, Robot
@@ -176,6 +175,10 @@ class AdaptiveLaw(Controller, nn.Module):
         zero = 0.0 * q
         return AdaptiveMemory(constant_like(q, self.unknowns.start) + zero[..., :1], zero, zero)
 
+    def recorded(self, memory: AdaptiveMemory) -> Array:
+        """The duals."""
+        return memory.duals
+
     def step(
         self, memory: AdaptiveMemory, q: Vectors, v: Vectors, reference: Reference, period: float
     ) -> tuple[Vectors, AdaptiveMemory]:
@@ -200,32 +203,21 @@ class AdaptiveLaw(Controller, nn.Module):
     def _now(self, duals: Array, q: Array, v: Array, v_r: Array, a_r: Array) -> AdaptingModel:
         return AdaptingModel.of(self.unknowns, *self._tree, duals, q, v, v_r, a_r)
 
-    @checked(memory=maybe(a(AdaptiveMemory, "what initial_memory or step returned")))
-    def estimate(self, memory: AdaptiveMemory | None = None) -> Estimate:
-        """What is believed of the unknowns with this memory; None is the start."""
-        duals = self.unknowns.start if memory is None else np.asarray(memory.duals, dtype=float)
-        return Estimate(self.robot, self._believed, self.unknowns, duals)
+    def estimate(self, recorded: AdaptiveMemory | Array | None = None) -> Estimate:
+        """What is believed of the unknowns with this memory, or over a run: `law.estimate(run.estimates)`.
 
-    @property
-    def packable(self) -> bool:
-        """Whether the kernel implements this law and the one that it is about; False for a subclass."""
-        return defines(self, "packed_law") and self.law.packable
-
-    @checked(numpy=flag)
-    def packed_law(self, *, numpy: bool = True) -> Packed:
-        """Constants and weights of the law, its model and the unknowns (`kernels/adaptation.py`)."""
-        if not self.packable:
-            return super().packed_law(numpy=numpy)
-        return pack_adaptive(self.law.packed_law(), self._believed, self.unknowns.packed(self.rates, self.leak))
+        None is the start. Raises ArgumentError for estimates of another law.
+        """
+        duals = recorded.duals if isinstance(recorded, AdaptiveMemory) else recorded
+        (given,) = as_vectors(self.unknowns.start.size, estimates=self.unknowns.start if duals is None else duals)
+        return Estimate(self.robot, self._believed, self.unknowns, np.asarray(given, dtype=float))
 
     def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
-        """The law as machine code (`Controller.compile`)."""
-        if not self.packable:
+        """The law as machine code (`Controller.compile`); itself for a subclass, or around a law that has none."""
+        if not (defines(self, "compile") and self.law.packable):
             return self
-        law = self.law.packed_law()
-        return CompiledAdaptiveLaw(
-            law, self._believed, self.unknowns, self.rates, self.leak, self.period, self.robot.effort_limit
-        )
+        settings = self.rates, self.leak, self.period, self.robot.effort_limit
+        return CompiledAdaptiveLaw(self.law.packed_law(), self._believed, self.unknowns, *settings)
 
 
 def _geometry(tree: Packed) -> np.ndarray:

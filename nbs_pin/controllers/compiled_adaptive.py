@@ -47,8 +47,8 @@ class CompiledAdaptiveLaw(Controller):
     """
 
     def __init__(
-        self, law: Packed, tree: Packed, unknowns: Unknowns, rates: Float[np.ndarray, " unknowns"], leak: float, period: float,
-        limit: JointArray,
+        self, law: Packed, tree: Packed, unknowns: Unknowns, rates: Float[np.ndarray, " unknowns"], leak: float,
+        period: float, limit: JointArray,
     ) -> None:  # fmt: skip
         self._given = law, tree, unknowns, rates, leak, period, limit
         compile_adaptive_law()
@@ -81,6 +81,10 @@ class CompiledAdaptiveLaw(Controller):
         (q,) = as_vectors(self.nv, q=q)
         _numpy(q)
         return AdaptiveMemory(self._start + 0.0 * q[..., :1], np.zeros_like(q), np.zeros_like(q))
+
+    def recorded(self, memory: AdaptiveMemory) -> Array:
+        """The duals."""
+        return memory.duals
 
     def step(
         self, memory: AdaptiveMemory, q: Vectors, v: Vectors, reference: Reference, period: float

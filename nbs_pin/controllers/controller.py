@@ -48,6 +48,10 @@ class Controller(Shown, ABC):
     def step(self, memory: Any, q: Vectors, v: Vectors, reference: Reference, period: float) -> tuple[Vectors, Any]:
         """Torque τ [N·m] to hold for the next period [s], and the memory for the step after it."""
 
+    def recorded(self, memory: Any) -> Array | None:
+        """What a run records of the memory, (..., m), as its `estimates`; None for nothing."""
+        return None
+
     @property
     def packable(self) -> bool:
         """Whether the law has a compiled form (`packed_law`, `compile`)."""

@@ -99,11 +99,15 @@ class Estimate(Shown):
         return inertial_parameters(back @ bodies @ np.swapaxes(back, -1, -2))
 
     def dynamics(self) -> IdentifiedDynamics:
-        """The model with these bodies, rotors and friction, of one memory, which laws, `compare` and files take."""
+        """The model with these bodies, rotors and friction, of one memory, which laws, `compare` and files take.
+
+        Estimates of friction and rotors a little below zero become zero.
+        """
         friction = None
         if any(number.code == NumberCode.COULOMB for number in self.unknowns.numbers):
-            friction = JointFriction(self.viscous, self.coulomb, self.unknowns.transition)
-        return IdentifiedDynamics(self.robot, self.parameters, friction, np.array(self.rotor_inertia))
+            own = np.maximum(self.viscous, 0.0), np.maximum(self.coulomb, 0.0)
+            friction = JointFriction(*own, self.unknowns.transition)
+        return IdentifiedDynamics(self.robot, self.parameters, friction, np.maximum(self.rotor_inertia, 0.0))
 
     @property
     def _load(self) -> UnknownBody | None:

@@ -22,7 +22,7 @@ from nbs_pin.base.arguments import checked, count, maybe, writable
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
-from nbs_pin.base.records import ROW_ARRAYS, RUN, Run
+from nbs_pin.base.records import RUN, Run
 from nbs_pin.reports.captions import arm_in_words, law_in_words, settings_in_words
 from nbs_pin.reports.verdicts import BAD, GOOD, WARNING, Verdict, verdict_of
 from nbs_pin.robots.named import robot_of
@@ -285,7 +285,7 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
 
 def one_start(run: Run, start: int) -> Run:
     """The run with one start alone; raises ArgumentError if it has no such start."""
-    arrays: dict[str, Any] = {name: getattr(run, name).reshape(len(run.t), -1, run.nv) for name in ROW_ARRAYS}
+    arrays = {name: x.reshape(len(run.t), -1, x.shape[-1]) for name, x in run.signals.items()}
     starts = arrays["q"].shape[1]
     if not 0 <= start < starts:
         raise ArgumentError(f"{option('start', start)} does not exist: the run has starts 0 to {starts - 1}.")

@@ -126,10 +126,14 @@ def _shared(loop: "_Closed", reference: DesiredMotion, start: tuple[np.ndarray, 
             for first, end in shares
         ]
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-            runs = joblib.Parallel(n_jobs=workers)(jobs)
-    stored = {name: getattr(runs[0], name) for name in ("q_ref", "v_ref", "a_ref")}
-    references = {name: np.array(np.broadcast_to(x, rows[0].shape)) for name, x in stored.items()}
-    return replace(runs[0], **{name: np.asarray(row) for name, row in zip(_RECORDED, rows, strict=True)}, **references)
+            shared = joblib.Parallel(n_jobs=workers)(jobs)
+    first, seen = shared[0][0], [estimates for _, estimates in shared if estimates is not None]
+    stored = {name: getattr(first, name) for name in ("q_ref", "v_ref", "a_ref")}
+    references: dict[str, np.ndarray] = {
+        name: np.array(np.broadcast_to(x, rows[0].shape)) for name, x in stored.items()
+    }
+    references |= {"estimates": np.concatenate(seen, axis=1)} if seen else {}
+    return replace(first, **{name: np.asarray(row) for name, row in zip(_RECORDED, rows, strict=True)}, **references)
 
 
 def _roomy(size: int) -> str | None:
@@ -145,14 +149,15 @@ def _of_starts(loop: "_Closed", first: int, end: int, count: int) -> "_Closed":
 
 def _share(
     file: str, share: tuple[int, int], loop: "_Closed", reference: DesiredMotion, q0: np.ndarray, v0: np.ndarray
-) -> Run:
-    """The simulation of one worker: writes its starts into the file and returns the first of them."""
+) -> tuple[Run, np.ndarray | None]:
+    """The simulation of one worker: writes its starts into the file, returns the first of them and all estimates."""
     own = slice(*share)
     run, _ = _block(loop, reference, 0, loop.steps, (q0[own], v0[own]), None, False)
     rows = np.lib.format.open_memmap(file, mode="r+")
     for row, name in zip(rows, _RECORDED, strict=True):
         row[:, own] = getattr(run, name)
-    return replace(run, **{name: getattr(run, name)[:, :1] for name in (*_RECORDED, "q_ref", "v_ref", "a_ref")})
+    one = {name: getattr(run, name)[:, :1] for name in (*_RECORDED, "q_ref", "v_ref", "a_ref")}
+    return replace(run, **one, estimates=None), run.estimates
 
 
 @checked(**_LOOP, block=count(1, MOST_PERIODS, "periods"))
@@ -249,13 +254,19 @@ def _block(
     run = loop.blank_run(times, desired, *start, controller=loop.name)
     run.info.update(getattr(reference, "notes", {}))
     memory = loop.law.initial_memory(run.q[0]) if first == 0 else memory
+    begun = loop.law.recorded(memory)
+    seen = None if begun is None else np.zeros((steps + 1, *np.shape(begun)))
     # No overflow warnings: every torque and state is checked, and reported with its time.
     with np.errstate(over="ignore", invalid="ignore"):
         for k in tracked(range(steps), "simulating", progress):
+            if seen is not None:
+                seen[k] = loop.law.recorded(memory)
             tau, memory = _control(loop, run, k, leads[k], target, memory)
             run.q[k + 1], run.v[k + 1] = _advance(loop, run, k, tau)
+        if seen is not None:
+            seen[steps] = loop.law.recorded(memory)
         _control(loop, run, steps, leads[steps], target, memory)  # recorded; a following block computes it again
-    return run, memory
+    return run if seen is None else replace(run, estimates=seen), memory
 
 
 def _control(loop: _Closed, run: Run, k: int, lead: float, target: Reference, memory: Any) -> tuple[np.ndarray, Any]:

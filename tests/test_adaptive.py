@@ -1,0 +1,255 @@
+"""Laws that adapt: identities of their proof, their kernel against the law as it is written, and what they learn."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings, strategies as st
+
+import nbs_pin as nbs
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.records import Reference
+from nbs_pin.controllers.adapting_model import Duals
+from nbs_pin.controllers.matrix_logistic import logistic_and_cut
+from nbs_pin.controllers.unknowns import ADAPTS, model_body
+from nbs_pin.dynamics.body_fields import body_fields
+from nbs_pin.dynamics.pinocchio_tree import pack_model
+from nbs_pin.dynamics.rigid_tree import RigidTree
+from nbs_pin.kernels.symmetric4 import FARTHEST
+from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY
+from nbs_pin.robots.places import tool_frame
+
+ARMS = ["two_link", "panda", str(Path(__file__).parent / "data" / "gantry.urdf")]
+KINDS = [["load"], ["links"], ["friction", "rotors", "offsets"], list(ADAPTS)]
+
+
+@pytest.fixture(scope="module", params=ARMS)
+def robot(request):
+    return nbs.load_robot(request.param)
+
+
+def law_for(robot, adapts, **settings):
+    return nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), adapts, **settings)
+
+
+def stirred(law, batch, seed=0):
+    """A memory with estimates away from the first ones, and errors of earlier instants."""
+    rng, zero = np.random.default_rng(seed), np.zeros((*batch, law.nv))
+    memory = law.initial_memory(zero)
+    duals = memory.duals + rng.normal(size=memory.duals.shape)
+    return memory._replace(duals=duals, z2=rng.normal(size=zero.shape), before=rng.normal(size=zero.shape))
+
+
+def fields_of(robot, q, v, w, a):
+    tree = pack_model(robot.model)
+    return body_fields(RigidTree.of(tree), -tree.weights[:BASE], q, v, w, a)
+
+
+def test_torques_are_linear_in_bodies(robot):
+    """The torque of 4×4 fields is Pinocchio's M a + C(q, v) w + G, and its power at μ is Σ tr(L P)."""
+    tree, n = pack_model(robot.model), robot.nv
+    q, v, w, a, mu = np.random.default_rng(1).normal(size=(5, 4, n))
+    fields, bodies = fields_of(robot, q, v, w, a), [model_body(tree, i) for i in range(n)]
+    armature = tree.weights[BASE:].reshape(n, BODY)[:, ARMATURE]
+    tau = fields.torque(bodies)
+    expected = nbs.PinocchioDynamics(robot).reference_torque(q, v, w, a)
+    np.testing.assert_allclose(tau + armature * a, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    powers = zip(fields.velocities(mu), fields.accelerations, bodies, strict=True)
+    power = sum(np.einsum("kij,kil,jl->k", u, x, p) for u, x, p in powers)
+    np.testing.assert_allclose(power, (tau * mu).sum(axis=-1), rtol=1e-12, atol=1e-12 * np.abs(power).max())
+
+
+@pytest.mark.parametrize("adapts", KINDS, ids="+".join)
+def test_the_kernel_is_the_law(robot, adapts):
+    law = law_for(robot, adapts, leak=0.3)
+    compiled, rng = law.compile(), np.random.default_rng(2)
+    assert compiled is not law
+    ours = theirs = stirred(law, (2, 3))
+    for _ in range(3):
+        q, v, *aim = 0.1 * rng.normal(size=(5, 2, 3, law.nv))
+        tau, ours = law.step(ours, q, v, Reference(*aim), 0.001)
+        found, theirs = compiled.step(theirs, q, v, Reference(*aim), 0.001)
+        np.testing.assert_allclose(found, tau, rtol=0.0, atol=1e-12 * np.abs(tau).max())
+        for x, y in zip(theirs, ours, strict=True):
+            np.testing.assert_allclose(x, y, rtol=0.0, atol=1e-11 * np.abs(y).max())
+
+
+@pytest.mark.parametrize("adapts", KINDS, ids="+".join)
+def test_at_the_start_the_law_is_the_one_it_is_about(robot, adapts):
+    law = law_for(robot, adapts)
+    q, v, *aim = np.random.default_rng(3).normal(size=(5, law.nv))
+    tau = law.law.torque(q, v, *aim)
+    found, _ = law.step(law.initial_memory(q), q, v, Reference(*aim), 0.001)
+    spare = 1e-3 if robot.name.startswith("two") else 1e-9  # a point mass is not inside the cone: it begins near it
+    np.testing.assert_allclose(found, tau, rtol=0.0, atol=spare * np.abs(tau).max())
+
+
+@pytest.mark.parametrize("adapts", KINDS, ids="+".join)
+def test_the_divergence_pays_for_the_wrong_estimates(robot, adapts):
+    """d/dt Σ d/γ = −z2ᵀ(τ(estimates) − τ(truth)): what the wrong model adds to V̇, the divergence takes away."""
+    law, rng = law_for(robot, adapts), np.random.default_rng(4)
+    memory, truth = stirred(law, ()), stirred(law, (), seed=5)
+    q, v, v_r, a_r, z2 = rng.normal(size=(5, law.nv))
+    now, true = (law._now(m.duals, q, v, v_r, a_r) for m in (memory, truth))
+    power = float(z2 @ (now.torque() - true.torque()))
+
+    def divergence(duals):
+        count, total = len(law.unknowns.bodies), 0.0
+        mine, other = Duals.of(duals, count), Duals.of(truth.duals, count)
+        (x, _), (y, _) = logistic_and_cut(mine.bodies), logistic_and_cut(other.bodies)
+        for k in range(count):
+            total += _bregman(np.linalg.eigvalsh(mine.bodies[k]), np.linalg.eigvalsh(other.bodies[k])) / law.rates[k]
+            total += np.trace((other.bodies[k] - mine.bodies[k]) @ y[k]) / law.rates[k]
+            assert np.linalg.eigvalsh(x[k])[0] > 0.0
+        for a, b, rate in zip(mine.numbers, other.numbers, law.rates[count:], strict=True):
+            total += (np.logaddexp(0.0, a) - np.logaddexp(0.0, b) + (b - a) / (1.0 + np.exp(-b))) / rate
+        return total
+
+    h = 1e-7
+    ahead, behind = (now.moved(sign * z2, law.rates, 0.0, h) for sign in (1.0, -1.0))
+    rate = (divergence(ahead) - divergence(behind)) / (2.0 * h)
+    assert rate == pytest.approx(-power, rel=1e-5, abs=1e-6 * (1.0 + abs(power)))
+
+
+def _bregman(mine, other):
+    return np.logaddexp(0.0, mine).sum() - np.logaddexp(0.0, other).sum()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 3.0))
+def test_no_step_leaves_the_cone_and_its_cost_is_bounded(seed, size):
+    """However large a step, estimates stay within their bounds; it costs at most ‖step‖²/8 of divergence."""
+    rng = np.random.default_rng(seed)
+    q, step = (x + x.T for x in rng.normal(size=(2, 4, 4)) * 10.0**size)
+    (x, cut), (y, _) = logistic_and_cut(q), logistic_and_cut(q + step)
+    for estimate in (x, y):
+        values = np.linalg.eigvalsh(estimate)
+        assert values[0] > 0.0
+        assert values[-1] < 1.0
+    small = step / np.linalg.norm(step)
+    if np.abs(np.linalg.eigvalsh(q)).max() < 0.9 * FARTHEST:
+        cost = _bregman(np.linalg.eigvalsh(q + small), np.linalg.eigvalsh(q)) - np.trace(small @ x)
+        assert -1e-12 <= cost <= 0.125 + 1e-12
+        np.testing.assert_allclose(cut, q, rtol=0.0, atol=1e-12 * np.abs(q).max())
+
+
+def test_the_logistic_function_can_be_differentiated_where_eigenvalues_are_equal():
+    q = torch.diag(torch.tensor([1.0, 1.0, 1.0, -2.0], dtype=torch.float64))[None].requires_grad_()
+    weight = torch.from_numpy(np.random.default_rng(6).normal(size=(1, 4, 4)))
+
+    def value(dual):
+        x, _ = logistic_and_cut(0.5 * (dual + dual.transpose(-1, -2)))
+        return (x * weight).sum()
+
+    assert torch.autograd.gradcheck(value, (q,), eps=1e-6, atol=1e-7)
+
+
+def test_gradients_pass_through_steps(robot):
+    """∂/∂(start) of torques after three steps, by torch against differences of the numpy law."""
+    law, n = law_for(robot, ["load", "friction", "rotors"]), robot.nv
+    rng = np.random.default_rng(7)
+    states, weight, direction = 0.1 * rng.normal(size=(3, 5, n)), rng.normal(size=n), rng.normal(size=n)
+
+    def cost(q0):
+        memory, total = law.initial_memory(q0), 0.0
+        for q, v, *aim in states:
+            given = [torch.as_tensor(x) for x in aim] if isinstance(q0, torch.Tensor) else aim
+            q, v = (torch.as_tensor(x) for x in (q, v)) if isinstance(q0, torch.Tensor) else (q, v)
+            tau, memory = law.step(memory, q0 + q, v, Reference(*given), 0.001)
+            total = total + (tau * (torch.as_tensor(weight) if isinstance(q0, torch.Tensor) else weight)).sum()
+        return total
+
+    start = torch.zeros(n, dtype=torch.float64, requires_grad=True)
+    cost(start).backward()
+    h = 1e-6
+    slope = (cost(h * direction) - cost(-h * direction)) / (2.0 * h)
+    assert float(start.grad @ torch.as_tensor(direction)) == pytest.approx(slope, rel=1e-5)
+
+
+def test_estimates_wait_while_a_torque_is_cut_off():
+    robot = nbs.load_robot("two_link")
+    for adapting in (law_for(robot, list(ADAPTS)), law_for(robot, list(ADAPTS)).compile()):
+        memory = stirred(adapting if isinstance(adapting, nbs.AdaptiveLaw) else law_for(robot, list(ADAPTS)), ())
+        still = np.zeros(2)
+        for error, moves in ((1e-3, True), (3.0, False)):
+            _, after = adapting.step(memory, still, still, Reference(np.full(2, error), still, still), 0.001)
+            assert bool((after.duals != memory.duals).any()) is moves
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "xarm7"])
+def test_an_unknown_load_is_found(name):
+    """2 kg that the law does not know: the error falls below a twentieth of the fixed law's, the mass is right."""
+    robot = nbs.load_robot(name)
+    plant = nbs.MujocoPlant(robot.with_payload(tool_frame(robot), 2.0))
+    fixed, law = nbs.NeuralBackstepping.for_robot(robot), nbs.AdaptiveLaw.for_robot(robot)
+    reference, errors = nbs.Sinusoid.for_robot(robot), []
+    for one in (fixed, law):
+        run = nbs.simulate(plant, one, reference, 12.0, 0.001, check=False)
+        errors.append(np.abs(run.q - run.q_ref)[run.t > 9.0].max())
+    assert errors[1] < 0.05 * errors[0] or errors[1] < 3e-3
+    assert float(law.estimate(run.estimates[-1]).load_mass) == pytest.approx(2.0, rel=0.05)
+
+
+def test_estimates_make_a_model_whose_torque_is_that_of_the_law(robot):
+    law = law_for(robot, list(ADAPTS[:-1]))
+    numbers = 10 * len(law.unknowns.bodies)
+    memory = stirred(law, ())
+    memory.duals[numbers:] = np.maximum(memory.duals, law.unknowns.start)[numbers:]  # no friction below zero
+    q, v, v_r, a_r = np.random.default_rng(8).normal(size=(4, robot.nv))
+    model = law.estimate(memory).dynamics()
+    tau = law.law.dynamics.reference_torque(q, v, v_r, a_r) + law._now(memory.duals, q, v, v_r, a_r).torque()
+    found = model.reference_torque(q, v, v_r, a_r) + model.friction.torque(v_r)
+    np.testing.assert_allclose(found, tau, rtol=0.0, atol=1e-9 * np.abs(tau).max())
+
+
+def test_files_keep_rates_of_a_law_that_was_trained_first(tmp_path, robot):
+    inner = nbs.NeuralBackstepping.for_robot(robot)
+    with torch.no_grad():
+        for parameter in inner.parameters():
+            parameter += 0.01
+    law = nbs.AdaptiveLaw(inner, ["load", "rotors"], load_mass=1.5, load_radius=0.2, leak=0.1)
+    nbs.save(law, tmp_path / "law.nbs")
+    again = nbs.load(tmp_path / "law.nbs")
+    memory = stirred(law, ())
+    q, v, *aim = 0.1 * np.random.default_rng(9).normal(size=(5, robot.nv))
+    for one, other in ((law, again), (law.compile(), again.compile())):
+        after, same = (x.step(memory, q, v, Reference(*aim), 0.001)[1] for x in (one, other))
+        for x, y in zip(after, same, strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+def _step(law, memory, zero, period=0.001):
+    return law.step(memory, zero, zero, Reference(zero, zero, zero), period)
+
+
+REFUSED = {
+    "period is 0.002 s, expected at most": lambda law, zero: _step(law, law.initial_memory(zero), zero, 0.002),
+    "what initial_memory or step returned": lambda law, zero: _step(law, None, zero),
+    "duals": lambda law, zero: _step(law, law.initial_memory(np.tile(zero, (2, 1))), zero),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_wrong_calls_are_refused(case):
+    robot = nbs.load_robot("two_link")
+    law = law_for(robot, ["load"])
+    for one in (law, law.compile()):
+        with pytest.raises(ArgumentError, match=case):
+            REFUSED[case](one, np.zeros(2))
+
+
+def test_wrong_settings_are_refused():
+    robot = nbs.load_robot("panda")
+    inner = nbs.NeuralBackstepping.for_robot(robot)
+    for wrong in (["mass"], [], ["load", "load"]):
+        with pytest.raises(ArgumentError, match="adapts is"):
+            nbs.AdaptiveLaw(inner, wrong)
+    with pytest.raises(ArgumentError, match="no moving link 'nothing'"):
+        nbs.AdaptiveLaw(inner, frame="nothing")
+    with pytest.raises(ArgumentError, match="no joint 'nothing'"):
+        nbs.AdaptiveLaw(inner, ["links"], links=["nothing"])
+    with pytest.raises(ArgumentError, match="gain is 1"):
+        nbs.AdaptiveLaw(inner, gain=1.0)
+    with pytest.raises(ArgumentError, match="cannot adapt"):
+        nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot, nbs.TanhNetwork(7, robot=robot)))
