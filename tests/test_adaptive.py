@@ -226,7 +226,7 @@ def _step(law, memory, zero, period=0.001):
 REFUSED = {
     "period is 0.002 s, expected at most": lambda law, zero: _step(law, law.initial_memory(zero), zero, 0.002),
     "what initial_memory or step returned": lambda law, zero: _step(law, None, zero),
-    "duals": lambda law, zero: _step(law, law.initial_memory(np.tile(zero, (2, 1))), zero),
+    "duals": lambda law, zero: _step(law, law.initial_memory(zero)._replace(duals=np.zeros(3)), zero),
 }
 
 
@@ -251,5 +251,9 @@ def test_wrong_settings_are_refused():
         nbs.AdaptiveLaw(inner, ["links"], links=["nothing"])
     with pytest.raises(ArgumentError, match="gain is 1"):
         nbs.AdaptiveLaw(inner, gain=1.0)
-    with pytest.raises(ArgumentError, match="cannot adapt"):
-        nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot, nbs.TanhNetwork(7, robot=robot)))
+    with pytest.raises(ArgumentError, match="cannot adapt a Foreign"):
+        nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot, Foreign(robot)))
+
+
+class Foreign(nbs.PinocchioDynamics):
+    """A model whose equations may not be those of a rigid tree."""

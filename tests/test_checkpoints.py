@@ -84,7 +84,7 @@ def torques(controller, rows=20):
     q, v, q_ref, v_ref, a_ref = rng.normal(scale=2.0, size=(5, rows, controller.nv))
     memory = controller.initial_memory(q)
     for _ in range(3):
-        tau, memory = controller.step(memory, q, v, Reference(q_ref, v_ref, a_ref), 0.01)
+        tau, memory = controller.step(memory, q, v, Reference(q_ref, v_ref, a_ref), 0.001)
     return tau
 
 
