@@ -183,6 +183,7 @@ def _draw_tool(figure: Figure, row: np.ndarray, run: Run, robot: Robot, tool: di
     for axes, title, error in zip(row, titles, shown if tool.get("orientation") == "hold" else shown[:1], strict=False):
         _draw_error(axes, run.t, error, _decades(error))
         axes.set_title(title, loc="left", fontsize=8.5, color=INK)
+        draw_changes([axes], run)
     if tool.get("orientation") != "hold":
         row[1].set_axis_off()
     place = row[2].get_subplotspec()

@@ -124,5 +124,5 @@ def _check_joints(first: Plant, t: float, plant: Plant) -> None:
         problem = difference_of_joints(plant.robot, first.robot, "the first plant")
     if problem:
         raise ArgumentError(
-            f"ChangingPlant: the plant from {t:g} s on is of another arm: {problem}; build all for one."
+            f"ChangingPlant: the plant from {t:g} s on is of another arm: {problem}; build all for one arm."
         )
