@@ -187,6 +187,10 @@ def test_loads_add_up_with_those_that_the_arm_carries(tmp_path):
             weight = weight + _weight(alone, q) - _weight(nbs.PinocchioDynamics(bare), q)
         np.testing.assert_allclose(_mass(held, q), mass, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(_weight(held, q), weight, rtol=1e-10, atol=1e-12)
+        q, v, tau = rng.normal(size=(3, 3))
+        moved = nbs.DynamicsPlant(nbs.PinocchioDynamics(carrying(robot, loads))).step(q, v, tau, 1e-3)
+        in_mujoco = nbs.MujocoPlant(carrying(robot, loads)).step(q, v, tau, 1e-3)
+        np.testing.assert_allclose(in_mujoco, moved, rtol=0.0, atol=1e-9)
     assert carrying(bare, []) is bare
 
 
