@@ -93,6 +93,7 @@ from .runtime.guard import Fault as Fault, Guard as Guard, Mode as Mode
 from .runtime.guarded import FaultReport as FaultReport, Guarded as Guarded, Sample as Sample
 from .runtime.ur_arm import URArm as URArm
 from .simulation import metrics as metrics
+from .simulation.changing_plant import ChangingPlant as ChangingPlant
 from .simulation.costs import TimeOutside as TimeOutside, TorqueAware as TorqueAware, squared_error as squared_error
 from .simulation.dynamics_plant import DynamicsPlant as DynamicsPlant
 from .simulation.mujoco_plant import MujocoPlant as MujocoPlant

@@ -388,7 +388,7 @@ def test_the_live_view_listens_on_this_machine_only():
 def test_nbs_pin_run_writes_what_happened(tmp_path, monkeypatch):
     from nbs_pin.commands import run as command
 
-    monkeypatch.setattr(command, "arm_at", lambda text, robot, motion, period: simulated(robot, motion(0.0).q))
+    monkeypatch.setattr(command, "arm_at", lambda text, robot, motion, *_: simulated(robot, motion(0.0).q))
     text = printed_by("run", "two_link", "--duration", "0.3", "--certified", "5", "--out", tmp_path)
     assert "guard: OK" in text
     assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "tracking.png", "replay.html", "summary.json"}

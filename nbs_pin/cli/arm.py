@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import tyro
 
+from nbs_pin.cli.payloads import read_payload
 from nbs_pin.cli.values import OptionError, default, plain_number, plain_numbers, text
 
 _FLAGS = {"xacro_args": "arg", "package_dirs": "package-dir"}
@@ -82,19 +83,6 @@ def _read_by_joint(flag: str) -> Callable[[str], float | dict[str, float]]:
     return read
 
 
-def _read_payload(words: str) -> tuple[str, dict[str, Any]]:
-    """The link and the load of MASS, MASS@LINK or MASS@LINK:X,Y,Z."""
-    mass, _, where = words.partition("@")
-    link, _, at = where.partition(":")
-    kilograms, com = plain_number(mass), plain_numbers(at) if at else [0.0, 0.0, 0.0]
-    if kilograms is None or kilograms <= 0.0 or com is None or len(com) != 3:
-        raise OptionError(
-            f"--payload is '{words}'; give MASS [kg], MASS@LINK, or with its centre of mass in the frame of the link "
-            "[m]: --payload 2@flange:0,0,0.05."
-        )
-    return link, {"mass": kilograms, "com": com}
-
-
 def _read_tool(words: str) -> dict[str, Any]:
     """The file and the link of FILE or FILE@LINK."""
     file, _, link = words.rpartition("@") if "@" in words else (words, "", "")
@@ -169,9 +157,7 @@ class ArmOptions:
     """Viscous joint friction [N·m·s/rad, N·s/m], of every joint or by joint."""
     coulomb_friction: Annotated[str | None, _by_joint("coulomb-friction"), default("the file's")] = None
     """Coulomb joint friction [N·m, N], of every joint or by joint."""
-    payload: tyro.conf.UseAppendAction[
-        tuple[Annotated[str, text("MASS@LINK:X,Y,Z", _checked(_read_payload))], ...]
-    ] = ()
+    payload: tyro.conf.UseAppendAction[tuple[Annotated[str, text("MASS@LINK:X,Y,Z", _checked(read_payload))], ...]] = ()
     """Load [kg] at a link, with its centre of mass in the link's frame [m]: --payload 2@flange:0,0,0.05; no link is the
     last one, no centre its origin; may be given several times."""
     tool: Annotated[str | None, text("FILE@LINK", _checked(_read_tool))] = None
@@ -209,7 +195,7 @@ class ArmOptions:
             "xacro_args": dict(map(_read_argument, self.arg)) or None,
             "package_dirs": list(self.package_dir) or None,
             "gravity": None if self.gravity is None else _read_gravity(self.gravity),
-            "payload": dict(map(_read_payload, self.payload)) or None,
+            "payload": dict(map(read_payload, self.payload)) or None,
             "tool": None if self.tool is None else _read_tool(self.tool),
             "base_rpy": None if self.base_rpy is None else _READ_RPY(self.base_rpy),
             "base_xyz": None if self.base_xyz is None else _READ_XYZ(self.base_xyz),

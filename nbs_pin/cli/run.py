@@ -6,8 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.followed import Followed
+from nbs_pin.cli.loaded_arm import LoadedArmOptions, OfLoadedArm
 from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import SAVED, OptionError, choice, default, number, text
@@ -55,5 +55,5 @@ class Run(Followed, Reported):
     """Overwrite the results of another run in that folder."""
     tool: OfTool = field(default_factory=ToolOptions)
     """How a path of the tool is followed."""
-    arm: OfArm = field(default_factory=ArmOptions)
+    arm: OfLoadedArm = field(default_factory=LoadedArmOptions)
     """How the arm is read."""

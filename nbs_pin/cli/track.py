@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.followed import Followed
+from nbs_pin.cli.loaded_arm import LoadedArmOptions, OfLoadedArm
 from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.tool_options import OfTool, ToolOptions
 from nbs_pin.cli.values import (
@@ -84,5 +84,5 @@ class Track(Followed, Reported):
     """Also print the tables; summary.json always has every number."""
     tool: OfTool = field(default_factory=ToolOptions)
     """How a path of the tool is followed."""
-    arm: OfArm = field(default_factory=ArmOptions)
+    arm: OfLoadedArm = field(default_factory=LoadedArmOptions)
     """How the arm is read."""

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,9 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.npz import LARGEST
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Reference, Run
+from nbs_pin.cli.payloads import TimedLoad
 from nbs_pin.commands.inputs import law_of
+from nbs_pin.commands.loads import kept, loaded
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.dynamics.friction import JointFriction
@@ -52,6 +55,7 @@ def track(
     start_error: float = 0.0,
     start: Sequence[float] | None = None,
     disturbance: Disturbance | None = None,
+    loads: Sequence[TimedLoad] = (),
     joint_friction: str = "drop",
     joint_stops: str = "drop",
     integrator: str | None = None,
@@ -65,6 +69,7 @@ def track(
     plant, controller: by name (`build_plant`, `law_of`) or built. reference: None takes
     `Sinusoid.for_robot(robot)`. start_error: initial error of every joint, with alternating sign, at rest [rad]; 0
     starts on the reference. start: configuration to start from at rest [rad], in place of `start_error`.
+    loads: what a plant by name carries from some time on, unknown to the law.
     joint_friction: "keep" simulates the URDF's friction, fed forward by laws that model it. joint_stops:
     "keep" stops joints at their position limits. integrator: of a plant by
     name, None its usual one. plant_step, lookahead [s]: as in `simulate`. seed: of the network weights.
@@ -81,7 +86,10 @@ def track(
     if not isinstance(controller, Controller):
         controller = law_of(controller, robot, bandwidth=bandwidth, period=period, friction=friction, seed=seed)
     if not isinstance(plant, Plant):
-        plant = build_plant(plant, robot, integrator=integrator, joint_friction=joint_friction, joint_stops=joint_stops)
+        build = partial(
+            build_plant, plant, integrator=integrator, joint_friction=joint_friction, joint_stops=joint_stops
+        )
+        plant = loaded(robot, loads, build)
     if start is None and start_error:
         start = Reference(*reference(0.0)).q + start_error * (-1.0) ** np.arange(robot.nv)
     begun = time.perf_counter()
@@ -107,6 +115,7 @@ def track(
         if not blocks:
             raise
     run = _joined(blocks)
+    run.info.update(kept(loads))
     interrupted = len(run.t) <= round(duration / period)
     return Tracked(run, before - begun, time.perf_counter() - before, interrupted)
 
@@ -144,7 +153,11 @@ def _check_size(nv: int, duration: float, period: float) -> None:
 
 
 def _plant_step(plant: Plant, robot: Robot, period: float) -> float | None:
-    """A step short enough for RK4 to follow the plant's joint friction [s], or None for the usual one."""
+    """A step short enough for RK4 to follow the plant's joint friction [s], or None for the usual one.
+
+    Loads that appear make the arm heavier, and with that friction slower to follow.
+    """
+    plant = plant.at(0.0)
     if not isinstance(plant, DynamicsPlant) or plant.friction is None:
         return None
     # Friction is a damper of this slope near rest; RK4 is stable up to 2.78 of its fastest time constant.

@@ -2,7 +2,7 @@
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,11 @@ from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.certify import certify
 from nbs_pin.cli.exit_codes import STOPPED
+from nbs_pin.cli.payloads import TimedLoad
 from nbs_pin.cli.run import Run
+from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.inputs import law_of
+from nbs_pin.commands.loads import check_times, kept, loaded, note
 from nbs_pin.commands.results import Results, drawing, table, tell
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
@@ -48,15 +51,17 @@ def run(options: Run, console: Console, notes: Console) -> int:
         settings = {**options.units(), **options.tool.given(), "duration": options.duration}
         motion, length = motion_of(options.reference, robot, frequency=options.frequency, period=period, **settings)
     duration = options.duration or length
-    results = Results.of(options, robot.name, robot, robot=robot.source, duration=duration)
+    loads = _loads(options, duration)
+    results = Results.of(options, robot.name, robot, robot=robot.source, duration=duration, **kept(loads))
     results = results.check(FILES, options.force)
     with notes.status("compiling the law"):
         law = law_of(options.controller, robot, bandwidth=options.bandwidth, period=period, friction=None, seed=0)
         law.compile()
-        arm = arm_at(options.at, robot, motion, period)
+        arm = arm_at(options.at, robot, motion, period, loads)
         guard = guard_for(arm, robot, certificate=_bound(options, law, robot))
     with results.made() as folder, _watching(options, robot, notes) as latest:
         driven = drive(arm, law, robot, motion, duration, guard=guard, watch=latest.append, priority=options.priority)
+        note(driven.run, loads)
         found = figures(driven, robot)
         driven.run.info.update(reference=options.reference, stopped=found["stopped"], **results.facts)
         with results.replaced(FILES, found) as draft:
@@ -70,11 +75,16 @@ def run(options: Run, console: Console, notes: Console) -> int:
     return 0 if driven.report is None else STOPPED
 
 
-def arm_at(text: str, robot: Robot, motion: DesiredMotion, period: float) -> ArmInterface:
-    """The arm that --arm names; raises ArgumentError where it does not answer or has another rate."""
+def arm_at(
+    text: str, robot: Robot, motion: DesiredMotion, period: float, loads: Sequence[TimedLoad] = ()
+) -> ArmInterface:
+    """The arm that --arm names; raises ArgumentError where it does not answer or has another rate.
+
+    A simulated arm carries the loads at their times.
+    """
     kind, _, host = text.partition(":")
     if kind == "mujoco":
-        return PlantArm(MujocoPlant(robot), np.asarray(motion(0.0).q), period=period)
+        return PlantArm(loaded(robot, loads, MujocoPlant), np.asarray(motion(0.0).q), period=period)
     arm: ArmInterface = FrankaArm(host) if kind == "libfranka" else URArm(host)
     if abs(arm.period - period) > 1e-9:
         raise ArgumentError(f"this arm has {1.0 / arm.period:g} Hz; give {option('rate', round(1.0 / arm.period))}.")
@@ -95,6 +105,18 @@ def figures(driven: Driven, robot: Robot) -> dict[str, Any]:
         "work_max_us": float(work.max()),
         "real_time_priority": driven.times.priority,
     }
+
+
+def _loads(options: Run, duration: float) -> tuple[TimedLoad, ...]:
+    """The loads that appear meanwhile; raises OptionError if the arm is none in simulation, or it ends before."""
+    loads = options.arm.loads()
+    if loads and options.at != "mujoco":
+        raise OptionError(
+            f"--payload is '{loads[0].words}', a load that appears in a simulated arm, but --arm is '{options.at}'; "
+            "leave the times out if the arm carries it, or give --arm mujoco."
+        )
+    check_times(loads, duration)
+    return loads
 
 
 def _bound(options: Run, law: Controller, robot: Robot) -> Certificate | None:

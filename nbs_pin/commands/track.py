@@ -13,6 +13,7 @@ from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_numbers
 from nbs_pin.commands.following import not_simulated, track
 from nbs_pin.commands.inputs import arm_of
+from nbs_pin.commands.loads import check_times, kept
 from nbs_pin.commands.results import Results, drawing, keywords, table, tell
 from nbs_pin.commands.track_laws import FILES, PICTURE, files_in, track_laws
 from nbs_pin.motions.by_name import motion_of
@@ -37,10 +38,13 @@ def run(options: Track, console: Console, notes: Console) -> None:
             options.reference, robot, frequency=options.frequency, period=options.period, **settings
         )
     duration = options.duration or length
-    results = Results.of(options, robot.name, robot, robot=robot.source, duration=duration)
+    loads = options.arm.loads()
+    check_times(loads, duration)
+    results = Results.of(options, robot.name, robot, robot=robot.source, duration=duration, **kept(loads))
     given = keywords(options, track) | {
         "reference": motion,
         "duration": duration,
+        "loads": loads,
         "start": _start(options, robot.nv),
         "disturbance": parse_disturbance(options.disturbance).build(robot.nv, options.period, options.seed),
     }

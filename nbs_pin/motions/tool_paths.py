@@ -167,7 +167,7 @@ def _knots(positions: np.ndarray, times: np.ndarray | None) -> np.ndarray:
                 f"times of shape {times.shape} for {len(positions)} points, expected one for each, increasing; "
                 "correct them."
             )
-        return np.asarray((times - times[0]) / (times[-1] - times[0]))
+        return _apart((times - times[0]) / (times[-1] - times[0]))
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
     if not (steps > 0.0).all():
         k = int(np.argmin(steps))
@@ -176,7 +176,19 @@ def _knots(positions: np.ndarray, times: np.ndarray | None) -> np.ndarray:
             "times."
         )
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    return np.asarray(along / along[-1])
+    return _apart(along / along[-1])
+
+
+def _apart(knots: np.ndarray) -> np.ndarray:
+    """The knots, unless rounding makes two of them one: raises ArgumentError then."""
+    steps = np.diff(knots)
+    if not (steps > 0.0).all():
+        k = int(np.argmin(steps > 0.0))
+        raise ArgumentError(
+            f"the points {k + 1} and {k + 2} are nearer to each other than the length or the time of the whole path "
+            "resolves, 1e-16 of it; leave one out, or correct the others."
+        )
+    return knots
 
 
 def _rotations(orientations: np.ndarray, count: int) -> Rotation:

@@ -84,6 +84,7 @@ def _start(given: Mapping[str, Any]) -> str:
 
 def _plant(text: str, given: Mapping[str, Any]) -> list[str]:
     """The plant from its repr, as in MujocoPlant(panda, rk4, joint_friction=drop)."""
+    text = re.sub(r"^ChangingPlant\((.*), changes at .* s\)$", r"\1", text)  # the first of them
     name, _, inside = text.rstrip(")").partition("(")
     words = inside.split(", ")
     engine = next((f" ({_ENGINES[word]})" for word in words if word in _ENGINES), "")

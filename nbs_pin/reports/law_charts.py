@@ -7,7 +7,7 @@ import numpy as np
 
 from nbs_pin.base.records import Run
 from nbs_pin.base.units import several
-from nbs_pin.reports.plotting import ACTUAL, ERROR, FAST, LIMIT, REFERENCE, TORQUE, Heading, picture, thin
+from nbs_pin.reports.plotting import ACTUAL, ERROR, FAST, LIMIT, REFERENCE, TORQUE, Heading, draw_changes, picture, thin
 from nbs_pin.simulation.metrics import squared_error
 
 _COLOURS = (ACTUAL, REFERENCE, TORQUE, FAST, ERROR, "#8c564b", "#17a2b8", "#6c757d")
@@ -38,5 +38,6 @@ def plot_laws(runs: Mapping[str, Run], path: str | Path, heading: Heading | None
         errors.set_title(f"‖error‖ [{several(of.position for of in first.units)}]", loc="left")
         for axes in (errors, torques):
             axes.set(xlabel="time [s]", xlim=(first.t[0], first.t[-1]))
+        draw_changes((errors, torques), first)
         errors.legend(frameon=False)
     return Path(path)

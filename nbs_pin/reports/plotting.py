@@ -3,7 +3,7 @@
 import io
 import textwrap
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from nbs_pin.robots.named import robot_of
 from nbs_pin.robots.robot import ARM, Robot, configuration_difference
 from nbs_pin.robots.urdf import JointData
 from nbs_pin.simulation.metrics import saturated_fraction
-from nbs_pin.simulation.run_figures import figures
+from nbs_pin.simulation.run_figures import changes_of, figures
 from nbs_pin.simulation.tool_errors import tool_errors, tool_of
 
 ACTUAL, REFERENCE, ERROR = "#1f5fbf", "#ff8c1a", "#b3261e"
@@ -48,6 +48,7 @@ INK, NOTE, VIOLET = "#1d2733", "#5d6b7a", "#7a4fa3"
 _COLOURS = {GOOD: TORQUE, WARNING: "#8a5a00", BAD: ERROR}
 _UNDATED: Any = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
 _WIDE: Any = {"color": "#ffc891", "linewidth": 4.5}  # of the reference, so that it shows beside the curve on it
+_CHANGE: Any = {"color": INK, "linewidth": 0.9, "linestyle": (0, (1, 1.5))}
 _NARROWEST = 0.012  # share of the time axis that a marked stretch takes, at least
 
 
@@ -109,10 +110,11 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
     It is a PNG, or of the kind that the path ends in: .svg or .pdf. Each row shows actual and desired position, |error|
     on a logarithmic scale that is the same for joints of one kind (wrapped on continuous joints), and the applied
     torque with the disturbance, if there was one, and the effort limits where they are near; saturated stretches are
-    shaded. The heading has the law, its settings and a verdict. `start` selects one start of a batched run. With
-    a `robot`, the arm that ran, position limits are drawn where the joint comes near them, and stretches are shaded in
-    which it is outside them or faster than its velocity limit. A run along a path of the tool has a last row: its
-    errors and the path, for which None loads the arm that the run names.
+    shaded, and a dotted line stands where another plant took over (`ChangingPlant`). The heading has the law, its
+    settings and a verdict. `start` selects one start of a batched run. With a `robot`, the arm that ran, position
+    limits are drawn where the joint comes near them, and stretches are shaded in which it is outside them or faster
+    than its velocity limit. A run along a path of the tool has a last row: its errors and the path, for which None
+    loads the arm that the run names.
 
     Raises:
         ArgumentError: If the start does not exist, the robot has another number of joints, or the arm of a path of the
@@ -155,6 +157,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
                 for axes, unit in zip(grid[joint], (of.position, of.position, of.torque), strict=True):
                     axes.annotate(f"[{unit}]", (0.0, 1.0), xycoords="axes fraction", va="bottom", fontsize=7,
                                   color=NOTE)  # fmt: skip
+        draw_changes(grid[: run.nv].flat, run)
         _dress(figure, grid, run, fraction)
         if tool is not None:
             assert robot is not None
@@ -180,6 +183,7 @@ def _draw_tool(figure: Figure, row: np.ndarray, run: Run, robot: Robot, tool: di
     for axes, title, error in zip(row, titles, shown if tool.get("orientation") == "hold" else shown[:1], strict=False):
         _draw_error(axes, run.t, error, _decades(error))
         axes.set_title(title, loc="left", fontsize=8.5, color=INK)
+        draw_changes([axes], run)
     if tool.get("orientation") != "hold":
         row[1].set_axis_off()
     place = row[2].get_subplotspec()
@@ -279,8 +283,17 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
     ]
     if run.disturbance.any():
         handles.append(figure.axes[2].plot([], [], color=VIOLET, label="disturbance")[0])
+    if changes_of(run):
+        handles.append(figure.axes[0].plot([], [], label="the plant changes", **_CHANGE)[0])
     shown = handles if cut else [*handles[:2], *handles[3:]]
-    figure.legend(handles=shown, loc="upper right", ncols=4, frameon=False)
+    figure.legend(handles=shown, loc="upper right", ncols=5, frameon=False)
+
+
+def draw_changes(each: Iterable[Axes], run: Run) -> None:
+    """Dotted lines at the times at which another plant took over."""
+    for axes in each:
+        for t in changes_of(run):
+            axes.axvline(t, **_CHANGE)
 
 
 def one_start(run: Run, start: int) -> Run:

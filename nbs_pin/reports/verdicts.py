@@ -84,8 +84,10 @@ def _finished(figures: Mapping[str, Any]) -> Verdict:
 
 def _tracking(figures: Mapping[str, Any]) -> Verdict:
     stopped = figures.get("stopped")
+    loads = _loads(figures)
     if stopped:
-        return Verdict(BAD, f"the guard stopped the arm after {stopped['time_s']:.3g} s: {stopped['why']}".rstrip("."))
+        said = f"the guard stopped the arm after {stopped['time_s']:.3g} s: {stopped['why']}".rstrip(".")
+        return Verdict(BAD, said, loads)
     if "units" not in figures:
         return Verdict(BAD, "ended after too few periods to be judged")
     units, joints = figures["units"]["position"], figures["joints"]
@@ -93,7 +95,7 @@ def _tracking(figures: Mapping[str, Any]) -> Verdict:
     (error, unit, joint), *others = largest_late_errors(figures)
     said += f"; in the last 30 % {joint}, the worst joint, is off by {measured(error, unit)} RMS"
     said += "".join(f", and {joint} by {measured(error, unit)}" for error, unit, joint in others)
-    more = []
+    more = [*loads]
     if "tool" in figures:
         tool = figures["tool"]
         kinds = {"position": "m"} | ({"orientation": "rad"} if tool["orientation"] == "hold" else {})
@@ -110,6 +112,18 @@ def _tracking(figures: Mapping[str, Any]) -> Verdict:
     beyond = zip(joints, excesses, units, strict=True)
     left = [f"{joint} left its range by {measured(excess, unit)}" for joint, excess, unit in beyond if excess > 0.0]
     return Verdict(WARNING if level == GOOD and (left or late_cut) else level, said, (*more, *left))
+
+
+def _loads(figures: Mapping[str, Any]) -> tuple[str, ...]:
+    """What appeared in the plant before the end of the run."""
+    told = []
+    for load in figures.get("loads", []):
+        begin, end, last = load["from_s"], load["until_s"], figures.get("duration_s", 0.0)
+        if begin < last:
+            where = f" at {load['link']}" if load["link"] else ""
+            then = f" and was gone at {end:g} s" if end is not None and end < last else ""
+            told.append(f"a load of {load['mass_kg']:g} kg{where}, unknown to the law, appeared at {begin:g} s{then}")
+    return tuple(told)
 
 
 def _convergence(figures: Mapping[str, Any]) -> tuple[str, str]:
@@ -130,13 +144,15 @@ def _laws(figures: Mapping[str, Any]) -> Verdict:
     found = figures["laws"]
     off = {name: largest_late_errors(of) for name, of in found.items() if has_converged(of)}
     lost = [name for name in found if name not in off]
+    loads = _loads(next(iter(found.values())))
     if not off:
-        return Verdict(BAD, f"none of {', '.join(found)} converged in the first {_IN_TIME:.0%} of the time")
+        return Verdict(BAD, f"none of {', '.join(found)} converged in the first {_IN_TIME:.0%} of the time", loads)
     told = {name: " and ".join(measured(error, unit) for error, unit, _ in of) for name, of in off.items()}
     least, *others = sorted(off, key=lambda name: off[name])
     said = f"{least} is off the least, {told[least]} RMS in the last 30 % at its worst joint"
     more = (f"{', '.join(lost)} did not converge in the first {_IN_TIME:.0%} of the time",) if lost else ()
-    return Verdict(WARNING if lost else GOOD, "; ".join([said, *(f"{name} {told[name]}" for name in others)]), more)
+    said = "; ".join([said, *(f"{name} {told[name]}" for name in others)])
+    return Verdict(WARNING if lost else GOOD, said, (*more, *loads))
 
 
 def _times(figures: Mapping[str, Any]) -> np.ndarray:

@@ -21,6 +21,7 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 def attach(robot: Node, options: UrdfOptions, packages: Packages) -> UrdfOptions:
     """Add the payloads, the tool and the mount of the options to the <robot> element.
 
+    The link of a payload is called payload_LINK, and a payload may name one of those before it.
     A tool's moving joints become locked where they are nearest to zero, which a warning says; the options returned have
     these locks, beside those that were given.
 
@@ -29,13 +30,12 @@ def attach(robot: Node, options: UrdfOptions, packages: Packages) -> UrdfOptions
     """
     if options.tool is not None:
         options = _add_tool(robot, options)
-    frames = [_frame(robot, frame, "payload") for frame in options.payload]
-    twice = next((frame for frame in frames if frames.count(frame) > 1), None)
-    if twice is not None:
-        problem = f"the payload of the last link '{twice}' is given twice, with its name and without"
+    last = tip(robot) if "" in options.payload else ""
+    if last in options.payload and "" in options.payload:
+        problem = f"the payload of the last link '{last}' is given twice, with its name and without"
         raise robot.refuse(problem, "give one of them")
-    for frame, payload in zip(frames, options.payload.values(), strict=True):
-        _add_payload(robot, frame, payload)
+    for frame, payload in options.payload.items():  # the link of one may carry the next
+        _add_payload(robot, _frame(robot, frame or last, "payload"), payload)
     if any(options.base_rpy) or any(options.base_xyz):
         root = _ends(robot, parents=True)[0]
         _free_name(robot, MOUNT)

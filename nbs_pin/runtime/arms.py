@@ -119,8 +119,9 @@ class PlantArm:
             due = max(due, int((time.perf_counter() - self._began) / self.period))
             self._wait(self._began + due * self.period)
         while self._steps < due:
-            push = 0.0 if self.disturbance is None else self.disturbance(self._steps * self.period, self._q, self._v)
-            self._q, self._v = self.plant.step(self._q, self._v, self._tau + push, self.period)
+            t = self._steps * self.period
+            push = 0.0 if self.disturbance is None else self.disturbance(t, self._q, self._v)
+            self._q, self._v = self.plant.at(t).step(self._q, self._v, self._tau + push, self.period)
             self._steps += 1
         return Sample(self._steps * self.period, self._q, self._v)
 

@@ -127,7 +127,8 @@ class Loop:
             robot_sha256="" if robot is None else robot.sha256,
             robot_options={} if robot is None else robot.options,
             prismatic=np.zeros(n, dtype=bool) if robot is None else robot.prismatic,
-            info={"controller": controller, "plant": repr(self.plant), "plant_step": self.step, "lookahead": self.lead},
+            info={"controller": controller, "plant": repr(self.plant), "plant_step": self.step, "lookahead": self.lead}
+            | ({"plant_changes": list(self.plant.changes)} if self.plant.changes else {}),
         )
         run.q[0], run.v[0] = q0, v0
         return run

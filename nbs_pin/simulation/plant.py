@@ -30,6 +30,18 @@ class Plant(Shown, ABC):
     def robot(self) -> Robot | None:
         """The simulated arm, or None for a plant without a URDF."""
 
+    @property
+    def changes(self) -> tuple[float, ...]:
+        """Times at which another plant takes over [s], in order; a plant that stays what it is has none."""
+        return ()
+
+    def at(self, t: float) -> "Plant":
+        """The plant that acts from time t [s] on, itself unless it changes (`ChangingPlant`).
+
+        The time loops ask it at every plant step, and step what it returns.
+        """
+        return self
+
     def _facts(self) -> Iterable[str]:
         return (joints_told(self.nv) if self.robot is None else self.robot.name,)
 

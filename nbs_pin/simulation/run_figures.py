@@ -16,7 +16,8 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     """`metrics.summary` of the run and the RMS error over its last 30 %, as JSON can store them.
 
     They are None where a row is not finite. With a robot, also how far each joint left its position range, as the
-    plants have no joint stops, and how far the tool was from its path, if it followed one. `units` says in what the
+    plants have no joint stops, and how far the tool was from its path, if it followed one. `loads` are those that
+    appeared in the plant meanwhile, which the law did not know. `units` says in what the
     numbers of each joint are: those of one that slides are in m and N, whatever the key says.
     """
     values = metrics.summary(run)
@@ -28,4 +29,33 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
         tool = tool_of(run)
         if tool is not None:
             values["tool"] = tool | plain(tool_errors(run, robot).figures())
-    return values
+    loads = loads_of(run)
+    return values | ({"loads": loads} if loads else {})
+
+
+def loads_of(run: Run) -> list[dict[str, Any]]:
+    """The loads that appeared in the plant of a run, as the run notes them; none of those that cannot be read.
+
+    Each has "mass_kg", "link", "from_s", and "until_s", which is None for one that stayed.
+    """
+    noted = run.info.get("loads")
+    return [load for load in noted if _is_load(load)] if isinstance(noted, list) else []
+
+
+def changes_of(run: Run) -> list[float]:
+    """Times within a run at which another plant took over [s]."""
+    noted = run.info.get("plant_changes")
+    times = [float(t) for t in noted if _is_time(t)] if isinstance(noted, list) else []
+    return [t for t in times if run.t[0] <= t <= run.t[-1]]
+
+
+def _is_load(load: Any) -> bool:
+    if not isinstance(load, dict) or not isinstance(load.get("link"), str):
+        return False
+    return all(map(_is_time, (load.get("mass_kg"), load.get("from_s")))) and (
+        load.get("until_s") is None or _is_time(load["until_s"])
+    )
+
+
+def _is_time(t: Any) -> bool:
+    return isinstance(t, int | float) and not isinstance(t, bool) and bool(np.isfinite(t))

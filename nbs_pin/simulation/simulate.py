@@ -295,7 +295,7 @@ def _advance(loop: _Closed, run: Run, k: int, tau: np.ndarray) -> tuple[np.ndarr
                 total = tau + torque
                 if j == 0:
                     run.disturbance[k] = torque
-            q, v = loop.plant.step(q, v, total, step)
+            q, v = loop.plant.at(t + j * step).step(q, v, total, step)
     except SimulationDiverged as error:
         raise SimulationDiverged(f"after t = {t:g} s: {error}") from error
     return q, v

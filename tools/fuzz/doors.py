@@ -155,6 +155,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "Admissible.told": {"units": ["N·m", "N·m"]},
         "Admissible": {"box": np.ones(2), "radius": None},
         "Dataset": {**{name: getattr(s.data, name) for name in _COLUMNS}, "robot": "arm", "about": {}},
+        "ChangingPlant": {"first": s.plant, "changes": [(0.005, nbs.MujocoPlant(s.robot))]},
         "Damping": {"floor": np.eye(2), "gain": 0.2, "scale": np.ones(2), "ceiling": 1.0, "widths": (4,)},
         "Potential": {"stiffness": np.eye(2), "scale": np.ones(2), "widths": (4,)},
         "NeuralBackstepping": {"potential": s.law.potential, "damping": s.law.damping, "rate": np.ones(2)},
@@ -262,7 +263,7 @@ def _subjects(s: Stock) -> dict[str, Any]:
         nbs.SlidingMode.for_robot(s.robot), nbs.SlotineLi.for_robot(s.robot), nbs.SquareWave([1.0, 2.0], 2.0),
         nbs.TimeOutside(), nbs.TorqueAware.for_robot(s.robot), nbs.TorqueNoise(1.0, 0.01), nbs.Uncertainty(0.1),
         nbs.Watch(s.certificate), s.tool_path, s.tool_motion, nbs.Margins(0.1),
-        nbs.tool_errors(s.run, s.robot, "tip"),
+        nbs.tool_errors(s.run, s.robot, "tip"), nbs.ChangingPlant(s.plant, [(0.005, nbs.MujocoPlant(s.robot))]),
     ]  # fmt: skip
     return {type(x).__name__: x for x in found} | {
         "CompiledController": s.law.compile(),
