@@ -82,6 +82,7 @@ from .motions.tool_files import load_tool_path as load_tool_path
 from .motions.tool_motions import ToolMotion as ToolMotion, tool_motion as tool_motion
 from .motions.tool_paths import ToolPath as ToolPath
 from .motions.tool_postures import tool_posture as tool_posture
+from .reports.estimate_charts import plot_estimates as plot_estimates
 from .reports.plotting import plot_tracking as plot_tracking
 from .reports.replay import replay as replay
 from .robots.catalogue import ROBOT_NAMES as ROBOT_NAMES

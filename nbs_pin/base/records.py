@@ -99,8 +99,8 @@ class Run(Shown):
     """Further metadata (controller, plant, seed, versions), stored as JSON."""
     prismatic: Bool[np.ndarray, " n"] | None = None
     """True for joints that slide, with q in [m] and a force tau [N]; None, as in older files, is for no joint."""
-    estimates: Float[np.ndarray, "rows *batch m"] | None = None
-    """What a law that adapts believed before each row, for its `estimate`; None for other laws."""
+    estimates: Float[np.ndarray, "rows *batch k"] | None = None
+    """What a law that adapts believed in each row, named in `info["estimates"]`; None for other laws."""
 
     def __post_init__(self) -> None:
         check_fields(self, period=PERIOD, robot=text, robot_sha256=text, robot_options=mapping, info=mapping)

@@ -15,8 +15,9 @@ from nbs_pin.commands.following import not_simulated, track
 from nbs_pin.commands.inputs import arm_of
 from nbs_pin.commands.loads import check_times, kept
 from nbs_pin.commands.results import Results, drawing, keywords, table, tell
-from nbs_pin.commands.track_laws import FILES, PICTURE, files_in, track_laws
+from nbs_pin.commands.track_laws import FILES, LEARNED, PICTURE, files_in, track_laws
 from nbs_pin.motions.by_name import motion_of
+from nbs_pin.reports.estimate_charts import plot_estimates
 from nbs_pin.reports.plotting import plot_tracking
 from nbs_pin.reports.replay import replay
 from nbs_pin.reports.verdicts import verdict_of
@@ -51,7 +52,7 @@ def run(options: Track, console: Console, notes: Console) -> None:
     if "," in options.controller:
         track_laws(options, robot, given, results, console, notes)
         return
-    results = results.check((*FILES, PICTURE), options.force, whole={"interrupted": False})
+    results = results.check((*FILES, PICTURE, LEARNED), options.force, whole={"interrupted": False})
     with results.made() as folder:
         recorded, compile_time, wall_time, interrupted = track(robot, **given, progress=True)
         recorded.info.update(reference=options.reference, interrupted=interrupted, **results.facts)
@@ -64,7 +65,8 @@ def run(options: Track, console: Console, notes: Console) -> None:
     verdict = verdict_of(found, interrupted=interrupted)
     lines = (*verdict.more, *_lines(found, compile_time, wall_time))
     tell(console, f"{title}: {verdict.said}", lines, [_table(title, found)], verbose=options.verbose)
-    results.show(console, FILES, "replay", results.folder, "--open")
+    learned = (LEARNED,) if recorded.estimates is not None else ()
+    results.show(console, (*FILES[:2], *learned, *FILES[2:]), "replay", results.folder, "--open")
     if interrupted:
         raise KeyboardInterrupt
 
@@ -79,6 +81,9 @@ def write_results(run: Run, results: Results, robot: Robot, figures: dict[str, A
         run.save(draft / FILES[0])
     with drawing(folder / FILES[1]) as path:
         plot_tracking(run, path, robot=robot)
+    if run.estimates is not None:
+        with drawing(folder / LEARNED) as path:
+            plot_estimates(run, path)
     with drawing(folder / FILES[2]) as path:
         replay(run, path, robot)
 

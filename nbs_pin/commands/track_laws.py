@@ -25,13 +25,15 @@ FILES = (RUN, "tracking.png", "replay.html", SUMMARY)
 """What `nbs-pin track` writes with one law."""
 PICTURE = "comparison.png"
 """The picture of several laws."""
+LEARNED = "estimates.png"
+"""The picture of what a law that adapts believed, with one law."""
 
 
 def files_in(folder: Path) -> tuple[str, ...]:
     """What may be in the folder from a track before, with one law or several, whose place new results take."""
     found = summary_in(folder).get("figures")
     laws = found.get("laws") if isinstance(found, Mapping) else None
-    return (*FILES, PICTURE, *runs_of_laws(laws if isinstance(laws, Mapping) else ()).values())
+    return (*FILES, PICTURE, LEARNED, *runs_of_laws(laws if isinstance(laws, Mapping) else ()).values())
 
 
 def track_laws(

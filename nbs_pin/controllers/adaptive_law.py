@@ -179,6 +179,11 @@ class AdaptiveLaw(Controller, nn.Module):
         """The duals."""
         return memory.duals
 
+    def estimates(self, recorded: np.ndarray) -> tuple[np.ndarray, list[str]]:
+        """`Estimate.values` of these duals, and its names."""
+        found = Estimate.of_duals(self.robot, self._believed, self.unknowns, recorded)
+        return found.values, found.names
+
     def step(
         self, memory: AdaptiveMemory, q: Vectors, v: Vectors, reference: Reference, period: float
     ) -> tuple[Vectors, AdaptiveMemory]:
@@ -208,16 +213,19 @@ class AdaptiveLaw(Controller, nn.Module):
 
         None is the start. Raises ArgumentError for estimates of another law.
         """
-        duals = recorded.duals if isinstance(recorded, AdaptiveMemory) else recorded
-        (given,) = as_vectors(self.unknowns.start.size, estimates=self.unknowns.start if duals is None else duals)
-        return Estimate(self.robot, self._believed, self.unknowns, np.asarray(given, dtype=float))
+        known = self.robot, self._believed, self.unknowns
+        if recorded is None or isinstance(recorded, AdaptiveMemory):
+            duals = self.unknowns.start if recorded is None else recorded.duals
+            return Estimate.of_duals(*known, np.asarray(duals, dtype=float))
+        (values,) = as_vectors(len(self.unknowns.start), estimates=recorded)
+        return Estimate(*known, values)
 
     def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
         """The law as machine code (`Controller.compile`); itself for a subclass, or around a law that has none."""
         if not (defines(self, "compile") and self.law.packable):
             return self
-        settings = self.rates, self.leak, self.period, self.robot.effort_limit
-        return CompiledAdaptiveLaw(self.law.packed_law(), self._believed, self.unknowns, *settings)
+        settings = self.rates, self.leak, self.period
+        return CompiledAdaptiveLaw(self.law.packed_law(), self._believed, self.unknowns, *settings, self.robot)
 
 
 def _geometry(tree: Packed) -> np.ndarray:

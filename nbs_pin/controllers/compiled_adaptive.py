@@ -7,17 +7,19 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arguments import PERIOD
-from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors, finite_result, is_torch_array
+from nbs_pin.base.arrays import Array, Vectors, as_vectors, finite_result, is_torch_array
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import joints_told
 from nbs_pin.controllers.controller import Controller
+from nbs_pin.controllers.estimates import Estimate
 from nbs_pin.controllers.unknowns import Unknowns
 from nbs_pin.kernels.adaptation import adaptive_law, adaptive_workspace, compile_adaptive_law, pack_adaptive
 from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.threads import Scratch
+from nbs_pin.robots.robot import Robot
 
 _LATE = 1.0 + 1e-6  # a period longer than this multiple of the law's own is refused
 
@@ -43,17 +45,17 @@ class CompiledAdaptiveLaw(Controller):
         rates: γ of every unknown.
         leak: σ [1/s].
         period: Longest control period [s].
-        limit: Torque beyond which the estimates wait [N·m], (n,).
+        robot: The arm, beyond whose effort limits the estimates wait.
     """
 
     def __init__(
         self, law: Packed, tree: Packed, unknowns: Unknowns, rates: Float[np.ndarray, " unknowns"], leak: float,
-        period: float, limit: JointArray,
+        period: float, robot: Robot,
     ) -> None:  # fmt: skip
-        self._given = law, tree, unknowns, rates, leak, period, limit
+        self._given = law, tree, unknowns, rates, leak, period, robot
         compile_adaptive_law()
         self._packed = tuple(pack_adaptive(law, tree, unknowns.packed(rates, leak)))
-        self._start, self._limit, self._period = unknowns.start, np.ascontiguousarray(limit, dtype=float), period
+        self._start, self._limit, self._period = unknowns.start, robot.effort_limit, period
         self._scratch = Scratch(adaptive_workspace(law, tree))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -85,6 +87,12 @@ class CompiledAdaptiveLaw(Controller):
     def recorded(self, memory: AdaptiveMemory) -> Array:
         """The duals."""
         return memory.duals
+
+    def estimates(self, recorded: np.ndarray) -> tuple[np.ndarray, list[str]]:
+        """`Estimate.values` of these duals, and its names."""
+        _, tree, unknowns, *_, robot = self._given
+        found = Estimate.of_duals(robot, tree, unknowns, recorded)
+        return found.values, found.names
 
     def step(
         self, memory: AdaptiveMemory, q: Vectors, v: Vectors, reference: Reference, period: float

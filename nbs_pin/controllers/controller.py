@@ -49,8 +49,12 @@ class Controller(Shown, ABC):
         """Torque τ [N·m] to hold for the next period [s], and the memory for the step after it."""
 
     def recorded(self, memory: Any) -> Array | None:
-        """What a run records of the memory, (..., m), as its `estimates`; None for nothing."""
+        """What a run records of the memory, (..., m); None for nothing."""
         return None
+
+    def estimates(self, recorded: np.ndarray) -> tuple[np.ndarray, list[str]]:
+        """What was `recorded` (rows, ..., m) in units of the arm, (rows, ..., k), and the names of the k numbers."""
+        raise NotImplementedError
 
     @property
     def packable(self) -> bool:

@@ -7,22 +7,27 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.shown import Shown
+from nbs_pin.base.units import units_of
 from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
-from nbs_pin.controllers.unknowns import UnknownBody, Unknowns, into_tree, model_body
+from nbs_pin.controllers.unknowns import LOAD_AT, Unknowns, into_tree, model_body
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
-from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
+from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, inertial_parameters, pseudo_inertia
 from nbs_pin.kernels.layout import NumberCode, Packed
+from nbs_pin.kernels.symmetric4 import FARTHEST
 from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY
 from nbs_pin.robots.robot import Robot
 
-_NO_MASS = 1e-3  # [kg]
+NO_MASS = 1e-3
+"""Below this mass [kg] a load has no centre to speak of."""
+_KINDS = ("kg", *["kg·m"] * 3, *["kg·m²"] * 6)
+_PARAMETERS = tuple(zip(PARAMETER_NAMES, _KINDS, strict=True))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimate(Shown):
-    """What an `AdaptiveLaw` believes with one memory, or with many: then every array has their leading axes.
+    """What an `AdaptiveLaw` believes at one instant, or at many: then every array has their leading axes.
 
     Example:
         >>> import nbs_pin as nbs
@@ -38,31 +43,67 @@ class Estimate(Shown):
     tree: Packed
     """The model that was believed at first."""
     unknowns: Unknowns
-    duals: Float[np.ndarray, "*batch m"]
+    values: Float[np.ndarray, "*batch k"]
+    """What `names` lists: ten parameters of every body in Pinocchio's order, then the numbers of the joints."""
+
+    @classmethod
+    def of_duals(
+        cls, robot: Robot, tree: Packed, unknowns: Unknowns, duals: Float[np.ndarray, "*batch m"]
+    ) -> "Estimate":
+        """From the memory of the law."""
+        given = Duals.of(duals, len(unknowns.bodies))
+        x, _ = logistic_and_cut(given.bodies)
+        parts = []
+        for k, body in enumerate(unknowns.bodies):
+            p = body.factor @ x[..., k, :, :] @ body.factor.T
+            back = np.linalg.inv(body.place)
+            parts.append(inertial_parameters(back @ (p - body.known if body.is_load else p) @ back.T))
+        for k, number in enumerate(unknowns.numbers):
+            share = 1.0 / (1.0 + np.exp(-np.clip(given.numbers[..., k], -FARTHEST, FARTHEST)))
+            parts.append((number.lowest + number.width * share)[..., None])
+        return cls(robot, tree, unknowns, np.concatenate(parts, axis=-1))
+
+    @property
+    def names(self) -> list[str]:
+        """What every value is, with its unit."""
+        bodies = [f"{body.name} {name} [{unit}]" for body in self.unknowns.bodies for name, unit in _PARAMETERS]
+        of = units_of(self.robot.prismatic)
+        kinds = {
+            NumberCode.VISCOUS: ("viscous friction", "damping"),
+            NumberCode.COULOMB: ("Coulomb friction", "torque"),
+            NumberCode.ROTOR: ("rotor inertia", "inertia"),
+            NumberCode.OFFSET: ("constant torque", "torque"),
+        }
+        own = []
+        for number in self.unknowns.numbers:
+            what, quantity = kinds[number.code]
+            own.append(f"{self.robot.joint_names[number.joint]} {what} [{getattr(of[number.joint], quantity)}]")
+        return bodies + own
 
     def _facts(self) -> Iterable[str]:
         own = []
-        if self._load is not None and self.duals.ndim == 1:
+        if self._load >= 0 and self.values.ndim == 1:
             centre = ", ".join(f"{1e3 * x:.0f}" for x in self.load_centre)
-            own = [f"load {float(self.load_mass):.3g} kg at ({centre}) mm of {self._load.name}"]
+            name = self.unknowns.bodies[self._load].name.removeprefix(LOAD_AT)
+            own = [f"load {float(self.load_mass):.3g} kg at ({centre}) mm of {name}"]
         return self.robot.name, *own, f"{len(self.unknowns.bodies)} bodies, {len(self.unknowns.numbers)} numbers"
 
     @property
     def load_mass(self) -> Float[np.ndarray, "*batch"]:
         """Mass of the load [kg], 0 where none adapts; negative where the link seems lighter than in the model."""
-        return np.asarray(self._load_body[..., 3, 3])
+        return self._load_values[..., 0]
 
     @property
     def load_centre(self) -> Float[np.ndarray, "*batch 3"]:
         """Centre of mass of the load in the frame that carries it [m]; 0 for a load below a gram."""
-        p = self._load_body
-        return np.asarray(p[..., :3, 3] / np.where(np.abs(p[..., 3, 3]) > _NO_MASS, p[..., 3, 3], np.inf)[..., None])
+        mass = np.where(np.abs(self.load_mass) > NO_MASS, self.load_mass, np.inf)
+        return np.asarray(self._load_values[..., 1:4] / mass[..., None])
 
     @property
     def load_inertia(self) -> Float[np.ndarray, "*batch 3 3"]:
         """Inertia of the load about its centre of mass, in the directions of that frame [kg·m²]."""
-        p, centre = self._load_body, self.load_centre
-        spread = p[..., :3, :3] - p[..., 3, 3, None, None] * centre[..., :, None] * centre[..., None, :]
+        p, centre = pseudo_inertia(self._load_values), self.load_centre
+        spread = p[..., :3, :3] - self.load_mass[..., None, None] * centre[..., :, None] * centre[..., None, :]
         return np.asarray(np.trace(spread, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - spread)
 
     @property
@@ -80,7 +121,7 @@ class Estimate(Shown):
         """Rotor inertia per joint [kg·m², kg], the believed one where it does not adapt."""
         own = self.tree.weights[BASE:].reshape(-1, BODY)[:, ARMATURE]
         adapts = any(number.code == NumberCode.ROTOR for number in self.unknowns.numbers)
-        return self._numbers(NumberCode.ROTOR) if adapts else np.broadcast_to(own, (*self.duals.shape[:-1], len(own)))
+        return self._numbers(NumberCode.ROTOR) if adapts else np.broadcast_to(own, (*self.values.shape[:-1], len(own)))
 
     @property
     def offset(self) -> Float[np.ndarray, "*batch n"]:
@@ -90,13 +131,14 @@ class Estimate(Shown):
     @property
     def parameters(self) -> Float[np.ndarray, "*batch n 10"]:
         """Ten inertial parameters of every joint's body about the joint, in Pinocchio's order, the load included."""
-        n = self.robot.nv
+        n, turns = self.robot.nv, into_tree(self.robot)
         known = np.array([model_body(self.tree, i) for i in range(n)])
-        bodies = np.tile(known, (*self.duals.shape[:-1], 1, 1, 1))
-        for body, p in zip(self.unknowns.bodies, self._bodies(), strict=True):
-            bodies[..., body.joint, :, :] += p - body.known
-        back = np.swapaxes(into_tree(self.robot), -1, -2)  # a rotation
-        return inertial_parameters(back @ bodies @ np.swapaxes(back, -1, -2))
+        bodies = np.tile(known, (*self.values.shape[:-1], 1, 1, 1))
+        for k, body in enumerate(self.unknowns.bodies):
+            p = body.place @ pseudo_inertia(self.values[..., 10 * k : 10 * k + 10]) @ body.place.T
+            bodies[..., body.joint, :, :] += p if body.is_load else p - body.known
+        back = np.swapaxes(turns, -1, -2)  # a rotation
+        return inertial_parameters(back @ bodies @ turns)
 
     def dynamics(self) -> IdentifiedDynamics:
         """The model with these bodies, rotors and friction, of one memory, which laws, `compare` and files take.
@@ -110,27 +152,18 @@ class Estimate(Shown):
         return IdentifiedDynamics(self.robot, self.parameters, friction, np.maximum(self.rotor_inertia, 0.0))
 
     @property
-    def _load(self) -> UnknownBody | None:
-        return next((body for body in self.unknowns.bodies if body.frame is not None), None)
+    def _load(self) -> int:
+        """Which body is the load, −1 where none adapts."""
+        return next((k for k, body in enumerate(self.unknowns.bodies) if body.is_load), -1)
 
     @property
-    def _load_body(self) -> np.ndarray:
-        """The pseudo-inertia of the load in its own frame; zero where none adapts."""
-        for body, p in zip(self.unknowns.bodies, self._bodies(), strict=True):
-            if body.frame is not None:
-                back = np.linalg.inv(body.frame)
-                return np.asarray(back @ (p - body.known) @ back.T)
-        return np.zeros((*self.duals.shape[:-1], 4, 4))
-
-    def _bodies(self) -> list[np.ndarray]:
-        x, _ = logistic_and_cut(Duals.of(self.duals, len(self.unknowns.bodies)).bodies)
-        return [body.factor @ x[..., k, :, :] @ body.factor.T for k, body in enumerate(self.unknowns.bodies)]
+    def _load_values(self) -> np.ndarray:
+        k = self._load
+        return np.zeros((*self.values.shape[:-1], 10)) if k < 0 else self.values[..., 10 * k : 10 * k + 10]
 
     def _numbers(self, code: NumberCode) -> Float[np.ndarray, "*batch n"]:
-        found = np.zeros((*self.duals.shape[:-1], self.robot.nv))
-        for number, dual in zip(
-            self.unknowns.numbers, np.moveaxis(self.duals[..., -len(self.unknowns.numbers) :], -1, 0), strict=True
-        ):
+        found, begin = np.zeros((*self.values.shape[:-1], self.robot.nv)), 10 * len(self.unknowns.bodies)
+        for k, number in enumerate(self.unknowns.numbers):
             if number.code == code:
-                found[..., number.joint] = number.lowest + number.width / (1.0 + np.exp(-dual))
+                found[..., number.joint] = self.values[..., begin + k]
         return found

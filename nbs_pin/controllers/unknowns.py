@@ -25,6 +25,8 @@ from nbs_pin.robots.robot import Robot
 
 ADAPTS = ("load", "links", "friction", "rotors", "offsets")
 """What a law can adapt: a load at a frame, bodies of links, joint friction, rotor inertia, constant torques."""
+LOAD_AT = "load at "
+"""What the name of a load begins with, before its link."""
 _UPPER = np.triu_indices(4)
 _LEAST_SHARE = 1e-4  # what every direction of a body begins with, where the model has less, as a share of the largest
 _REACH = 2.0  # a link's largest body, as a multiple of the one that the model has
@@ -41,6 +43,7 @@ class UnknownBody(NamedTuple):
     """A body that is not known, in the frame of its joint's body in the tree."""
 
     name: str
+    """"load at LINK", or the joint that carries the body."""
     joint: int
     factor: Float[np.ndarray, "4 4"]
     """K [√kg·m, √kg]."""
@@ -48,8 +51,10 @@ class UnknownBody(NamedTuple):
     """Q₀."""
     known: Float[np.ndarray, "4 4"]
     """Pseudo-inertia of what it replaces in the model."""
-    frame: Float[np.ndarray, "4 4"] | None = None
-    """Placement of the frame that carries a load, None for a link."""
+    place: Float[np.ndarray, "4 4"]
+    """Placement of the frame that carries the load, or of the joint's frame, in which estimates are told."""
+    is_load: bool
+    """Whether estimates are told without the known body."""
 
 
 class UnknownNumber(NamedTuple):
@@ -112,7 +117,7 @@ def unknown_load(robot: Robot, tree: Packed, frame: str | None, mass: float, rad
     placement = next(f.placement for f in robot.model.frames if f.name == name and f.type == pin.FrameType.BODY)
     carried = into_tree(robot)[joint - 1] @ placement.homogeneous
     known, root = model_body(tree, joint - 1), carried * np.sqrt(2.0 * mass) @ np.diag([radius] * 3 + [1.0])
-    return _between(name, joint - 1, known, known + root @ root.T, carried)
+    return _between(LOAD_AT + name, joint - 1, known, known + root @ root.T, carried, True)
 
 
 def unknown_links(robot: Robot, tree: Packed, names: Sequence[str]) -> list[UnknownBody]:
@@ -123,19 +128,19 @@ def unknown_links(robot: Robot, tree: Packed, names: Sequence[str]) -> list[Unkn
     wrong = [name for name in names if name not in robot.joint_names]
     if wrong:
         raise ArgumentError(f"{robot.name} has no joint '{wrong[0]}'; give some of {', '.join(robot.joint_names)}.")
-    found = []
+    found, places = [], into_tree(robot)
     for i, name in enumerate(robot.joint_names):
         known = model_body(tree, i)
         if known[3, 3] > 0.0 and (not names or name in names):
             more = _SPREAD * known[3, 3] * np.diag([_LENGTH**2] * 3 + [0.0])
-            found.append(_between(name, i, known, _REACH * (known + more)))
+            found.append(_between(name, i, known, _REACH * (known + more), places[i], False))
     if not found:
         raise ArgumentError(f"no link of {robot.name} has mass; adapt a load instead.")
     return found
 
 
 def _between(
-    name: str, joint: int, known: np.ndarray, largest: np.ndarray, frame: np.ndarray | None = None
+    name: str, joint: int, known: np.ndarray, largest: np.ndarray, place: np.ndarray, is_load: bool
 ) -> UnknownBody:
     """A body up to the largest one that begins as the known one."""
     values, vectors = np.linalg.eigh(largest)
@@ -143,7 +148,7 @@ def _between(
     share = np.linalg.solve(factor, np.linalg.solve(factor, known).T)
     shares, own = np.linalg.eigh(0.5 * (share + share.T))
     start = (own * _logit(np.clip(shares, _LEAST_SHARE, 1.0 - _LEAST_SHARE))) @ own.T
-    return UnknownBody(name, joint, factor, start, known, frame)
+    return UnknownBody(name, joint, factor, start, known, place, is_load)
 
 
 def unknown_numbers(

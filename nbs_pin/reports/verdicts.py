@@ -8,12 +8,15 @@ import numpy as np
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.units import measured, several
+from nbs_pin.simulation.run_figures import load_of
 
 GOOD, WARNING, BAD, NOTE = "good", "warning", "bad", "note"
 """How a verdict is coloured: kept, to be looked at, broken, and neither."""
 _SEVERITY = (NOTE, GOOD, WARNING, BAD)
 _IN_TIME = 0.7
 """Share of the time by which an arm must have converged: one that is near its motion later may only be passing it."""
+_LIGHT = 0.01
+"""A learned load of less than this [kg] is told without its centre."""
 _USABLE = 0.1
 """Torque error over the standard deviation of the torque below which a learned model is good."""
 _CONSTANT = 100.0
@@ -84,7 +87,7 @@ def _finished(figures: Mapping[str, Any]) -> Verdict:
 
 def _tracking(figures: Mapping[str, Any]) -> Verdict:
     stopped = figures.get("stopped")
-    loads = _loads(figures)
+    loads = (*_loads(figures), *_load_learned(figures))
     if stopped:
         said = f"the guard stopped the arm after {stopped['time_s']:.3g} s: {stopped['why']}".rstrip(".")
         return Verdict(BAD, said, loads)
@@ -124,6 +127,16 @@ def _loads(figures: Mapping[str, Any]) -> tuple[str, ...]:
             then = f" and was gone at {end:g} s" if end is not None and end < last else ""
             told.append(f"a load of {load['mass_kg']:g} kg{where}, unknown to the law, appeared at {begin:g} s{then}")
     return tuple(told)
+
+
+def _load_learned(figures: Mapping[str, Any]) -> tuple[str, ...]:
+    """The load that a law believed in the end, if it learns one."""
+    found = load_of({name: x for name, x in figures.get("estimates", {}).items() if isinstance(x, int | float)})
+    if found is None:
+        return ()
+    link, mass, centre = found
+    at = f" with its centre at ({', '.join(f'{1e3 * x:.0f}' for x in centre)}) mm" if abs(mass) > _LIGHT else ""
+    return (f"the law has learned a load of {float(mass):.3g} kg at {link}{at}",)
 
 
 def _convergence(figures: Mapping[str, Any]) -> tuple[str, str]:

@@ -7,6 +7,8 @@ import numpy as np
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.base.units import by_quantity
+from nbs_pin.controllers.estimates import NO_MASS
+from nbs_pin.controllers.unknowns import LOAD_AT
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation import metrics
 from nbs_pin.simulation.tool_errors import tool_errors, tool_of
@@ -17,8 +19,8 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
 
     They are None where a row is not finite. With a robot, also how far each joint left its position range, as the
     plants have no joint stops, and how far the tool was from its path, if it followed one. `loads` are those that
-    appeared in the plant meanwhile, which the law did not know. `units` says in what the
-    numbers of each joint are: those of one that slides are in m and N, whatever the key says.
+    appeared in the plant meanwhile, which the law did not know; `estimates` what a law that adapts believed in the end.
+    `units` says in what the numbers of each joint are: those of one that slides are in m and N, whatever the key says.
     """
     values = metrics.summary(run)
     values["units"] = by_quantity(run.slides)
@@ -29,8 +31,28 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
         tool = tool_of(run)
         if tool is not None:
             values["tool"] = tool | plain(tool_errors(run, robot).figures())
-    loads = loads_of(run)
-    return values | ({"loads": loads} if loads else {})
+    loads, learned = loads_of(run), estimates_of(run)
+    values |= {"loads": loads} if loads else {}
+    return values | ({"estimates": {name: plain(x[-1]) for name, x in learned.items()}} if learned else {})
+
+
+def estimates_of(run: Run) -> dict[str, Any]:
+    """What a law that adapts believed in every row, (rows, ...), by name; empty for other laws."""
+    names = run.info.get("estimates")
+    if run.estimates is None or not isinstance(names, list) or len(names) != run.estimates.shape[-1]:
+        return {}
+    return {str(name): run.estimates[..., k] for k, name in enumerate(names)}
+
+
+def load_of(estimates: dict[str, Any]) -> tuple[str, Any, Any] | None:
+    """Link, mass [kg] and centre (..., 3) [m] of the load among estimates by name; None where no load adapts."""
+    masses = [name for name in estimates if name.startswith(LOAD_AT) and name.endswith(" m [kg]")]
+    if not masses:
+        return None
+    link = masses[0].removeprefix(LOAD_AT).removesuffix(" m [kg]")
+    firsts = [np.asarray(estimates.get(f"{LOAD_AT}{link} m{axis} [kg·m]", np.nan), dtype=float) for axis in "xyz"]
+    mass = np.asarray(estimates[masses[0]], dtype=float)
+    return link, mass, np.stack(firsts, axis=-1) / np.where(np.abs(mass) > NO_MASS, mass, np.inf)[..., None]
 
 
 def loads_of(run: Run) -> list[dict[str, Any]]:

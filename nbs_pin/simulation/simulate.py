@@ -266,7 +266,10 @@ def _block(
         if seen is not None:
             seen[steps] = loop.law.recorded(memory)
         _control(loop, run, steps, leads[steps], target, memory)  # recorded; a following block computes it again
-    return run if seen is None else replace(run, estimates=seen), memory
+    if seen is not None:
+        values, run.info["estimates"] = loop.law.estimates(seen)
+        run = replace(run, estimates=values)
+    return run, memory
 
 
 def _control(loop: _Closed, run: Run, k: int, lead: float, target: Reference, memory: Any) -> tuple[np.ndarray, Any]:
