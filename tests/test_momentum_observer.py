@@ -1,5 +1,6 @@
 """The momentum observer: its identity, its filter against theory, its order, its two paths, runs, payloads and CSV."""
 
+import base64
 import csv
 import itertools
 import math
@@ -11,6 +12,7 @@ import torch
 
 import nbs_pin as nbs
 from nbs_pin.dynamics.momentum_observer import ObserverMemory
+from nbs_pin.reports.signals import signals_of
 from tests.random_arms import random_arm
 from tests.test_dynamics import learned, relative
 
@@ -328,3 +330,31 @@ def test_what_is_remembered_are_plain_numbers():
     memory = nbs.MomentumObserver.for_robot(TWO).initial(np.zeros(2), np.zeros(2))
     assert isinstance(memory, ObserverMemory)
     assert memory.rows.shape == (3, 2)
+
+
+def test_a_picture_shows_what_was_observed_beside_the_disturbance(tmp_path):
+    run = run_of(TWO, push=nbs.ConstantTorque([20.0, -10.0]))
+    seen = nbs.MomentumObserver.for_robot(TWO).observe(run)
+    plain, more = (
+        nbs.plot_tracking(run, tmp_path / name, external=given).read_text()
+        for name, given in (("a.svg", None), ("b.svg", seen))
+    )
+    assert plain.count("stroke-dasharray") < more.count("stroke-dasharray")
+    with pytest.raises(nbs.ArgumentError, match="returned for this run"):
+        nbs.plot_tracking(run.head(10), tmp_path / "c.svg", external=seen)
+    short = nbs.MomentumObserver.for_robot(TWO).observe(run.head(1))
+    assert short.torque.shape == (1, 2)
+    assert not short.torque.any()
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_pages_have_it_as_a_signal_with_the_friction_that_was_simulated(kept):
+    robot = TWO.with_friction(viscous=1.0, coulomb=1.0)
+    push, plant = nbs.ConstantTorque([3.0, -1.0]), nbs.MujocoPlant(robot, joint_friction="keep" if kept else "drop")
+    run = run_of(robot, push=push, plant=plant)
+    signals = signals_of(run, robot)
+    numbers = np.frombuffer(base64.b64decode(signals["external"]), dtype=np.float32).reshape(run.q.shape)
+    friction = nbs.JointFriction.of(robot) if kept else None
+    assert np.allclose(numbers, nbs.MomentumObserver.for_robot(robot, friction=friction).observe(run).torque, atol=1e-5)
+    # MuJoCo's own Coulomb friction is not the smooth one that is known here
+    assert np.abs(numbers[-1] - [3.0, -1.0]).max() < (0.2 if kept else 1e-3)

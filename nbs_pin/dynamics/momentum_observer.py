@@ -299,7 +299,7 @@ class MomentumObserver(Shown):
         mean = np.diff(momentum, axis=0) / h - tau[:-1] - 0.5 * (known[1:] + known[:-1])
         torque = np.zeros(q.shape).reshape(flat)
         gains = np.tile(self.gain, torque.shape[1] // self.nv)
-        at.filtered(periods, gains, np.ascontiguousarray(mean.reshape(len(periods), -1)), torque)
+        at.filtered(periods, gains, np.ascontiguousarray(mean.reshape(len(periods), torque.shape[1])), torque)
         return np.asarray(finite_result("the external torque", torque.reshape(q.shape), q, v, tau))
 
     def _numpy(self, **vectors: Array) -> tuple[np.ndarray, ...]:
@@ -340,6 +340,8 @@ class MomentumObserver(Shown):
 
 OBSERVER = a(MomentumObserver, "a MomentumObserver, such as MomentumObserver.for_robot(robot)")
 """The check of an argument that is a momentum observer."""
+OBSERVED = a(ObservedTorques, "what MomentumObserver.observe returned")
+"""The check of an argument that is the torque from outside along a run."""
 
 
 def _told(after: np.ndarray) -> tuple[ExternalTorque, ObserverMemory]:

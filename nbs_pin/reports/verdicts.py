@@ -185,6 +185,7 @@ def _certificate(figures: Mapping[str, Any]) -> Verdict:
         more.append(f"no worst motion to compare with the bounds: {figures['attack_diverged']}")
     if seen is not None:
         more.append(f"the run: {seen['verdict']}")
+        more += [seen["external"]] if "external" in seen else []
         level = max(level, monitor_level(is_kept=seen["is_kept"], broken=seen["broken"]), key=_SEVERITY.index)
     useless = figures.get("useless") or []
     more += [f"of no use: {text}" for text in useless]
