@@ -4,7 +4,6 @@ import base64
 import csv
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -126,10 +125,11 @@ def test_the_error_is_of_second_order_and_below_its_bound():
         assert ((coarse / fine > 3.5) & (coarse / fine < 4.5))[moved].all()
 
 
-@pytest.mark.parametrize("robot", [TWO, PANDA, nbs.load_robot("ur5")], ids=["two_link", "panda", "ur5"])
-def test_without_a_torque_from_outside_it_stays_at_the_error_of_the_discretisation(robot):
+@pytest.mark.parametrize(("name", "most"), [("two_link", 3e-5), ("panda", 1e-5), ("ur5", 3e-5)])
+def test_without_a_torque_from_outside_it_stays_at_the_error_of_the_discretisation(name, most):
+    robot = nbs.load_robot(name)
     run = run_of(robot, plant=nbs.MujocoPlant(robot))
-    assert np.abs(nbs.MomentumObserver.for_robot(robot).observe(run).torque).max() < 3e-5  # N·m, at 1 kHz
+    assert np.abs(nbs.MomentumObserver.for_robot(robot).observe(run).torque).max() < most  # N·m, at 1 kHz
 
 
 def test_at_rest_nothing_is_left_but_rounding():
@@ -309,8 +309,6 @@ def test_it_says_what_it_is_and_a_run_of_it_is_a_table(tmp_path):
     assert np.array_equal(np.array(rows, dtype=float), np.column_stack([seen.t, seen.torque]))
     with pytest.raises(nbs.ArgumentError, match="starts 0 to 0"):
         seen.save(path, start=1)
-    with pytest.raises(nbs.ArgumentError, match="give arrays that fit"):
-        replace(seen, torque=seen.torque[:-1])
 
 
 def test_noise_of_the_velocity_is_amplified_as_told():

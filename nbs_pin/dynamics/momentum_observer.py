@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nbs_pin.base.arguments import PERIOD, a, check_fields, checked, count, joints, many, text, writable
+from nbs_pin.base.arguments import PERIOD, a, checked, count, joints, writable
 from nbs_pin.base.arrays import Array, JointArray, Vectors, as_vectors, finite_result, is_torch_array, matvec
 from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.csv_files import write_csv
@@ -84,23 +84,6 @@ class ObservedTorques(Shown):
     """K_o of the observer [1/s]."""
     prismatic: Bool[np.ndarray, " n"]
     """True for joints that slide."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, joint_names=many(text, 1), gain=joints(above=0.0, unit="1/s"))
-        for name in ("t", "torque", "disturbance"):
-            object.__setattr__(self, name, floats(f"ObservedTorques: {name}", getattr(self, name)))
-        shape, n = self.torque.shape, len(self.joint_names)
-        slides = floats("ObservedTorques: prismatic", self.prismatic, truths=True)
-        object.__setattr__(self, "prismatic", slides.astype(bool))
-        sizes = {"gain": self.gain.shape, "prismatic": slides.shape}
-        wanted = {"t": shape[:1], "disturbance": shape} | dict.fromkeys(sizes, (n,))
-        found = {"t": self.t.shape, "disturbance": self.disturbance.shape} | sizes
-        wrong = [name for name in found if found[name] != wanted[name]]
-        if len(shape) < 2 or shape[-1] != n or wrong:
-            raise ArgumentError(
-                f"ObservedTorques: torque has shape {shape}, {', '.join(f'{k} {x}' for k, x in found.items())} for {n}"
-                " joint_names, expected (rows, ..., joints) and one time per row; give arrays that fit."
-            )
 
     def _facts(self) -> Iterable[str]:
         return joints_told(len(self.joint_names)), f"{len(self.t)} rows", spread("gain", self.gain, "1/s")

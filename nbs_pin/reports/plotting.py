@@ -136,13 +136,8 @@ def plot_tracking(
     one = one_start(run, start)
     if robot is not None and robot.nv != run.nv:
         raise ArgumentError(f"the run has {run.nv} joints and {robot!r} {robot.nv}; give the robot of the run.")
-    if external is not None and external.torque.shape != run.q.shape:
-        raise ArgumentError(
-            f"external has torques of shape {external.torque.shape} for a run of shape {run.q.shape}; give what"
-            " MomentumObserver.observe returned for this run."
-        )
     q, v, q_ref, tau = one.q, one.v, one.q_ref, one.tau
-    outside = None if external is None else external.torque.reshape(len(run.t), -1, run.nv)[:, start]
+    outside = None if external is None else _observed(external, run, start)
     error = np.abs(configuration_difference(q, q_ref, run.continuous))
     cut = np.abs(one.tau_command) > run.effort_limit
     tau[-1], cut[-1] = np.nan, False  # commanded, but never applied
@@ -171,6 +166,16 @@ def plot_tracking(
             assert robot is not None
             _draw_tool(figure, grid[-1], one, robot, tool)
     return Path(path)
+
+
+def _observed(external: ObservedTorques, run: Run, start: int) -> Float[np.ndarray, "rows n"]:
+    """What was observed in one start; raises ArgumentError if that was in another run."""
+    if external.torque.shape != run.q.shape:
+        raise ArgumentError(
+            f"external has torques of shape {external.torque.shape} for a run of shape {run.q.shape}; give what"
+            " MomentumObserver.observe returned for this run."
+        )
+    return external.torque.reshape(len(run.t), -1, run.nv)[:, start]
 
 
 def _heading(run: Run, robot: Robot | None) -> Heading:
