@@ -220,7 +220,8 @@ def test_an_attack_finds_more_and_a_run_is_held_against_the_bound(certified, tmp
     assert figures["monitor"]["verdict"] in printed
     assert figures["monitor"]["external"].removeprefix("the") in printed
     assert figures["monitor"]["declared_Nm"] == [5.0, 4.0]
-    assert figures["monitor"]["largest_external_Nm"][0] == pytest.approx(5.0, abs=0.1)
+    assert max(figures["monitor"]["largest_external_Nm"]) > 5.0
+    assert "more than declared" in printed
     assert not figures["monitor"]["is_wrong"]
 
 

@@ -402,6 +402,7 @@ def test_a_circle_is_drawn_in_mujoco_within_a_tenth_of_a_millimetre(name, frame)
 
 BAD_PATHS = {
     "at least two": lambda: nbs.ToolPath.through([[0.1, 0.2, 0.3]]),
+    "points 2 and 3 of the path are too near": lambda: nbs.ToolPath.through([[-1e30, 0.0, 0.0], [0.0] * 3, [1.0] * 3]),
     "points 1 and 2 of the path are the same": lambda: nbs.ToolPath.through([[0.0, 0.0, 0.0]] * 2),
     "increasing": lambda: nbs.ToolPath.through([[0.0, 0, 0], [1.0, 0, 0]], times=[1.0, 1.0]),
     "orientation of point 2 is no rotation": lambda: nbs.ToolPath.through(

@@ -167,7 +167,7 @@ def _knots(positions: np.ndarray, times: np.ndarray | None) -> np.ndarray:
                 f"times of shape {times.shape} for {len(positions)} points, expected one for each, increasing; "
                 "correct them."
             )
-        return np.asarray((times - times[0]) / (times[-1] - times[0]))
+        return _distinct((times - times[0]) / (times[-1] - times[0]))
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
     if not (steps > 0.0).all():
         k = int(np.argmin(steps))
@@ -176,7 +176,18 @@ def _knots(positions: np.ndarray, times: np.ndarray | None) -> np.ndarray:
             "times."
         )
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    return np.asarray(along / along[-1])
+    return _distinct(along / along[-1])
+
+
+def _distinct(knots: np.ndarray) -> np.ndarray:
+    """The values; raises ArgumentError where two waypoints cannot be told apart after rounding."""
+    if not (np.diff(knots) > 0.0).all():
+        k = int(np.argmin(np.diff(knots)))
+        raise ArgumentError(
+            f"the points {k + 1} and {k + 2} of the path are too near to each other for a path of its length; leave one"
+            " out, or bring the far ones nearer."
+        )
+    return knots
 
 
 def _rotations(orientations: np.ndarray, count: int) -> Rotation:
