@@ -53,6 +53,11 @@ from .dynamics.equations import (
 from .dynamics.friction import JointFriction as JointFriction
 from .dynamics.identified import IdentifiedDynamics as IdentifiedDynamics
 from .dynamics.lagrangian import LagrangianDynamics as LagrangianDynamics
+from .dynamics.momentum_observer import (
+    ExternalTorque as ExternalTorque,
+    MomentumObserver as MomentumObserver,
+    ObservedTorques as ObservedTorques,
+)
 from .dynamics.pinocchio import PinocchioDynamics as PinocchioDynamics
 from .dynamics.provider import DynamicsProvider as DynamicsProvider
 from .dynamics.residual import ResidualDynamics as ResidualDynamics

@@ -216,7 +216,12 @@ def test_an_attack_finds_more_and_a_run_is_held_against_the_bound(certified, tmp
     # The run's disturbance, 5 N·m and loads, is beyond what was certified.
     assert str(Assumption.DISTURBANCE) in figures["monitor"]["broken"]
     assert isinstance(figures["monitor"]["largest_error_bound_rad"], float)
-    assert figures["monitor"]["verdict"] in " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert figures["monitor"]["verdict"] in printed
+    assert figures["monitor"]["external"].removeprefix("the") in printed
+    assert figures["monitor"]["declared_Nm"] == [5.0, 4.0]
+    assert max(figures["monitor"]["largest_external_Nm"]) > 5.0
+    assert "more than declared" in printed
     assert not figures["monitor"]["is_wrong"]
 
 

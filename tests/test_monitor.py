@@ -445,3 +445,44 @@ def test_pictures_show_what_they_are_of(law, certificate, fallen, tmp_path):
     joint = replace(certificate, joint_errors=0.1 * found.joint_errors)
     of_joint = plot_monitor(monitor(found.run, joint), tmp_path / "joint.png")
     assert pixels(of_joint, "#7a4fa3") > pixels(kept, "#7a4fa3") + 100
+
+
+def test_the_torque_seen_is_told_beside_the_declared_one_and_changes_no_verdict(law, certificate):
+    run = run_of(law, torque=WAVE, duration=1.0)
+    seen = monitor(run, certificate)
+    observed = nbs.MomentumObserver(law.dynamics).observe(run)
+    assert np.array_equal(seen.external.torque, observed.torque)
+    assert np.array_equal(seen.external.declared, BOUND)
+    assert (seen.external.largest <= BOUND * 1.001).all()  # a mean of admissible torques is admissible
+    assert (seen.external.largest > 0.9 * BOUND).all()
+    assert "declared" in str(seen.external)
+    assert "more than" not in str(seen.external)
+    assert seen.verdict == "promise kept"
+    pushed = monitor(run_of(law, torque=ConstantTorque([1.0, 4.0]), duration=1.0), certificate)
+    told = "the momentum shows at most 4 N·m from outside on joint2, of 3 N·m declared"
+    assert str(pushed.external) == f"{told}; more than declared on 1 of 2 joints"
+    assert Assumption.DISTURBANCE in pushed.broken  # by the balance of power, not by the observer
+
+
+def test_the_torque_seen_of_a_ball_is_a_norm(law):
+    seen = monitor(run_of(law, torque=ConstantTorque([3.0, 4.0]), duration=1.0), certify(law, 6.0)).external
+    assert seen.size == pytest.approx(5.0, abs=1e-3)
+    assert str(seen) == "the momentum shows at most 5 N·m from outside, of 6 declared"
+
+
+def test_friction_that_is_fed_forward_is_no_torque_from_outside(robot):
+    friction = JointFriction(viscous=[0.5, 0.3], coulomb=[1.0, 0.5], transition=0.1)
+    law = NeuralBackstepping.for_robot(robot, bandwidth=8.0, friction=friction)
+    run = run_of(law, friction=friction, duration=0.5)
+    assert monitor(run, certify(law, BOUND)).external.largest.max() < 0.01
+
+
+def test_a_row_that_is_not_finite_is_not_observed(law, certificate):
+    run = run_of(law, torque=ConstantTorque([1.0, 1.0]), duration=0.5)
+    q = run.q.copy()
+    q[200:210] = np.nan
+    seen = monitor(replace(run, q=q), certificate).external
+    assert np.isnan(seen.torque[200:210]).all()
+    assert np.isfinite(np.delete(seen.torque, np.s_[200:210], axis=0)).all()
+    assert np.isfinite(seen.largest).all()
+    assert np.allclose(seen.torque[-1], 1.0, atol=1e-3)

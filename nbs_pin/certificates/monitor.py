@@ -36,6 +36,7 @@ from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, storage_of
 from nbs_pin.certificates.glance import Glance, labels
+from nbs_pin.certificates.seen_torque import SeenTorque, seen_torque
 from nbs_pin.certificates.window_watch import UNEXPLAINED, WindowWatch
 
 
@@ -82,6 +83,8 @@ class Monitored(Shown):
     """Whether a bound was exceeded by more than the failed assumptions account for."""
     compared: Bool[np.ndarray, " rows"]
     """When V and torques were compared with their bounds: from encoders, when a window of readings was full."""
+    external: SeenTorque
+    """The torque from outside as the momentum shows it, beside the declared disturbance; no part of the verdict."""
     suspects: tuple[str, ...] = ()
     """From encoders: simple faults each of which would explain the torques of the last window with any."""
     basis: str = ""
@@ -209,6 +212,7 @@ def _exact(
         is_recorded=bool(recorded.any()),
         is_wrong=is_wrong,
         compared=~lost,
+        external=seen_torque(certificate, at, lost),
         basis=in_which_time(certificate, promise.initial),
     )
 
@@ -252,6 +256,7 @@ def _read(
         is_recorded=False,
         is_wrong=any(x.is_wrong for x in seen),
         compared=np.array([np.isfinite(x.storage) for x in seen]),
+        external=seen_torque(certificate, at, lost),
         basis="" if memory is None else memory.basis,
         suspects=suspects[-1] if suspects else (),
     )

@@ -45,6 +45,10 @@ class Run(Followed, Reported):
         float | None, number("--certified", above=0.0, most=1e9, unit="N·m"), default("0.5 rad for every joint")
     ] = None
     """Stop where an error passes the certified bound for disturbances up to this on every joint [N·m]."""
+    external_limit: Annotated[
+        float | None, number("--external-limit", above=0.0, most=1e9, unit="N·m"), default("none")
+    ] = None
+    """Stop where a torque from outside passes this on any joint [N·m], as the arm tells it or its momentum shows."""
     live: bool = False
     """Show the arm in the browser meanwhile, on this machine only."""
     priority: bool = True

@@ -191,6 +191,9 @@ def figures(result: Certified) -> dict[str, Any]:
             "largest_share": float((watched.storage / watched.promise).max()) if watched.promise.all() else None,
             "largest_error_rad": float(watched.error.max()),
             "largest_error_bound_rad": float(watched.error_bound.max()),
+            "external": str(watched.external),
+            "largest_external_Nm": watched.external.largest,
+            "declared_Nm": watched.external.declared,
         }
     if proposal is not None:
         numbers["design"] = {

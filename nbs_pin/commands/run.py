@@ -58,7 +58,8 @@ def run(options: Run, console: Console, notes: Console) -> int:
         law = law_of(options.controller, robot, bandwidth=options.bandwidth, period=period, friction=None, seed=0)
         law.compile()
         arm = arm_at(options.at, robot, motion, period, loads)
-        guard = guard_for(arm, robot, certificate=_bound(options, law, robot))
+        limit = np.inf if options.external_limit is None else options.external_limit
+        guard = guard_for(arm, robot, certificate=_bound(options, law, robot), external_limit=limit)
     with results.made() as folder, _watching(options, robot, notes) as latest:
         driven = drive(arm, law, robot, motion, duration, guard=guard, watch=latest.append, priority=options.priority)
         note(driven.run, loads)

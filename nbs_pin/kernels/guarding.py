@@ -75,6 +75,8 @@ def _stop(s: Part, c: Part, code: int) -> None:
     s.x[MODE], s.x[CODE] = STOPPED, code
     for i in range(s.rows.shape[1]):
         s.rows[PEAK, i], s.rows[READ, i] = abs(s.rows[V, i]) / c.rows[SPEED, i], s.rows[Q, i]
+        if code == EXTERNAL:  # what pushes may go on, and make joints faster in spite of the brake
+            s.rows[PEAK, i] = max(s.rows[PEAK, i], 1.0)
         if code == SIGN:  # a damping of this velocity would drive the joint
             s.rows[V, i] = 0.0
 

@@ -52,7 +52,7 @@ def settings_in_words(run: Run) -> list[str]:
         _motion(run, given),
         _start(given),
         "" if given.get("disturbance") in (None, "none") else f"disturbance {given['disturbance']}",
-        *_plant(str(run.info.get("plant") or ""), given),
+        *_plant(str(run.info.get("plant") or ""), friction_of(run)),
         *(f"{name.replace('_', ' ')} {_told(value)}" for name, value in (given.get("arm") or {}).items()),
         f"seed {given['seed']}" if given.get("seed") is not None else "",
     ]
@@ -82,18 +82,24 @@ def _start(given: Mapping[str, Any]) -> str:
     return f"start off by {given['start_error']:g} rad" if given.get("start_error") else ""
 
 
-def _plant(text: str, given: Mapping[str, Any]) -> list[str]:
+def _plant(text: str, friction: str) -> list[str]:
     """The plant from its repr, as in MujocoPlant(panda, rk4, joint_friction=drop)."""
     text = re.sub(r"^ChangingPlant\((.*), changes at .* s\)$", r"\1", text)  # the first of them
     name, _, inside = text.rstrip(")").partition("(")
     words = inside.split(", ")
     engine = next((f" ({_ENGINES[word]})" for word in words if word in _ENGINES), "")
-    friction = given.get("joint_friction") or next((w.partition("=")[2] for w in words if "joint_friction=" in w), "")
     return [
         f"in {_words(name)}{engine}" if name else "",
         {"drop": "no joint friction", "keep": "with joint friction"}.get(friction, ""),
         "joint stops" if "joint_stops=keep" in words else "",
     ]
+
+
+def friction_of(run: Run) -> str:
+    """What a simulation did with the arm's joint friction, "drop" or "keep", by settings or plant; "" if unknown."""
+    given = run.info.get("settings")
+    stated = given.get("joint_friction") if isinstance(given, Mapping) else ""
+    return str(stated or next(iter(re.findall(r"joint_friction=(\w+)", str(run.info.get("plant")))), ""))
 
 
 def _words(name: str) -> str:

@@ -87,7 +87,7 @@ def _draw_load(above: Axes, below: Axes, run: Run, load: tuple[str, np.ndarray, 
     if carried.any():
         above.plot(run.t, carried, color=INK, linewidth=0.9, linestyle=(0, (1, 2)), label="carried")
         above.legend(frameon=False, loc="best", ncols=2)
-    heavy = np.abs(mass) > 0.1 * np.abs(mass).max()
+    heavy = np.abs(mass) > 0.25 * np.abs(mass).max()
     curves = {axis: np.where(heavy, 1e3 * centre[:, k], np.nan) for k, axis in enumerate("xyz")}
     _draw(below, run, f"its centre in the frame of {link} [mm]", curves)
 

@@ -23,6 +23,7 @@ from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import RUN, Run
+from nbs_pin.dynamics.momentum_observer import OBSERVED, ObservedTorques
 from nbs_pin.reports.captions import arm_in_words, law_in_words, settings_in_words
 from nbs_pin.reports.verdicts import BAD, GOOD, WARNING, Verdict, verdict_of
 from nbs_pin.robots.named import robot_of
@@ -49,6 +50,7 @@ _COLOURS = {GOOD: TORQUE, WARNING: "#8a5a00", BAD: ERROR}
 _UNDATED: Any = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
 _WIDE: Any = {"color": "#ffc891", "linewidth": 4.5}  # of the reference, so that it shows beside the curve on it
 _CHANGE: Any = {"color": INK, "linewidth": 0.9, "linestyle": (0, (1, 1.5))}
+_OBSERVED: Any = {"color": ERROR, "linewidth": 0.9, "linestyle": (0, (4, 2))}
 _NARROWEST = 0.012  # share of the time axis that a marked stretch takes, at least
 
 
@@ -103,8 +105,10 @@ def _head(figure: Figure, heading: Heading) -> None:
     engine.set(rect=(0.0, 0.0, 1.0, 1.0 - down / height))
 
 
-@checked(run=RUN, path=writable, start=count(0), robot=maybe(ARM))
-def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | None = None) -> Path:
+@checked(run=RUN, path=writable, start=count(0), robot=maybe(ARM), external=maybe(OBSERVED))
+def plot_tracking(
+    run: Run, path: str | Path, *, start: int = 0, robot: Robot | None = None, external: ObservedTorques | None = None
+) -> Path:
     """Plot how each joint follows its reference and write the picture; returns its path.
 
     It is a PNG, or of the kind that the path ends in: .svg or .pdf. Each row shows actual and desired position, |error|
@@ -114,10 +118,11 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
     settings and a verdict. `start` selects one start of a batched run. With a `robot`, the arm that ran, position
     limits are drawn where the joint comes near them, and stretches are shaded in which it is outside them or faster
     than its velocity limit. A run along a path of the tool has a last row: its errors and the path, for which None
-    loads the arm that the run names.
+    loads the arm that the run names. `external`, what `MomentumObserver.observe` made of the run, is drawn dashed
+    beside torque and disturbance.
 
     Raises:
-        ArgumentError: If the start does not exist, the robot has another number of joints, or the arm of a path of the
+        ArgumentError: If the start does not exist, robot or `external` do not fit the run, or the arm of a path of the
             tool is missing or has changed.
 
     Example:
@@ -134,6 +139,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
     if robot is not None and robot.nv != run.nv:
         raise ArgumentError(f"the run has {run.nv} joints and {robot!r} {robot.nv}; give the robot of the run.")
     q, v, q_ref, tau = one.q, one.v, one.q_ref, one.tau
+    outside = None if external is None else _observed(external, run, start)
     error = np.abs(configuration_difference(q, q_ref, run.continuous))
     cut = np.abs(one.tau_command) > run.effort_limit
     tau[-1], cut[-1] = np.nan, False  # commanded, but never applied
@@ -150,7 +156,7 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
             if robot is not None:
                 _draw_stops(position_axes, run.t, q[:, joint], v[:, joint], robot.joints[joint])
             _draw_error(error_axes, run.t, error[:, joint], decades[joint])
-            _draw_torque(torque_axes, one, joint, cut[:, joint])
+            _draw_torque(torque_axes, one, joint, cut[:, joint], None if outside is None else outside[:, joint])
             position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color=INK)
             if len(set(run.units)) > 1:
                 of = run.units[joint]
@@ -158,11 +164,21 @@ def plot_tracking(run: Run, path: str | Path, *, start: int = 0, robot: Robot | 
                     axes.annotate(f"[{unit}]", (0.0, 1.0), xycoords="axes fraction", va="bottom", fontsize=7,
                                   color=NOTE)  # fmt: skip
         draw_changes(grid[: run.nv].flat, run)
-        _dress(figure, grid, run, fraction)
+        _dress(figure, grid, run, fraction, observed=outside is not None)
         if tool is not None:
             assert robot is not None
             _draw_tool(figure, grid[-1], one, robot, tool)
     return Path(path)
+
+
+def _observed(external: ObservedTorques, run: Run, start: int) -> Float[np.ndarray, "rows n"]:
+    """What was observed in one start; raises ArgumentError if that was in another run."""
+    if external.torque.shape != run.q.shape:
+        raise ArgumentError(
+            f"external has torques of shape {external.torque.shape} for a run of shape {run.q.shape}; give what"
+            " MomentumObserver.observe returned for this run."
+        )
+    return external.torque.reshape(len(run.t), -1, run.nv)[:, start]
 
 
 def _heading(run: Run, robot: Robot | None) -> Heading:
@@ -242,8 +258,9 @@ def _draw_error(axes: Axes, t: Float[np.ndarray, " rows"], error: Float[np.ndarr
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def _draw_torque(axes: Axes, run: Run, joint: int, cut: Bool[np.ndarray, " rows"]) -> None:
-    """Torque of a joint and the disturbance, on an axis that fits both, and the stretches where it is saturated.
+def _draw_torque(axes: Axes, run: Run, joint: int, cut: Bool[np.ndarray, " rows"],
+                 outside: Float[np.ndarray, " rows"] | None) -> None:  # fmt: skip
+    """Torque of a joint, disturbance and what was observed, on an axis that fits all; shaded where it is saturated.
 
     A limit is drawn where it is on that axis.
     """
@@ -254,6 +271,8 @@ def _draw_torque(axes: Axes, run: Run, joint: int, cut: Bool[np.ndarray, " rows"
     if run.disturbance.any():
         axes.plot(*thin(t[:-1], run.disturbance[:-1, joint]), color=VIOLET, linewidth=0.9)
     axes.plot(*thin(t, tau), color=TORQUE, linewidth=1.0)
+    if outside is not None:
+        axes.plot(*thin(t, outside), **_OBSERVED)
     axes.autoscale_view()
     low, high = axes.get_ylim()
     for side in (-limit, limit) if np.isfinite(limit) else ():
@@ -265,7 +284,7 @@ def _draw_torque(axes: Axes, run: Run, joint: int, cut: Bool[np.ndarray, " rows"
     axes.annotate(note, (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=NOTE)
 
 
-def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
+def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float, observed: bool) -> None:
     """Titles, the legend and the time axis."""
     kinds = {(of.position, of.position, of.torque) for of in run.units}
     beside = [f" [{unit}]" for unit in kinds.pop()] if len(kinds) == 1 else ["", "", ""]  # else each row has its own
@@ -283,10 +302,12 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float) -> None:
     ]
     if run.disturbance.any():
         handles.append(figure.axes[2].plot([], [], color=VIOLET, label="disturbance")[0])
+    if observed:
+        handles.append(figure.axes[2].plot([], [], **_OBSERVED, label="from outside, by the momentum")[0])
     if changes_of(run):
         handles.append(figure.axes[0].plot([], [], label="the plant changes", **_CHANGE)[0])
     shown = handles if cut else [*handles[:2], *handles[3:]]
-    figure.legend(handles=shown, loc="upper right", ncols=5, frameon=False)
+    figure.legend(handles=shown, loc="upper right", ncols=6, frameon=False)
 
 
 def draw_changes(each: Iterable[Axes], run: Run) -> None:

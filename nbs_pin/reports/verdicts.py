@@ -15,8 +15,8 @@ GOOD, WARNING, BAD, NOTE = "good", "warning", "bad", "note"
 _SEVERITY = (NOTE, GOOD, WARNING, BAD)
 _IN_TIME = 0.7
 """Share of the time by which an arm must have converged: one that is near its motion later may only be passing it."""
-_LIGHT = 0.01
-"""A learned load of less than this [kg] is told without its centre."""
+_LIGHT = 0.02
+"""A learned load of less than this [kg] is none."""
 _USABLE = 0.1
 """Torque error over the standard deviation of the torque below which a learned model is good."""
 _CONSTANT = 100.0
@@ -135,8 +135,10 @@ def _load_learned(figures: Mapping[str, Any]) -> tuple[str, ...]:
     if found is None:
         return ()
     link, mass, centre = found
-    at = f" with its centre at ({', '.join(f'{1e3 * x:.0f}' for x in centre)}) mm" if abs(mass) > _LIGHT else ""
-    return (f"the law has learned a load of {float(mass):.3g} kg at {link}{at}",)
+    if abs(mass) < _LIGHT:
+        return (f"the law has learned that {link} carries no load",)
+    at = ", ".join(f"{1e3 * x:.0f}" for x in centre)
+    return (f"the law has learned a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm",)
 
 
 def _convergence(figures: Mapping[str, Any]) -> tuple[str, str]:
@@ -214,6 +216,7 @@ def _certificate(figures: Mapping[str, Any]) -> Verdict:
         more.append(f"no worst motion to compare with the bounds: {figures['attack_diverged']}")
     if seen is not None:
         more.append(f"the run: {seen['verdict']}")
+        more += [seen["external"]] if "external" in seen else []
         level = max(level, monitor_level(is_kept=seen["is_kept"], broken=seen["broken"]), key=_SEVERITY.index)
     useless = figures.get("useless") or []
     more += [f"of no use: {text}" for text in useless]

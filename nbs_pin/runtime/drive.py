@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arguments import DURATION, a, checked, flag, function, maybe
-from nbs_pin.base.checks import told, whole
+from nbs_pin.base.checks import PerJoint, told, whole
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.controllers.controller import CONTROLLER, Controller
+from nbs_pin.dynamics.momentum_observer import OBSERVER, MomentumObserver
 from nbs_pin.motions.approach import Approach
 from nbs_pin.motions.references import MOTION, DesiredMotion, at_times, check_reference
 from nbs_pin.robots.robot import ARM, Robot
@@ -95,6 +96,7 @@ class Live(NamedTuple):
     approach=flag,
     watch=maybe(function(1, "a function of what is seen at an instant, or None")),
     priority=flag,
+    observer=maybe(OBSERVER),
 )
 def drive(
     arm: ArmInterface,
@@ -107,6 +109,7 @@ def drive(
     approach: bool = True,
     watch: Callable[[Live], Any] | None = None,
     priority: bool = False,
+    observer: MomentumObserver | None = None,
 ) -> Driven:
     """Move an arm along a motion behind a guard, and stop it when the guard does, or on Ctrl-C.
 
@@ -124,6 +127,7 @@ def drive(
         watch: Called at every instant, with what must not take long; an exception of it stops the arm and is
             told in the run's `info`.
         priority: Ask the system for a real-time priority, which needs the right to have one.
+        observer: What estimates the torque from outside where the arm does not tell it, as in `Guarded`.
 
     Raises:
         ArgumentError: If arm, law and robot do not fit, the motion with its approach leaves the limits of the robot
@@ -149,7 +153,7 @@ def drive(
             " N·m/s; give Guard.for_robot the arm's torque_rate."
         )
     steps = whole(duration, arm.period, "duration", "period", 10**7)
-    here, guarded, led = arm.look(), Guarded(law, robot, guard), motion
+    here, guarded, led = arm.look(), Guarded(law, robot, guard, observer=observer), motion
     if approach:
         led = Approach.from_state(motion, robot, here.q)
         steps += math.ceil(led.lag / arm.period)
@@ -168,11 +172,12 @@ def _tells(sample: Sample) -> bool:
     return sample.fresh and bool(np.isfinite(sample.q).all() and np.isfinite(sample.v).all())
 
 
-def guard_for(arm: ArmInterface, robot: Robot, certificate: Certificate | None = None) -> Guard:
+def guard_for(
+    arm: ArmInterface, robot: Robot, certificate: Certificate | None = None, external_limit: PerJoint = np.inf
+) -> Guard:
     """The guard of `Guard.for_robot` with the period, the torque rate and the gravity of a driver."""
-    return Guard.for_robot(
-        robot, arm.period, certificate=certificate, torque_rate=arm.torque_rate, compensated=arm.compensated
-    )
+    settings = {"torque_rate": arm.torque_rate, "external_limit": external_limit, "compensated": arm.compensated}
+    return Guard.for_robot(robot, arm.period, certificate=certificate, **settings)
 
 
 class _Loop:

@@ -159,7 +159,7 @@ class Guard:
     error_limit: PerJoint = ERROR
     """|z1| beyond which the loop has diverged [rad]; a certificate's bounds are the natural choice."""
     external_limit: PerJoint = np.inf
-    """Largest torque from outside, where the arm or an observer tells it [N·m]."""
+    """Largest torque from outside [N·m], as the arm tells it, or else a `MomentumObserver`; inf for no check."""
     resolution: PerJoint = RESOLUTION
     """Encoder step [rad]: a reading that stays while the reference moves by two of them is frozen."""
     wraps: PerJoint = 0.0

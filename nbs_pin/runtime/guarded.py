@@ -14,11 +14,14 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import vector_of
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
+from nbs_pin.base.units import units_of
 from nbs_pin.controllers.controller import CONTROLLER, Controller, MemorylessController
+from nbs_pin.dynamics.momentum_observer import OBSERVER, MomentumObserver
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.kernels import guarding as at
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.runtime.guard import Counters, Fault, Guard, Mode
+from nbs_pin.runtime.outside import Outside
 
 LAST = 50
 """Samples of a report."""
@@ -119,9 +122,11 @@ class Guarded:
         robot: The arm, by whose model the guard holds it.
         guard: The limits; None takes `Guard.for_robot(robot)`.
         lookahead: How far ahead the law is evaluated [s], as in `simulate`; None is half a period.
+        observer: What estimates the torque from outside where the arm does not tell it, and its friction; None takes
+            `MomentumObserver.for_robot(robot)` if the guard has a finite `external_limit`, and none otherwise.
 
     Raises:
-        ArgumentError: If law, robot and guard are for different numbers of joints.
+        ArgumentError: If law, robot, guard and observer are for different numbers of joints.
 
     Example:
         >>> import numpy as np
@@ -139,9 +144,16 @@ class Guarded:
         robot=ARM,
         guard=maybe(a(Guard, "a Guard, such as Guard.for_robot(robot)")),
         lookahead=maybe(number(least=0.0, most=1.0, unit="s")),
+        observer=maybe(OBSERVER),
     )
     def __init__(
-        self, law: Controller, robot: Robot, guard: Guard | None = None, *, lookahead: float | None = None
+        self,
+        law: Controller,
+        robot: Robot,
+        guard: Guard | None = None,
+        *,
+        lookahead: float | None = None,
+        observer: MomentumObserver | None = None,
     ) -> None:
         self.guard = Guard.for_robot(robot) if guard is None else guard
         if not law.nv == robot.nv == self.guard.nv:
@@ -149,6 +161,11 @@ class Guarded:
                 f"the law has {law.nv} joints, the guard {self.guard.nv} and {robot.name} {robot.nv}; build all for one"
                 " arm."
             )
+        if observer is None and np.isfinite(self.guard.external_limit).any():
+            observer = MomentumObserver.for_robot(robot)
+        if observer is not None and observer.nv != robot.nv:
+            raise ArgumentError(f"the observer has {observer.nv} joints and {robot.name} {robot.nv}; give one for it.")
+        self._outside = None if observer is None else Outside(observer, self.guard)
         compiled = law.compile()
         self.law = compiled if isinstance(compiled, Controller) else law
         self.robot, self.lead = robot, 0.5 * self.guard.period if lookahead is None else lookahead
@@ -180,6 +197,8 @@ class Guarded:
         self._state = self.guard.begin(at_rest, now, self._model.gravity(at_rest))
         self._memory, self._count, self.report = self.law.initial_memory(at_rest), 0, None
         self._seen: deque[Seen] = deque(maxlen=LAST)
+        if self._outside is not None:
+            self._outside.begin()
 
     @property
     def state(self) -> np.ndarray:
@@ -234,10 +253,16 @@ class Guarded:
     def _step(self, sample: Sample, aim: Reference, overrun: bool, stop: bool) -> JointArray:
         state, config = self.state, self._config
         sample, aim = self._numbers(sample), Reference(*map(self._vector, aim))
+        watched = self._outside if sample.external is None and sample.fresh and state[at.MODE] < at.STOPPED else None
+        if watched is not None:
+            sent = self.guard.vector(state, at.TAU)
+            sample = sample._replace(external=watched.seen(sample.t, sample.q, sample.v, sent))
         external = self._nothing if sample.external is None else sample.external
         fault, trace = Fault.ARM if sample.fault else Fault.REQUESTED if stop else Fault.NONE, ""
         seen = sample.q, sample.v, aim.q, aim.v, external
         action = at.admit(config, state, sample.t, sample.fresh, bool(overrun), *seen)
+        if watched is not None and state[at.LOST] == 0.0:
+            watched.keep()
         command, gravity = self._unknown, self._unknown
         if action == at.COMPUTE and fault is Fault.NONE:
             try:
@@ -289,6 +314,10 @@ class Guarded:
     def _reported(self, sample: Sample, trace: str) -> FaultReport:
         code = Fault(int(self.state[at.CODE]))
         told = sample.fault if code is Fault.ARM else trace.strip().rsplit("\n", 1)[-1]
+        if code is Fault.EXTERNAL and sample.external is not None:
+            i = int(np.argmax(np.abs(sample.external) / self.guard.external_limit))
+            pushed, unit = sample.external[i], units_of(self.robot.prismatic)[i].torque
+            told = f"{self.robot.joint_names[i]}: {pushed:.3g} {unit}, limit {self.guard.external_limit[i]:.3g} {unit}"
         message = f"{code.sentence}{f' ({told})' if told else ''}"
         return FaultReport(code, float(self.state[at.AT]), message, trace, self.counters, tuple(self._seen))
 

@@ -18,7 +18,7 @@ RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
-    "FaultReport", "Mode", "Sample",
+    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -68,6 +68,9 @@ class Stock:
 
     def _friction(self) -> Any:
         return nbs.JointFriction([0.1, 0.1], [0.2, 0.1])
+
+    def _observer(self) -> Any:
+        return nbs.MomentumObserver(self.model)
 
     def _plant(self) -> Any:
         return nbs.DynamicsPlant(self.model)
@@ -174,7 +177,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "Encoders.of_bits": {"bits": 16},
         "Guard": {"effort_limit": [9.0, 9.0], "velocity_limit": 2.0, "lower": -1.0, "upper": 1.0, "damping": 1.0},
         "Guard.for_robot": {"torque_rate": 500.0, "certificate": None},
-        "Guarded": {"law": s.law, "lookahead": 0.001},
+        "Guarded": {"law": s.law, "lookahead": 0.001, "observer": s.observer},
         "Approach": {"motion": s.motion, "length": 1.0, "coefficients": np.zeros((6, 2)), "ramp": 1.0},
         "Approach.from_state": {"motion": s.motion, "length": None},
         "PlantArm": {"real_time": False, "disturbance": None},
@@ -191,6 +194,9 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "Payload": {"mass": 1.0, "radius": 0.1},
         "Uncertainty": {"inertia": 0.1, "payload": nbs.Payload(1.0)},
         "Uncertainty.errors": {"model": s.robot.model},
+        "MomentumObserver.step": {"memory": s.observer.initial(Q, V)},
+        "MomentumObserver.estimate": {"t": np.arange(3.0), **dict.fromkeys(("q", "v", "tau"), np.zeros((3, 2)))},
+        "ObservedTorques.save": {"path": s.folder / "observed.csv"},
         "Noise": {"encoder": 1e-4, "torque": 0.1},
         "TorqueAware": {"limit": 5.0, "rate": 0.02},
         "TimeOutside": {"threshold": 0.01, "pull": 0.1},
@@ -223,7 +229,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "Robot.with_tool": {"file": _TOOL, "frame": "tip", "xyz": [0.0, 0.0, 0.1], "rpy": [0.0, 0.0, 0.1]},
         "monitor": {"start": 0},
         "paper_controller": {"m": 0.001},
-        "plot_tracking": {"path": s.folder / "plot.png"},
+        "plot_tracking": {"path": s.folder / "plot.png", "external": s.observer.observe(s.run)},
         "propose": {"error": 0.1, "disturbance": [1.0, 1.0], "duration": 0.5, "periods": (0.01,)},
         "replay": {"path": s.folder / "replay.html"},
         "tool_motion": {"path": s.tool_path, "frame": "tip", "posture": BENT, "duration": 5.0},
@@ -264,6 +270,7 @@ def _subjects(s: Stock) -> dict[str, Any]:
         nbs.TimeOutside(), nbs.TorqueAware.for_robot(s.robot), nbs.TorqueNoise(1.0, 0.01), nbs.Uncertainty(0.1),
         nbs.Watch(s.certificate), s.tool_path, s.tool_motion, nbs.Margins(0.1),
         nbs.tool_errors(s.run, s.robot, "tip"), nbs.ChangingPlant(s.plant, [(0.005, nbs.MujocoPlant(s.robot))]),
+        nbs.tool_errors(s.run, s.robot, "tip"), s.observer, s.observer.observe(s.run),
     ]  # fmt: skip
     return {type(x).__name__: x for x in found} | {
         "CompiledController": s.law.compile(),

@@ -10,6 +10,7 @@ const SIGNALS = {
   torque: {chip: "torque", title: "torque", of: "torque", parts: [["tau"]], note: "applied"},
   saturation: {chip: "saturation", title: "torque asked for", unit: "% of the limit", parts: [["share", (x) => 100 * x]], line: 100, note: "above 100 % it is cut"},
   disturbance: {chip: "disturbance", title: "disturbance", of: "torque", parts: [["disturbance"]]},
+  external: {chip: "from outside", title: "torque from outside, by the momentum", of: "torque", parts: [["external"], ["disturbance", null, [6, 4]]], dashed: "simulated", note: "dashed: the simulated disturbance, if any"},
   tip: {chip: "tip", title: "tip, distance from the reference", log: true, unit: "mm", parts: [["tip", (x) => 1000 * x]]},
 };
 
@@ -89,8 +90,8 @@ function createCharts(root, runs, clock, shown, height) {
 
   function linesOf(signal, run, index) {   // label, colour, values and dashes of every line of a run
     const all = signal.parts[0][0] === "tip" ? tips : joints, picked = all === tips ? [tip] : [...chosen].sort((a, b) => a - b);
-    return picked.filter((k) => all[k].at[index] >= 0).flatMap((k) => signal.parts.map(([name, change, dash]) => ({
-      label: several ? run.label : all[k].name, dash: dash ?? (several && index > 9 ? [2, 2] : undefined),
+    return picked.filter((k) => all[k].at[index] >= 0).flatMap((k) => signal.parts.filter(([name, , dash]) => !dash || name !== "disturbance" || run.signals.disturbed).map(([name, change, dash]) => ({
+      label: several ? run.label : all[k].name, beside: signal.dashed ?? "reference", dash: dash ?? (several && index > 9 ? [2, 2] : undefined),
       colour: several ? colour(index) : all === tips ? themed("--ink") : colour(k), unit: signal.unit ?? run.joints[all[k].at[index]][signal.of],
       values: run.column(name, all[k].at[index]).map((x) => (x = change ? change(x) : x, signal.log && !(x > 0) ? null : x)),
       width: dash ? 1 : 1.3,
@@ -207,7 +208,7 @@ function createCharts(root, runs, clock, shown, height) {
       if (value === null || value === undefined || line.dash && several) return;
       const row = tooltip.appendChild(document.createElement("div"));
       Object.assign(row.appendChild(document.createElement("span")), {className: "swatch"}).style.background = line.colour;
-      row.append(line.label + (line.dash ? " (reference)" : ""));
+      row.append(line.label + (line.dash ? ` (${line.beside})` : ""));
       const also = beside(value, line.unit);
       row.appendChild(document.createElement("span")).textContent = `${told(value)} ${line.unit}${also ? ` (${also})` : ""}`;
     });
