@@ -42,7 +42,7 @@ class AdaptiveLaw(Controller, nn.Module):
     τ = law + Y(q, v, v_r, a_r)(π̂ − π_model). Every unknown body has P̂ = K X̂ Kᵀ with X̂ = (1 + e^−Q)⁻¹, which every
     symmetric Q makes a body that can exist, and Q̇ = −γ KᵀLK − σ(Q − Q₀), tr(LP) = z2ᵀY(P). With the Fermi–Dirac
     divergence d of X from X̂, V_a = V + Σ d/γ decreases as V does where the model is exact, for every weight of the law
-    (docs/theory.md §9). While a torque is at the effort limit the estimates wait.
+    (docs/theory.md §10). While a torque is at the effort limit the estimates wait.
 
     Args:
         law: A law with a Lyapunov function, such as NeuralBackstepping, with the model that is believed at first.

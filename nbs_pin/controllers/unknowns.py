@@ -1,7 +1,7 @@
 """What an adaptive law does not know of an arm: bodies between nothing and a largest one, and numbers of its joints.
 
 A body has the pseudo-inertia P = K X Kᵀ with 0 ≺ X ≺ 1: it can exist, and is less than the largest body P̄ = KKᵀ. A
-number is lowest + width·x with 0 < x < 1 (docs/theory.md §9).
+number is lowest + width·x with 0 < x < 1 (docs/theory.md §10).
 """
 
 from collections.abc import Sequence

@@ -22,7 +22,7 @@ def update_rates(
     """γ of every unknown [1/J]: a step of all costs at most `gain` times z2ᵀ(ωM + D₀)z2 in usual motions.
 
     A step from Q to Q − γhS costs (γh)²‖S‖²/8 of divergence, as the conjugate of the Fermi–Dirac entropy,
-    tr log(1 + e^Q), has a Hessian ≤ ¼, so Σ γh‖S‖²/8 of V̇ (docs/theory.md §9). S is linear in z2: with
+    tr log(1 + e^Q), has a Hessian ≤ ¼, so Σ γh‖S‖²/8 of V̇ (docs/theory.md §10). S is linear in z2: with
     ℓ² = max λ(SᵀS, ωM + D₀) for every unknown, shares s and λ = max λ(Σ s SᵀS/ℓ², ωM + D₀), γ = gain·8s/(h ℓ² λ). The
     largest are over sampled poses, velocities up to a quarter of the limits and accelerations that reach the limits in
     half a second.

@@ -6,7 +6,7 @@ For a body with the pseudo-inertia P = ∫ (x, 1)(x, 1)ᵀ dm the power of the t
 
     μᵀτ = tr(U P Aᵀ) = tr(L P),  L = ½(UᵀA + AᵀU),
 
-with the Christoffel C, as ∂_iT and ∂_i∂_jT are the derivatives of an embedding whose metric is M (docs/theory.md §9).
+with the Christoffel C, as ∂_iT and ∂_i∂_jT are the derivatives of an embedding whose metric is M (docs/theory.md §10).
 """
 
 from collections.abc import Sequence
