@@ -33,8 +33,8 @@ class Estimate(Shown):
         >>> import nbs_pin as nbs
         >>> law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(nbs.load_robot("panda")), load_mass=4.0)
         >>> estimate = law.estimate()
-        >>> bool(abs(estimate.load_mass) < 1e-9), estimate.load_centre
-        (True, array([0., 0., 0.]))
+        >>> bool(abs(estimate.load_mass) < 1e-9), estimate.names[0]
+        (True, 'load at panda_hand_tcp m [kg]')
         >>> estimate.dynamics().robot.name
         'panda'
     """
