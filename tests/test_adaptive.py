@@ -38,7 +38,7 @@ def stirred(law, batch, seed=0):
     rng, zero = np.random.default_rng(seed), np.zeros((*batch, law.nv))
     memory = law.initial_memory(zero)
     duals = memory.duals + rng.normal(size=memory.duals.shape)
-    return memory._replace(duals=duals, z2=rng.normal(size=zero.shape), before=rng.normal(size=zero.shape))
+    return memory._replace(duals=duals, output=rng.normal(size=zero.shape), before=rng.normal(size=zero.shape))
 
 
 def fields_of(robot, q, v, w, a):
@@ -73,6 +73,41 @@ def test_the_kernel_is_the_law(robot, adapts):
         np.testing.assert_allclose(found, tau, rtol=0.0, atol=1e-12 * np.abs(tau).max())
         for x, y in zip(theirs, ours, strict=True):
             np.testing.assert_allclose(x, y, rtol=0.0, atol=1e-11 * np.abs(y).max())
+
+
+OTHERS = {
+    "SlotineLi": nbs.SlotineLi.for_robot,
+    "PD+": nbs.PD.for_robot,
+    "PD": lambda robot: nbs.PD.for_robot(robot, feedforward="gravity"),
+    "ComputedTorque": nbs.ComputedTorque.for_robot,
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_kernel_is_the_law_with_integral_action(robot, name):
+    law = nbs.AdaptiveLaw(OTHERS[name](robot), ["offsets"])
+    compiled, rng = law.compile(), np.random.default_rng(2)
+    ours = theirs = stirred(law, (2,))
+    for _ in range(3):
+        q, v, *aim = 0.1 * rng.normal(size=(5, 2, law.nv))
+        tau, ours = law.step(ours, q, v, Reference(*aim), 0.001)
+        found, theirs = compiled.step(theirs, q, v, Reference(*aim), 0.001)
+        np.testing.assert_allclose(found, tau, rtol=0.0, atol=1e-12 * np.abs(tau).max())
+        for x, y in zip(theirs, ours, strict=True):
+            np.testing.assert_allclose(x, y, rtol=0.0, atol=1e-10 * np.abs(y).max())
+
+
+@pytest.mark.parametrize("name", ["NeuralBackstepping", *OTHERS])
+def test_integral_action_leaves_no_steady_error(name):
+    """Constant torques on every joint: without it the error stays, with it every law ends within 1e-6 rad."""
+    robot, torque = nbs.load_robot("two_link"), np.array([5.0, -5.0])
+    inner = OTHERS.get(name, nbs.NeuralBackstepping.for_robot)(robot)
+    plant, errors = nbs.DynamicsPlant.for_robot(robot), []
+    for law in (inner, nbs.AdaptiveLaw(inner, ["offsets"])):
+        run = nbs.simulate(plant, law, nbs.Hold([0.3, 0.2]), 10.0, 0.001, disturbance=nbs.ConstantTorque(torque))
+        errors.append(np.abs(run.q - run.q_ref)[-100:].max())
+    assert errors[0] > 1e-3
+    assert errors[1] < 1e-6
 
 
 @pytest.mark.parametrize("adapts", KINDS, ids="+".join)
@@ -249,6 +284,8 @@ def test_wrong_settings_are_refused():
         nbs.AdaptiveLaw(inner, frame="nothing")
     with pytest.raises(ArgumentError, match="no joint 'nothing'"):
         nbs.AdaptiveLaw(inner, ["links"], links=["nothing"])
+    with pytest.raises(ArgumentError, match=r"expected \['offsets'\]"):
+        nbs.AdaptiveLaw(nbs.PD.for_robot(robot), ["load"])
     with pytest.raises(ArgumentError, match="gain is 1"):
         nbs.AdaptiveLaw(inner, gain=1.0)
     with pytest.raises(ArgumentError, match="cannot adapt a Foreign"):

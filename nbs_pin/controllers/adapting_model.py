@@ -1,5 +1,6 @@
 """The model of an adaptive law at one instant: its torque beyond the believed model, and how its estimates move."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -64,6 +65,7 @@ class AdaptingModel:
             NumberCode.COULOMB: xp.tanh(v_r / unknowns.transition),
             NumberCode.ROTOR: a_r,
             NumberCode.OFFSET: 1.0 + 0.0 * q,
+            NumberCode.ACCELERATION: 1.0 + 0.0 * q,
         }
         columns = [kinds[number.code][..., number.joint] for number in unknowns.numbers]
         factors = xp.stack(columns, axis=-1) if columns else 0.0 * q[..., :0]
@@ -77,13 +79,25 @@ class AdaptingModel:
             factor, known = (constant_like(self.factors, x) for x in (body.factor, body.known))
             excess = factor @ self.shares.bodies[..., k, :, :] @ factor.T - known
             bodies[body.joint] = excess if bodies[body.joint] is None else bodies[body.joint] + excess
+        return self.fields.torque(bodies) + self._excess(lambda code: code != NumberCode.ACCELERATION)
+
+    def accelerations(self) -> Array:
+        """What the estimates add to the acceleration a_r, (..., n)."""
+        return self._excess(lambda code: code == NumberCode.ACCELERATION)
+
+    def _excess(self, chosen: Callable[[NumberCode], bool]) -> Array:
+        """What chosen numbers add beyond the known ones, per joint."""
         numbers = self.unknowns.numbers
-        lowest, width, known = (
-            constant_like(self.factors, np.array([getattr(number, name) for number in numbers], dtype=float))
-            for name in ("lowest", "width", "known")
+        lowest, width, known, picked = (
+            (
+                constant_like(self.factors, np.array(x, dtype=float))
+                for x in zip(*((one.lowest, one.width, one.known, chosen(one.code)) for one in numbers), strict=True)
+            )
+            if numbers
+            else 4 * (0.0 * self.factors,)
         )
-        torques = (lowest + width * self.shares.numbers - known) * self.factors
-        return self.fields.torque(bodies) + torques @ constant_like(self.factors, self._joints())
+        added = (lowest + width * self.shares.numbers - known) * picked * self.factors
+        return added @ constant_like(self.factors, self._joints())
 
     def slopes(self, mu: Array) -> Duals:
         """The derivatives KᵀLK of μᵀτ by X̂ of every body, and by x of every number."""

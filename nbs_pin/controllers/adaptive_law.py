@@ -1,4 +1,4 @@
-"""A law with a Lyapunov function whose model adapts to the arm: an unknown load, links, friction, rotors, offsets."""
+"""A law whose model adapts to the arm: an unknown load, links, friction, rotors, constant torques."""
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -8,7 +8,7 @@ import numpy as np
 from torch import nn
 
 from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, maybe, number, numbers, text, texts
-from nbs_pin.base.arrays import Array, Vectors, array_namespace, as_vectors, constant_like, finite_result
+from nbs_pin.base.arrays import Array, Vectors, array_namespace, as_vectors, constant_like, finite_result, matvec
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import defines
@@ -16,11 +16,20 @@ from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import joints_told
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.adapting_model import AdaptingModel
-from nbs_pin.controllers.compiled_adaptive import AdaptiveMemory, CompiledAdaptiveLaw, checked_period, read_memory
+from nbs_pin.controllers.compiled_adaptive import (
+    MEMORY,
+    AdaptiveMemory,
+    CompiledAdaptiveLaw,
+    checked_period,
+    read_memory,
+)
+from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.estimates import Estimate
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
+from nbs_pin.controllers.passive_outputs import output_of, signals_of
 from nbs_pin.controllers.unknowns import ADAPTS, Unknowns, unknown_links, unknown_load, unknown_numbers
 from nbs_pin.controllers.update_rates import update_rates
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
@@ -35,7 +44,10 @@ _LOAD = 0.25  # largest load as a share of the arm's mass
 _TRANSITION = 0.01  # speed scale of Coulomb friction where the law feeds none forward [rad/s]
 
 
-@storable(("adapts", "frame", "links", "load_mass", "load_radius", "gain", "leak", "period", "rates"), parts=("law",))
+@storable(
+    ("adapts", "frame", "links", "load_mass", "load_radius", "gain", "leak", "period", "rates", "output_rate"),
+    parts=("law",),
+)
 class AdaptiveLaw(Controller, nn.Module):
     """A backstepping or sliding law whose model learns what it does not know while the arm moves.
 
@@ -45,8 +57,10 @@ class AdaptiveLaw(Controller, nn.Module):
     (docs/theory.md §10). While a torque is at the effort limit the estimates wait.
 
     Args:
-        law: A law with a Lyapunov function, such as NeuralBackstepping, with the model that is believed at first.
-        adapts: Any of "load", "links", "friction", "rotors", "offsets" (constant torques: integral action).
+        law: A law with a Lyapunov function, such as NeuralBackstepping, with the model that is believed at first; or PD
+            or ComputedTorque, which adapt "offsets" alone.
+        adapts: Any of "load", "links", "friction", "rotors", "offsets" (constant torques, of ComputedTorque constant
+            accelerations: integral action).
         frame: Link that carries the load; None takes the arm's end.
         links: Joints whose bodies adapt with "links"; none takes all.
         load_mass: Largest load [kg]; None takes a quarter of the arm's mass.
@@ -56,9 +70,10 @@ class AdaptiveLaw(Controller, nn.Module):
         leak: σ [1/s], at which estimates return to the first ones; 0 for none.
         period: Longest control period h [s] that γ is stable for.
         rates: γ of every unknown, in place of those that `gain` gives.
+        output_rate: ε or λ [1/s] of PD and ComputedTorque (`passive_outputs.py`), (n,); None takes it from their gains.
 
     Raises:
-        ArgumentError: For a law without a Lyapunov function or an arm, an unknown name, or a number out of range.
+        ArgumentError: For a law without an arm or a passive output, an unknown name, or a number out of range.
 
     Example:
         >>> import nbs_pin as nbs
@@ -70,7 +85,7 @@ class AdaptiveLaw(Controller, nn.Module):
     """
 
     @checked(
-        law=a(LyapunovLaw, "a law with a Lyapunov function, such as NeuralBackstepping.for_robot(robot)"),
+        law=a(ModelLaw, "a law with a model, such as NeuralBackstepping.for_robot(robot)"),
         adapts=texts,
         frame=maybe(text),
         load_mass=maybe(number(above=0.0, unit="kg")),
@@ -81,7 +96,7 @@ class AdaptiveLaw(Controller, nn.Module):
     )
     def __init__(
         self,
-        law: LyapunovLaw,
+        law: ModelLaw,
         adapts: Sequence[str] = ("load",),
         *,
         frame: str | None = None,
@@ -92,6 +107,7 @@ class AdaptiveLaw(Controller, nn.Module):
         leak: float = 0.0,
         period: float = 0.001,
         rates: Any = None,
+        output_rate: Any = None,
     ) -> None:
         super().__init__()
         robot = law.dynamics.robot
@@ -100,12 +116,18 @@ class AdaptiveLaw(Controller, nn.Module):
         wrong = [name for name in adapts if name not in ADAPTS]
         if wrong or not len(adapts) or len(set(adapts)) < len(adapts):
             raise ArgumentError(f"AdaptiveLaw: adapts is {told(list(adapts))}; give some of {', '.join(ADAPTS)}, once.")
+        if not isinstance(law, LyapunovLaw) and tuple(adapts) != ("offsets",):
+            raise ArgumentError(
+                f"AdaptiveLaw: a {type(law).__name__} was given adapts={told(list(adapts))}, expected ['offsets'] for a"
+                " law without a Lyapunov function; give that, or NeuralBackstepping."
+            )
         self.law, self.robot = law, robot
         self.adapts, self.frame, self.links = tuple(map(str, adapts)), frame, tuple(map(str, links))
         mass = sum(body.mass for body in list(robot.model.inertias)[1:])
         self.load_mass = _LOAD * mass if load_mass is None else load_mass
         self.load_radius, self.gain, self.leak, self.period = load_radius, gain, leak, period
-        self.rates = self._rates(rates)
+        self.output = output_of(law, output_rate)
+        self.output_rate, self.rates = self.output.rate, self._rates(rates)
 
     @classmethod
     @checked(robot=ARM, dynamics=maybe(MODEL), bandwidth=BANDWIDTH, period=PERIOD, friction=maybe(FRICTION), seed=SEED)
@@ -146,7 +168,7 @@ class AdaptiveLaw(Controller, nn.Module):
             bodies += [body for body in unknown_links(robot, tree, self.links) if body.joint not in carrying]
         for kind in self.adapts:
             if kind not in ("load", "links"):
-                own += unknown_numbers(robot, friction, tree, kind, self.period)
+                own += unknown_numbers(robot, friction, tree, kind, self.period, isinstance(self.law, ComputedTorque))
         return Unknowns(tuple(bodies), tuple(own), _TRANSITION if friction is None else friction.transition)
 
     @cached_property
@@ -165,7 +187,7 @@ class AdaptiveLaw(Controller, nn.Module):
 
     def _rates(self, rates: Any) -> np.ndarray:
         if rates is None:
-            return update_rates(self.law, self.unknowns, *self._tree, gain=self.gain, period=self.period)
+            return update_rates(self.law, self.output, self.unknowns, *self._tree, gain=self.gain, period=self.period)
         count = len(self.unknowns.bodies) + len(self.unknowns.numbers)
         return np.array(numbers(count, least=0.0, unit="1/J")("AdaptiveLaw: rates", rates))
 
@@ -175,13 +197,15 @@ class AdaptiveLaw(Controller, nn.Module):
         zero = 0.0 * q
         return AdaptiveMemory(constant_like(q, self.unknowns.start) + zero[..., :1], zero, zero)
 
+    @checked(memory=MEMORY)
     def recorded(self, memory: AdaptiveMemory) -> Array:
         """The duals."""
         return memory.duals
 
     def estimates(self, recorded: np.ndarray) -> tuple[np.ndarray, list[str]]:
         """`Estimate.values` of these duals, and its names."""
-        found = Estimate.of_duals(self.robot, self._believed, self.unknowns, recorded)
+        (duals,) = as_vectors(len(self.unknowns.start), recorded=recorded)
+        found = Estimate.of_duals(self.robot, self._believed, self.unknowns, np.asarray(duals, dtype=float))
         return found.values, found.names
 
     def step(
@@ -194,16 +218,17 @@ class AdaptiveLaw(Controller, nn.Module):
         """
         period = checked_period(period, self.period)
         duals, given = read_memory(memory, self.unknowns.start.size, self.nv, q, v, reference)
-        z2_last, z2_before, q, v, *aim = given
-        e = self.law.errors(q, v, *aim)
-        a_r = e.a_r - self.law.inertial_rate * e.z2
-        now = self._now(duals, q, v, e.v_r, a_r)
+        last, before, q, v, *aim = given
+        v_r, a_r, output = signals_of(self.law, self.output, q, v, *aim)
+        now = self._now(duals, q, v, v_r, a_r)
         tau = self.law.torque(q, v, *aim) + now.torque()
+        if isinstance(self.law, ComputedTorque):
+            tau = tau + matvec(self.law.dynamics.mass_matrix(q), now.accelerations())
         tau = finite_result("the torque", tau, *given, duals)
         xp = array_namespace(q)
         free = xp.all(abs(tau) <= constant_like(q, self.robot.effort_limit), axis=-1)[..., None]
-        after = xp.where(free, now.moved(z2_before, self.rates, self.leak, period), now.duals.flat())
-        return tau, AdaptiveMemory(after, e.z2, z2_last)
+        after = xp.where(free, now.moved(before, self.rates, self.leak, period), now.duals.flat())
+        return tau, AdaptiveMemory(after, output, last)
 
     def _now(self, duals: Array, q: Array, v: Array, v_r: Array, a_r: Array) -> AdaptingModel:
         return AdaptingModel.of(self.unknowns, *self._tree, duals, q, v, v_r, a_r)
@@ -215,7 +240,8 @@ class AdaptiveLaw(Controller, nn.Module):
         """
         known = self.robot, self._believed, self.unknowns
         if recorded is None or isinstance(recorded, AdaptiveMemory):
-            duals = self.unknowns.start if recorded is None else recorded.duals
+            given = self.unknowns.start if recorded is None else recorded.duals
+            (duals,) = as_vectors(len(self.unknowns.start), duals=given)
             return Estimate.of_duals(*known, np.asarray(duals, dtype=float))
         (values,) = as_vectors(len(self.unknowns.start), estimates=recorded)
         return Estimate(*known, values)
@@ -224,7 +250,7 @@ class AdaptiveLaw(Controller, nn.Module):
         """The law as machine code (`Controller.compile`); itself for a subclass, or around a law that has none."""
         if not (defines(self, "compile") and self.law.packable):
             return self
-        settings = self.rates, self.leak, self.period
+        settings = self.rates, self.leak, self.period, self.output
         return CompiledAdaptiveLaw(self.law.packed_law(), self._believed, self.unknowns, *settings, self.robot)
 
 

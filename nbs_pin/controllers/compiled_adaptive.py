@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.arguments import PERIOD
+from nbs_pin.base.arguments import PERIOD, a, checked
 from nbs_pin.base.arrays import Array, Vectors, as_vectors, finite_result, is_torch_array
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
@@ -14,6 +14,7 @@ from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import joints_told
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.estimates import Estimate
+from nbs_pin.controllers.passive_outputs import Output
 from nbs_pin.controllers.unknowns import Unknowns
 from nbs_pin.kernels.adaptation import adaptive_law, adaptive_workspace, compile_adaptive_law, pack_adaptive
 from nbs_pin.kernels.jit import NOT_TAKEN
@@ -29,10 +30,14 @@ class AdaptiveMemory(NamedTuple):
 
     duals: Array
     """Q of every unknown body, ten numbers each, then the dual of every unknown number, (..., m)."""
-    z2: Array
-    """z2 of the last instant [rad/s], (..., n)."""
+    output: Array
+    """What drives adaptation (`passive_outputs.py`) at the last instant, z2 [rad/s] for most laws, (..., n)."""
     before: Array
-    """z2 of the one before: encoder noise in it is independent of that in today's acceleration."""
+    """The same one instant before: encoder noise in it is independent of that in today's acceleration."""
+
+
+MEMORY = a(AdaptiveMemory, "what initial_memory or step returned")
+"""The check of an argument that is a memory of an adaptive law."""
 
 
 class CompiledAdaptiveLaw(Controller):
@@ -45,16 +50,17 @@ class CompiledAdaptiveLaw(Controller):
         rates: γ of every unknown.
         leak: σ [1/s].
         period: Longest control period [s].
+        output: What drives adaptation.
         robot: The arm, beyond whose effort limits the estimates wait.
     """
 
     def __init__(
         self, law: Packed, tree: Packed, unknowns: Unknowns, rates: Float[np.ndarray, " unknowns"], leak: float,
-        period: float, robot: Robot,
+        period: float, output: Output, robot: Robot,
     ) -> None:  # fmt: skip
-        self._given = law, tree, unknowns, rates, leak, period, robot
+        self._given = law, tree, unknowns, rates, leak, period, output, robot
         compile_adaptive_law()
-        self._packed = tuple(pack_adaptive(law, tree, unknowns.packed(rates, leak)))
+        self._packed = tuple(pack_adaptive(law, tree, unknowns.packed(rates, leak, output)))
         self._start, self._limit, self._period = unknowns.start, robot.effort_limit, period
         self._scratch = Scratch(adaptive_workspace(law, tree))
 
@@ -84,6 +90,7 @@ class CompiledAdaptiveLaw(Controller):
         _numpy(q)
         return AdaptiveMemory(self._start + 0.0 * q[..., :1], np.zeros_like(q), np.zeros_like(q))
 
+    @checked(memory=MEMORY)
     def recorded(self, memory: AdaptiveMemory) -> Array:
         """The duals."""
         return memory.duals
@@ -91,7 +98,8 @@ class CompiledAdaptiveLaw(Controller):
     def estimates(self, recorded: np.ndarray) -> tuple[np.ndarray, list[str]]:
         """`Estimate.values` of these duals, and its names."""
         _, tree, unknowns, *_, robot = self._given
-        found = Estimate.of_duals(robot, tree, unknowns, recorded)
+        (duals,) = as_vectors(len(self._start), recorded=recorded)
+        found = Estimate.of_duals(robot, tree, unknowns, np.asarray(duals, dtype=float))
         return found.values, found.names
 
     def step(
@@ -101,22 +109,22 @@ class CompiledAdaptiveLaw(Controller):
         if type(period) is not float or not 0.0 < period <= self._period:
             period = checked_period(period, self._period)
         if isinstance(q, np.ndarray) and q.ndim == 1:
-            tau, z2, duals = np.empty(self.nv), np.empty(self.nv), np.empty(len(self._start))
+            tau, output, duals = np.empty(self.nv), np.empty(self.nv), np.empty(len(self._start))
             try:
-                fits = self._into(memory, (q, v, reference.q, reference.v, reference.a), period, tau, duals, z2)
+                fits = self._into(memory, (q, v, reference.q, reference.v, reference.a), period, tau, duals, output)
             except (AttributeError, *NOT_TAKEN):  # not all contiguous float64 vectors: converted and checked below
                 fits = False
             if fits:
-                return tau, AdaptiveMemory(duals, z2, memory.z2)
+                return tau, AdaptiveMemory(duals, output, memory.output)
         return self._steps(memory, q, v, reference, period)
 
     def _into(
-        self, memory: AdaptiveMemory, state: tuple[Array, ...], period: float, tau: Array, duals: Array, z2: Array
+        self, memory: AdaptiveMemory, state: tuple[Array, ...], period: float, tau: Array, duals: Array, output: Array
     ) -> bool:
-        """Write torque, duals and z2 of the states laid end to end; False unless all fit and are finite."""
+        """Write torque, duals and output of the states laid end to end; False unless all fit and are finite."""
         work = self._scratch.take()
         fits: bool = adaptive_law(
-            memory.duals, memory.before, *state, period, self._limit, *self._packed, work, tau, duals, z2
+            memory.duals, memory.before, *state, period, self._limit, *self._packed, work, tau, duals, output
         )
         self._scratch.give(work)
         return fits
@@ -127,11 +135,11 @@ class CompiledAdaptiveLaw(Controller):
         duals, given = read_memory(memory, len(self._start), self.nv, q, v, reference)
         _numpy(given[0])
         last, before, *state = (np.array(x, dtype=float) for x in given)
-        tau, z2, after = np.empty(last.shape), np.empty(last.shape), np.empty(duals.shape)
+        tau, output, after = np.empty(last.shape), np.empty(last.shape), np.empty(duals.shape)
         rows = tuple(x.ravel() for x in state)
         flat = AdaptiveMemory(np.array(duals, dtype=float).ravel(), last.ravel(), before.ravel())
-        self._into(flat, rows, period, tau.reshape(-1), after.reshape(-1), z2.reshape(-1))
-        return finite_result("the torque", tau, *given, duals), AdaptiveMemory(after, z2, last)
+        self._into(flat, rows, period, tau.reshape(-1), after.reshape(-1), output.reshape(-1))
+        return finite_result("the torque", tau, *given, duals), AdaptiveMemory(after, output, last)
 
 
 def checked_period(period: Any, longest: float) -> float:
@@ -148,14 +156,14 @@ def checked_period(period: Any, longest: float) -> float:
 def read_memory(
     memory: AdaptiveMemory, count: int, nv: int, q: Array, v: Array, reference: Reference
 ) -> tuple[Array, tuple[Array, ...]]:
-    """The duals (..., count), and z2, the z2 before it, q, v and the reference's q, v, a as arrays of one shape."""
+    """The duals (..., count); and output, the one before it, q, v, the reference's q, v, a as arrays of one shape."""
     if not isinstance(memory, AdaptiveMemory):
         raise ArgumentError(f"memory is {told(memory)}, expected what initial_memory or step returned; give that.")
     try:
         aim = {"q_ref": reference.q, "v_ref": reference.v, "a_ref": reference.a}
     except AttributeError as error:
         raise ArgumentError(f"reference is {told(reference)}, expected a Reference of q, v and a.") from error
-    given = as_vectors(nv, z2=memory.z2, before=memory.before, q=q, v=v, **aim)
+    given = as_vectors(nv, output=memory.output, before=memory.before, q=q, v=v, **aim)
     (duals,) = as_vectors(count, duals=memory.duals)
     if is_torch_array(duals) != is_torch_array(given[0]) or duals.shape[:-1] != given[0].shape[:-1]:
         raise ArgumentError(

@@ -9,7 +9,7 @@ import numpy as np
 
 from nbs_pin.base.arguments import PERIOD, a, checked, choice, flag, joints, path
 from nbs_pin.base.arrays import Array, Vectors
-from nbs_pin.base.checks import PerJoint, told
+from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import Shown, joints_told
@@ -53,8 +53,9 @@ class Controller(Shown, ABC):
         return None
 
     def estimates(self, recorded: np.ndarray) -> tuple[np.ndarray, list[str]]:
-        """What was `recorded` (rows, ..., m) in units of the arm, (rows, ..., k), and the names of the k numbers."""
-        raise NotImplementedError
+        """What was `recorded` (rows, ..., m) in the units of the arm (rows, ..., k), and names of the k numbers."""
+        numbers = np.atleast_1d(floats("recorded", recorded))
+        return numbers, [f"number {k + 1}" for k in range(numbers.shape[-1])]
 
     @property
     def packable(self) -> bool:

@@ -73,6 +73,7 @@ class Estimate(Shown):
             NumberCode.COULOMB: ("Coulomb friction", "torque"),
             NumberCode.ROTOR: ("rotor inertia", "inertia"),
             NumberCode.OFFSET: ("constant torque", "torque"),
+            NumberCode.ACCELERATION: ("constant acceleration", "acceleration"),
         }
         own = []
         for number in self.unknowns.numbers:

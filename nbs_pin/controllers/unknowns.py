@@ -31,7 +31,7 @@ _UPPER = np.triu_indices(4)
 _LEAST_SHARE = 1e-4  # what every direction of a body begins with, where the model has less, as a share of the largest
 _REACH = 2.0  # a link's largest body, as a multiple of the one that the model has
 _LENGTH, _SPREAD = 0.05, 0.02  # what a link's largest body has besides, so that a point mass is within it [m, share]
-_FRICTION = 0.1  # largest Coulomb friction and offset, as a share of the effort limit
+_FRICTION = 0.1  # largest Coulomb friction as a share of the effort limit
 _BEND = 1e-5  # friction may seem to be below zero by what bends a joint by this much [rad, m]
 _ROTOR, _LIGHTER = 0.25, 0.2  # largest rotor, of the arm's largest inertia; how much lighter the joints may seem
 _ANY = 1e-3  # a bandwidth [rad/s], on which the stiffness does not depend
@@ -84,10 +84,10 @@ class Unknowns(NamedTuple):
         own = [body.start[_UPPER] for body in self.bodies]
         return np.concatenate([*own, [number.start for number in self.numbers]])
 
-    def packed(self, rates: np.ndarray, leak: float) -> Packed:
-        """For `kernels/adaptation.py`; rates γ of every body, then every number."""
-        layout = [len(self.bodies), len(self.numbers), *(body.joint for body in self.bodies)]
-        weights = [np.array([leak, self.transition])]
+    def packed(self, rates: np.ndarray, leak: float, output: tuple[int, np.ndarray]) -> Packed:
+        """For `kernels/adaptation.py`: rates γ of every body, then every number; code and numbers of the output."""
+        layout = [len(self.bodies), len(self.numbers), output[0], *(body.joint for body in self.bodies)]
+        weights = [np.array([leak, self.transition]), output[1]]
         for body, rate in zip(self.bodies, rates, strict=False):
             p = body.known
             known = [p[3, 3], *p[:3, 3], *p[:3, :3][np.triu_indices(3)]]
@@ -152,14 +152,19 @@ def _between(
 
 
 def unknown_numbers(
-    robot: Robot, friction: JointFriction | None, tree: Packed, kind: str, period: float
+    robot: Robot, friction: JointFriction | None, tree: Packed, kind: str, period: float, accelerates: bool
 ) -> list[UnknownNumber]:
-    """Friction, rotor inertia or offset of every joint, which begin as what the law has."""
+    """Friction, rotor inertia or offset of every joint, which begin as what the law has.
+
+    accelerates: whether offsets are accelerations, as of computed torque.
+    """
     effort = np.where(np.isfinite(robot.effort_limit), robot.effort_limit, _UNLIMITED)
     speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, _FAST)
     n, zero, largest, dynamics = robot.nv, np.zeros(robot.nv), _FRICTION * effort, PinocchioDynamics(robot)
     if kind == "offsets":
-        return [UnknownNumber(NumberCode.OFFSET, i, -x, 2.0 * x, 0.0, 0.0) for i, x in enumerate(largest)]
+        code = NumberCode.ACCELERATION if accelerates else NumberCode.OFFSET
+        most = effort / effective_inertia(robot, dynamics) if accelerates else effort
+        return [UnknownNumber(code, i, -x, 2.0 * x, 0.0, 0.0) for i, x in enumerate(most)]
     if kind == "friction":
         own = (zero, zero) if friction is None else (friction.viscous, friction.coulomb)
         below = _BEND * gains_for_robot(robot, dynamics, bandwidth=_ANY, period=period).stiffness

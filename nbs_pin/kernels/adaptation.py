@@ -3,9 +3,9 @@
 A body that is not known has P = K X Kᵀ, 0 ≺ X ≺ 1, in place of a known one in the frame of a joint's body, and X the
 dual Q = log X(1 − X)⁻¹. A number that is not known is lowest + width·x, 0 < x < 1, with the dual log x/(1 − x).
 
-    unknown layout     bodies, numbers, then per body: joint, then per number: its `NumberCode`, joint
-    unknown weights    σ, transition, then per body: K (16), Q₀ (10), the known m, h (3), E (6), γ, then per number:
-                       lowest, width, dual₀, the known value, γ
+    unknown layout     bodies, numbers, `OutputCode`, then per body: joint, then per number: its `NumberCode`, joint
+    unknown weights    σ, transition, ε or λ of the output (n), then per body: K (16), Q₀ (10), the known
+                       m, h (3), E (6), γ, then per number: lowest, width, dual₀, the known value, γ
     memory             per body Q (10), then per number its dual
 """
 
@@ -16,20 +16,20 @@ from numba import boolean, float64, int64
 
 from nbs_pin.kernels import layout as at
 from nbs_pin.kernels.jit import compile_for, inlined, kernel
-from nbs_pin.kernels.laws import fit, is_finite, law_workspace, pack_tree_law, signals_of
-from nbs_pin.kernels.layout import NumberCode, Packed
+from nbs_pin.kernels.laws import difference, fit, is_finite, law_workspace, pack_tree_law, signals_of
+from nbs_pin.kernels.layout import NumberCode, OutputCode, Packed
 from nbs_pin.kernels.records import Motion, Signals, State, Target, Vec
 from nbs_pin.kernels.symmetric4 import FARTHEST, TRIANGLE, congruent, congruent_back, logistic
 from nbs_pin.kernels.tree_bodies import joint_of
 from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY, MASS
 from nbs_pin.kernels.tree_parameters import COLUMNS, INERTIA, inertia_bars
 from nbs_pin.kernels.trees import spread, tree_torque
-from nbs_pin.kernels.views import row, take, take3
+from nbs_pin.kernels.views import row, take, take3, vector
 
-BODIES, NUMBERS, UNKNOWN = range(3)
-"""Where the counts lie in the layout, and where the list of unknowns begins."""
-LEAK, TRANSITION, FIRST_BODY = range(3)
-"""Where σ and the transition speed lie in the weights, and where the first body begins."""
+BODIES, NUMBERS, OUTPUT, UNKNOWN = range(4)
+"""Where the counts and the kind of the output lie in the layout, and where the list of unknowns begins."""
+LEAK, TRANSITION, OUTPUT_RATE = range(3)
+"""Where σ, the transition speed and the numbers of the output lie in the weights; bodies follow these n numbers."""
 START, KNOWN, BODY_RATE, PER_BODY = 16, 26, 36, 37
 """Where Q₀, the known body and γ lie after K, and numbers of a body."""
 LOWEST, WIDTH, DUAL, VALUE, RATE, PER_NUMBER = range(6)
@@ -97,7 +97,7 @@ def factor_of(code: int, v_r: float, a_r: float, transition: float) -> float:
         return math.tanh(v_r / transition)
     if code == NumberCode.ROTOR:
         return a_r
-    return 1.0 if code == NumberCode.OFFSET else math.nan
+    return 1.0 if code == NumberCode.OFFSET or code == NumberCode.ACCELERATION else math.nan
 
 
 @inlined
@@ -121,19 +121,21 @@ def put_estimates(duals: Vec, unknown: Packed, own: Packed, signals: Signals, wo
     """The estimated bodies and rotors → the tree `own`, and friction and offsets → signals.feedback."""
     layout, weights = unknown.layout, unknown.weights
     x, p, other, work = take3(work, 16)
-    count = layout[BODIES]
+    count, first = layout[BODIES], OUTPUT_RATE + len(signals.v_r)
     for b in range(count):
-        w, i = weights[FIRST_BODY + PER_BODY * b :], layout[UNKNOWN + b]
+        w, i = weights[first + PER_BODY * b :], layout[UNKNOWN + b]
         logistic(duals[TRIANGLE * b : TRIANGLE * (b + 1)], work, x)
         congruent(w[:16], x, other, p)
         start = BASE + BODY * i
         add_body(p, w[KNOWN:BODY_RATE], own.weights[start : start + BODY])
     for k in range(layout[NUMBERS]):
         code, i = layout[UNKNOWN + count + 2 * k], layout[UNKNOWN + count + 2 * k + 1]
-        w = weights[FIRST_BODY + PER_BODY * count + PER_NUMBER * k :]
+        w = weights[first + PER_BODY * count + PER_NUMBER * k :]
         excess = value_of(duals, TRIANGLE * count + k, w) - w[VALUE]
         if code == NumberCode.ROTOR:
             own.weights[BASE + BODY * i + ARMATURE] += excess
+        elif code == NumberCode.ACCELERATION:
+            signals.a_r[i] += excess
         else:
             signals.feedback[i] += excess * factor_of(code, signals.v_r[i], 0.0, weights[TRANSITION])
 
@@ -146,9 +148,9 @@ def move_duals(z2: Vec, period: float, unknown: Packed, own: Packed, signals: Si
     power, slope, other, rest = take3(rest, 16)
     tree_work = rest[_MATRICES - 48 :]
     spread(z2, own, tree_work)
-    count, leak = layout[BODIES], weights[LEAK]
+    count, first, leak = layout[BODIES], OUTPUT_RATE + len(z2), weights[LEAK]
     for b in range(count):
-        w, i = weights[FIRST_BODY + PER_BODY * b :], layout[UNKNOWN + b]
+        w, i = weights[first + PER_BODY * b :], layout[UNKNOWN + b]
         inertia_bars(joint_of(i, own, tree_work), signals.a_r[i], z2[i], bars)
         bar_matrix(bars, power)
         congruent_back(w[:16], power, other, slope)
@@ -160,17 +162,31 @@ def move_duals(z2: Vec, period: float, unknown: Packed, own: Packed, signals: Si
                 k += 1
     for k in range(layout[NUMBERS]):
         code, i = layout[UNKNOWN + count + 2 * k], layout[UNKNOWN + count + 2 * k + 1]
-        w, d = weights[FIRST_BODY + PER_BODY * count + PER_NUMBER * k :], TRIANGLE * count + k
+        w, d = weights[first + PER_BODY * count + PER_NUMBER * k :], TRIANGLE * count + k
         felt = w[WIDTH] * z2[i] * factor_of(code, signals.v_r[i], signals.a_r[i], weights[TRANSITION])
         duals[d] = moved(duals[d], w[DUAL], w[RATE], leak, period, felt)
+
+
+@inlined
+def output_of(state: State, target: Target, v_r: Vec, law: Packed, unknown: Packed, s: Vec) -> None:
+    """The output that drives adaptation → s."""
+    code, rate = unknown.layout[OUTPUT], unknown.weights[OUTPUT_RATE:]
+    difference(state.q, target.q, vector(law, at.WRAPS), s)
+    for i in range(len(s)):
+        if code == OutputCode.VELOCITY:
+            s[i] = state.v[i] - v_r[i]
+        elif code == OutputCode.FILTERED:
+            s[i] = state.v[i] - target.v[i] + rate[i] * s[i]
+        else:
+            s[i] = math.nan
 
 
 @kernel
 def adaptive_step(
     before: Vec, state: State, target: Target, period: float, limit: Vec,
-    law: Packed, tree: Packed, unknown: Packed, work: Vec, tau: Vec, duals: Vec, z2: Vec,
+    law: Packed, tree: Packed, unknown: Packed, work: Vec, tau: Vec, duals: Vec, output: Vec,
 ) -> None:  # fmt: skip
-    """Torque, z2 and duals of one state; `duals` are those before and become those after."""
+    """Torque, output and duals of one state; `duals` are those before and become those after."""
     n = len(tau)
     v_r, a_r, feedback, work = take3(work, n)
     weights, work = take(work, len(tree.weights))
@@ -185,22 +201,22 @@ def adaptive_step(
     free = True
     for i in range(n):
         tau[i] += feedback[i]
-        z2[i] = state.v[i] - v_r[i]
         free = free and abs(tau[i]) <= limit[i]
     if free:  # a torque that is cut off does not do what the estimates expect: they wait
         move_duals(before, period, unknown, own, signals, work, duals)
+    output_of(state, target, v_r, law, unknown, output)
 
 
 @kernel
 def adaptive_law(
     memory: Vec, before: Vec, q: Vec, v: Vec, q_ref: Vec, v_ref: Vec, a_ref: Vec, period: float, limit: Vec,
-    layout: Vec, weights: Vec, work: Vec, tau: Vec, memory_out: Vec, z2: Vec,
+    layout: Vec, weights: Vec, work: Vec, tau: Vec, memory_out: Vec, output: Vec,
 ) -> bool:  # fmt: skip
     """One step of an `AdaptiveLaw`.
 
     Args:
         memory: duals of any number of states laid end to end.
-        before: z2 [rad/s] of two instants ago, n numbers per state.
+        before: the output of two instants ago, n numbers per state.
         q: position [rad].
         v: velocity [rad/s].
         q_ref: desired position [rad].
@@ -213,7 +229,7 @@ def adaptive_law(
         work: scratch space (`adaptive_workspace`).
         tau: written [N·m].
         memory_out: written, the duals after it.
-        z2: written, of this instant.
+        output: written, of this instant.
 
     Returns:
         Whether all lengths fit, nothing being done otherwise, and what was written is finite.
@@ -222,7 +238,7 @@ def adaptive_law(
     law, tree = Packed(both[2:], weights), Packed(both[both[0] :], weights[both[1] : layout[1]])
     n, size = law.layout[at.JOINTS], len(tau)
     duals = TRIANGLE * unknown.layout[BODIES] + unknown.layout[NUMBERS]
-    if not fit(n, size, (before, q, v, q_ref, v_ref, a_ref, z2)) or len(limit) != n:
+    if not fit(n, size, (before, q, v, q_ref, v_ref, a_ref, output)) or len(limit) != n:
         return False
     if len(memory) != size // n * duals or len(memory_out) != len(memory):
         return False
@@ -231,6 +247,6 @@ def adaptive_law(
         state, target = State(row(q, k, n), row(v, k, n)), Target(row(q_ref, k, n), row(v_ref, k, n), row(a_ref, k, n))
         adaptive_step(
             row(before, k, n), state, target, period, limit, law, tree, unknown, work,
-            row(tau, k, n), row(memory_out, k, duals), row(z2, k, n),
+            row(tau, k, n), row(memory_out, k, duals), row(output, k, n),
         )  # fmt: skip
     return is_finite(tau) and is_finite(memory_out)

@@ -41,8 +41,10 @@ IntegratorCode = IntEnum("IntegratorCode", "EULER SEMI_IMPLICIT_EULER RK4", star
 """Every integrator that rollouts have, by the equations of `simulation/integrators.py`."""
 JointCode = IntEnum("JointCode", "REVOLUTE PRISMATIC", start=0)
 """Every joint that a rigid tree may have."""
-NumberCode = IntEnum("NumberCode", "VISCOUS COULOMB ROTOR OFFSET", start=0)
+NumberCode = IntEnum("NumberCode", "VISCOUS COULOMB ROTOR OFFSET ACCELERATION", start=0)
 """Every number of a joint that a law may adapt, by its factor in the torque (`adaptation.factor_of`)."""
+OutputCode = IntEnum("OutputCode", "VELOCITY FILTERED", start=0)
+"""Every output that drives adaptation: v − v_r, or ż1 + εz1."""
 
 Code = TypeVar("Code", bound=IntEnum)
 Layers: TypeAlias = Sequence[tuple[Array, Array]]

@@ -26,7 +26,7 @@ from nbs_pin.reports.plotting import (
 from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.simulation.run_figures import estimates_of, figures, load_of, loads_of
 
-_KINDS = ("Coulomb friction", "viscous friction", "rotor inertia", "constant torque")
+_KINDS = ("Coulomb friction", "viscous friction", "rotor inertia", "constant torque", "constant acceleration")
 _COLOURS = (ACTUAL, ERROR, TORQUE, VIOLET, INK, NOTE)
 
 

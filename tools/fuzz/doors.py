@@ -15,6 +15,7 @@ import torch
 import nbs_pin as nbs
 
 RESULTS = (
+    "Estimate",
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
@@ -65,6 +66,12 @@ class Stock:
 
     def _law(self) -> Any:
         return nbs.NeuralBackstepping.for_robot(self.robot)
+
+    def _adaptive(self) -> Any:
+        return nbs.AdaptiveLaw(self.law)
+
+    def _adapted(self) -> Any:
+        return nbs.simulate(self.plant, self.adaptive, self.motion, 0.02, 0.001)
 
     def _friction(self) -> Any:
         return nbs.JointFriction([0.1, 0.1], [0.2, 0.1])
@@ -154,6 +161,15 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
     single = nbs.Reference(Q, V, V)
     tensor = torch.zeros(4, 2, dtype=torch.float64)
     return {
+        "AdaptiveLaw": {"law": s.law, "adapts": ["load"], "load_mass": 1.0, "gain": 0.5},
+        **{
+            f"{kind}.{method}": {"memory": s.adaptive.initial_memory(Q), "reference": nbs.Reference(Q, V, V)}
+            for kind in ("AdaptiveLaw", "CompiledAdaptiveLaw") for method in ("step", "recorded")
+        },
+        "AdaptiveLaw.estimates": {"recorded": s.adaptive.unknowns.start},
+        "CompiledAdaptiveLaw.estimates": {"recorded": s.adaptive.unknowns.start},
+        "AdaptiveLaw.estimate": {"recorded": None},
+        "plot_estimates": {"path": s.folder / "estimates.png", "run": s.adapted},
         "AnalyticDynamics": {"masses": (1.0, 1.0), "lengths": (1.0, 1.0), "gravity": 9.8},
         "Admissible.told": {"units": ["N·m", "N·m"]},
         "Admissible": {"box": np.ones(2), "radius": None},
@@ -264,7 +280,8 @@ def _subjects(s: Stock) -> dict[str, Any]:
         nbs.Admissible(box=np.ones(2)), nbs.AnalyticDynamics(), nbs.ComputedTorque.for_robot(s.robot), s.certificate,
         nbs.ConstantTorque([1.0, 2.0]), s.law.damping, s.data, s.plant, nbs.Encoders(1e-4), nbs.Hold(Q), s.identified,
         s.friction, s.learned, nbs.MinimumJerk([[0.0, 0.0], [1.0, 1.0]], [0.0, 2.0]), nbs.MujocoPlant(s.robot), s.law,
-        nbs.PD.for_robot(s.robot), nbs.PID.for_robot(s.robot), s.model, s.law.potential, s.residual, s.robot, s.run,
+        s.adaptive, s.adaptive.estimate(), nbs.PD.for_robot(s.robot), nbs.PID.for_robot(s.robot), s.model,
+        s.law.potential, s.residual, s.robot, s.run,
         nbs.Sampled(np.arange(5.0), np.zeros((5, 2))), s.motion, nbs.SinusoidalTorque([1.0, 2.0], 2.0),
         nbs.SlidingMode.for_robot(s.robot), nbs.SlotineLi.for_robot(s.robot), nbs.SquareWave([1.0, 2.0], 2.0),
         nbs.TimeOutside(), nbs.TorqueAware.for_robot(s.robot), nbs.TorqueNoise(1.0, 0.01), nbs.Uncertainty(0.1),
@@ -275,6 +292,7 @@ def _subjects(s: Stock) -> dict[str, Any]:
     return {type(x).__name__: x for x in found} | {
         "CompiledController": s.law.compile(),
         "CompiledPID": nbs.PID.for_robot(s.robot).compile(),
+        "CompiledAdaptiveLaw": s.adaptive.compile(),
     }
 
 
@@ -292,7 +310,7 @@ def doors() -> list[Door]:
             found += [(f"{name}.{m}", getattr(subjects.get(name, thing), m)) for m in _methods(thing, subjects)]
         elif callable(thing):
             found.append((name, thing))
-    for name in ("CompiledController", "CompiledPID"):
+    for name in ("CompiledController", "CompiledPID", "CompiledAdaptiveLaw"):
         found += [(f"{name}.{m}", getattr(subjects[name], m)) for m in _methods(type(subjects[name]), {name: 0})]
     common, own = _common(s), _own(s)
     memory = subjects["PID"].initial_memory(Q)
@@ -356,4 +374,4 @@ _FULL = (
     "NeuralBackstepping.for_robot",
 )
 """Doors that get the common values of optional arguments too."""
-_FALLBACK = {"memory": None, "reference": nbs.Reference(Q, V, V)}
+_FALLBACK = {"memory": None, "recorded": np.zeros((3, 2)), "reference": nbs.Reference(Q, V, V)}

@@ -1,0 +1,90 @@
+"""The output of a tracking law in which its loop is passive from a wrong torque: what drives adaptation.
+
+With a wrong torque p̃ added to τ, or for computed torque with a wrong acceleration p̃ added to a_r, V̇ = −(what the law
+takes) + sᵀp̃ for
+
+    a law with a Lyapunov function   s = z2
+    PD+                              s = ż1 + εz1    V = ½ż1ᵀMż1 + ½z1ᵀK_p z1 + εz1ᵀMż1 + ½εz1ᵀK_d z1
+    computed torque                  s = ż1 + λz1    V = ½‖ż1 + λz1‖² + ½z1ᵀ(K_p + λK_d − λ²)z1, λ = ½K_d
+
+For PD+ this holds near the motion alone, as V̇ has the term εz1ᵀCᵀż1, and with gravity alone (PD) near points at rest.
+Sources: docs/theory.md §10; Paden and Panja 1988; Takegaki and Arimoto 1981.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nbs_pin.base.arguments import numbers
+from nbs_pin.base.arrays import Array, JointArray, constant_like
+from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.controllers.gains import largest_inertia
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.controllers.pd import PD
+from nbs_pin.kernels.layout import OutputCode
+
+
+class Output(NamedTuple):
+    """Which output a law has."""
+
+    code: OutputCode
+    rate: JointArray
+    """ε or λ [1/s]; zero for a law with a Lyapunov function."""
+
+
+class Signals(NamedTuple):
+    """What a law adds to the model, τ = M a_r + C v_r + G + feedback, and its output, (..., n)."""
+
+    v_r: Array
+    a_r: Array
+    output: Array
+
+
+def output_of(law: ModelLaw, rate: Any = None) -> Output:
+    """The output of a law, with this ε or λ; raises ArgumentError for a law of which none is known."""
+    code, own = _usual(law)
+    given = own if rate is None else np.array(numbers(law.nv, least=0.0, unit="1/s")("output_rate", rate))
+    return Output(code, given)
+
+
+def _usual(law: ModelLaw) -> tuple[OutputCode, JointArray]:
+    if isinstance(law, LyapunovLaw):
+        return OutputCode.VELOCITY, np.zeros(law.nv)
+    robot = law.dynamics.robot
+    if type(law) is PD and robot is not None:
+        inertia = largest_inertia(robot, law.dynamics)
+        slowest = min(float((law.kd / inertia).min()), float((law.kp / law.kd).min()))
+        return OutputCode.FILTERED, np.full(law.nv, 0.5 * slowest)
+    if type(law) is ComputedTorque:
+        return OutputCode.FILTERED, 0.5 * law.kd
+    raise ArgumentError(
+        f"AdaptiveLaw was given a {type(law).__name__}, of which no passive output is known; give NeuralBackstepping or"
+        " another law with a Lyapunov function, PD or ComputedTorque."
+    )
+
+
+def signals_of(law: ModelLaw, output: Output, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Signals:
+    """The signals of a law at (..., n) states."""
+    if isinstance(law, LyapunovLaw):
+        e = law.errors(q, v, q_ref, v_ref, a_ref)
+        return Signals(e.v_r, e.a_r - law.inertial_rate * e.z2, e.z2)
+    z1, dz1 = law.dynamics.difference(q, q_ref), v - v_ref
+    filtered = dz1 + constant_like(q, output.rate) * z1
+    if isinstance(law, ComputedTorque):
+        kp, kd = law.gains.like(q)
+        return Signals(v, a_ref - kd * dz1 - kp * z1, filtered)
+    assert isinstance(law, PD)
+    share = 0.0 if law.feedforward == "gravity" else 1.0
+    return Signals(share * v_ref, share * a_ref, filtered)
+
+
+def damping_of(law: ModelLaw, output: Output, mass: Float[np.ndarray, "poses n n"]) -> Float[np.ndarray, "poses n n"]:
+    """A matrix Δ with V̇ ≤ −sᵀΔs without a wrong torque, at poses with these mass matrices."""
+    if isinstance(law, LyapunovLaw):
+        return np.asarray(law.inertial_rate * mass + law.lyapunov().floor)
+    assert isinstance(law, PD | ComputedTorque)
+    kd = law.kd - output.rate if isinstance(law, ComputedTorque) else law.kd
+    return np.broadcast_to(np.diag(1.0 / (1.0 / kd + output.rate / law.kp)), mass.shape)
