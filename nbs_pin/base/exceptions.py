@@ -94,7 +94,7 @@ class SimulationDiverged(NbsPinError, ArithmeticError):
     Example:
         >>> import nbs_pin as nbs
         >>> law, plant = nbs.PD.for_robot(nbs.load_robot("two_link")), nbs.DynamicsPlant(nbs.AnalyticDynamics())
-        >>> nbs.simulate(plant, law, nbs.Hold([0.0, 0.0]), 1.0, 0.1, effort_limit=float("inf"), q0=[1.0, 1.0])
+        >>> nbs.simulate(plant, law, nbs.Hold([0.0, 0.0]), 1.0, 0.25, effort_limit=float("inf"), q0=[1.0, 1.0])
         Traceback (most recent call last):
             ...
         nbs_pin.base.exceptions.SimulationDiverged: ...
