@@ -7,6 +7,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of torch wait for each 
 
 import pytest
 from jaxtyping import config as shapes, install_import_hook
+from threadpoolctl import threadpool_limits
+
+threadpool_limits(1)  # numpy is imported already, by a plugin; two threads of its own take up to five times the time
 
 CONTRACTS = {"test_dynamics", "test_controllers", "test_compiled", "test_plants", "test_networks", "test_lyapunov_laws"}
 """Test files that execute the annotations. Elsewhere the checks, and even checks that are switched off, would take more
