@@ -37,7 +37,7 @@ def check_leads(led, robot, q, v):
 def test_every_start_within_the_limits_has_an_approach_that_keeps_them(name):
     robot, rng = nbs.load_robot(name), np.random.default_rng(0)
     motion, waits = nbs.Sinusoid.for_robot(robot), []
-    for q in starts(robot, rng, 20):
+    for q in starts(robot, rng, 10):
         led = nbs.Approach.from_state(motion, robot, q)
         check_leads(led, robot, q, np.zeros(robot.nv))
         waits.append(led.ramp is not None)

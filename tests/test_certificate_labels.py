@@ -246,15 +246,15 @@ def test_a_model_edited_in_place_is_no_longer_the_urdfs():
 @pytest.mark.parametrize("ceiling", [None, 1.0])
 def test_weights_far_from_zero_are_in_the_rule_of_sampled_control(ceiling):
     """D(0) = D₀ for every weight of a network without biases; where the loop goes, D is another, unless bounded."""
-    robot = nbs.load_robot("panda")
+    robot = nbs.load_robot("three_link")
     law = nbs.NeuralBackstepping.for_robot(robot, damping_ceiling=ceiling)
     motion = nbs.Sinusoid.for_robot(robot)
-    assert certify(law, np.full(7, 0.5), reference=motion, period=0.001).label is Label.PROVED
+    assert certify(law, np.full(3, 0.5), reference=motion, period=0.001).label is Label.PROVED
     with torch.no_grad():
         for network in (law.damping.diagonal, law.damping.lower):
             for parameter in network.parameters():
                 parameter.mul_(10.0)
-    found = certify(law, np.full(7, 0.5), reference=motion, period=0.001)
+    found = certify(law, np.full(3, 0.5), reference=motion, period=0.001)
     assert found.label is (Label.EMPIRICAL if ceiling is None else Label.PROVED)
     assert [name.split(":")[0] for name in found.void] == (["control period"] if ceiling is None else [])
 
@@ -307,7 +307,7 @@ def test_an_arm_with_friction_stays_within_a_bound_that_counts_it(fed):
     plant = nbs.DynamicsPlant(PinocchioDynamics(robot), friction=arm)
     for rate in (0.5, 3.0, 10.0, 30.0):
         wave = nbs.SquareWave(np.array([3.0, -3.0]), rate)
-        run = nbs.simulate(plant, law, motion, 4.0, 0.001, disturbance=wave)
+        run = nbs.simulate(plant, law, motion, 2.0, 0.001, disturbance=wave)
         seen = nbs.monitor(run, found)
         assert (seen.joint_errors <= found.joint_errors).all()
         assert seen.is_kept
@@ -446,7 +446,7 @@ def test_a_watch_names_such_a_number_and_recovers(kept, bad):
 def test_an_honest_loop_at_a_sound_period_fails_no_assumption(name):
     """Disturbances on record and within their bound, in MuJoCo at 1 kHz, for slow laws and fast ones."""
     robot, rng = nbs.load_robot(name), np.random.default_rng(0)
-    for bandwidth in (6.0, 12.0, 18.0):
+    for bandwidth in (6.0, 18.0):
         law = nbs.NeuralBackstepping.for_robot(robot, bandwidth=bandwidth)
         motion = nbs.Sinusoid.for_robot(robot, frequency=rng.uniform(0.3, 2.0))
         size = np.full(robot.nv, 0.1 if name == "kinova" else 1.0)

@@ -322,7 +322,7 @@ def test_a_law_without_a_proof_is_refused(tmp_path, capsys):
         ("panda --disturbance 5 --reference paper", "with its error leaves the joint limits"),
         ("xarm7 --disturbance 0.1", "joint friction that is not fed forward"),
         ("two_link --disturbance 5 --law pid", "of which no Lyapunov function is known"),
-        ("ur5 --disturbance 1 --start-error 0.5", "these conditions fail: effort limit of"),
+        ("two_link --disturbance 1 --start-error 3", "these conditions fail: effort limit of"),
         ("kinova --disturbance 5", "of no use: a bound of 1.1 turns"),
     ],
 )

@@ -64,13 +64,12 @@ def test_whole_turns_of_a_continuous_joint_do_not_matter(law):
     np.testing.assert_allclose(call(controller, q, v, turned, v_ref, a_ref), tau, rtol=1e-9, atol=1e-9)
 
 
-def test_defaults_follow_a_moving_reference(law, robot):
-    """Out of the box: from the reference's start, every law stays near it in the truth its model believes."""
-    reference = nbs.Sinusoid.for_robot(robot, amplitude=0.2)
-    run = nbs.simulate(nbs.DynamicsPlant(PinocchioDynamics(robot)), law(robot), reference, 0.5, 0.001)
-    error = np.abs(robot.difference(run.q, run.q_ref)).max()
-    modelled = law not in (LAWS["pid"], LAWS["pd-gravity"])
-    assert error < (1e-3 if modelled else 0.15)
+def test_a_loop_under_every_law_on_every_arm(law, robot):
+    """Some periods, in which every call checks its shapes; test_closed_loops.py has longer ones."""
+    start = nbs.Sinusoid.for_robot(robot, amplitude=0.2)
+    run = nbs.simulate(nbs.DynamicsPlant(PinocchioDynamics(robot)), law(robot), start, 0.01, 0.001)
+    assert np.isfinite(run.q).all()
+    assert run.q.shape == run.tau_command.shape == (11, robot.nv)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))])
@@ -245,28 +244,6 @@ def check_lyapunov_identity(controller: NeuralBackstepping, seed: int) -> None:
     assert (np.abs(sum(parts) - (power - dissipation)) <= 1e-8 * scale).all()
 
 
-@pytest.mark.parametrize("damping", DAMPINGS)
-@pytest.mark.parametrize("potential", POTENTIALS)
-def test_storage_never_rises_for_any_weights(potential, damping):
-    """Theorem 1 in simulation: without disturbance V falls from starts far away, whatever the weights."""
-    robot = load_robot("two_link")
-    dynamics = PinocchioDynamics(robot)
-    controller = NeuralBackstepping.for_robot(robot, dynamics, potential=potential, damping=damping, bandwidth=3.0)
-    randomise(controller, seed=5, gain=0.5)
-    check_storage_falls(controller)
-
-
-def check_storage_falls(controller: NeuralBackstepping) -> None:
-    """Along motions of two joints from twenty starts far away."""
-    dynamics = controller.dynamics
-    starts = np.random.default_rng(1).uniform(-2.0, 2.0, (20, 2))
-    hold = nbs.Hold(np.zeros(2))
-    run = nbs.simulate(nbs.DynamicsPlant(dynamics), controller, hold, 0.3, 1e-3, q0=starts, effort_limit=np.inf)
-    storage = controller.storage(run.q, run.v, run.q_ref, run.v_ref)[::10]
-    assert (storage[1:] < storage[:-1]).all()
-    assert (storage[-1] < 0.5 * storage[0]).all()
-
-
 def test_the_paper_torque_jumps_and_the_smooth_one_does_not():
     """Crossing z1 = 0, where the paper's ∇²ψ is undefined, at speed (docs/theory.md §3)."""
     dynamics = nbs.AnalyticDynamics()
@@ -307,13 +284,6 @@ def test_gains_scale_with_the_inertia_and_respect_the_effort():
     np.testing.assert_allclose(gains.damping, 1.4 * np.sqrt(gains.stiffness * inertia))
     mass = dynamics.mass_matrix(np.random.default_rng(5).uniform(robot.lower, robot.upper, (500, 7)))
     assert (inertia <= 1.05 / np.diagonal(np.linalg.inv(mass), axis1=-2, axis2=-1)).all()
-
-
-def test_pid_removes_the_offset_of_an_unknown_load():
-    robot = load_robot("two_link")
-    plant, hold = nbs.DynamicsPlant(PinocchioDynamics(robot)), nbs.Hold(np.array([0.3, 0.4]))
-    run = nbs.simulate(plant, PID.for_robot(robot, period=0.004), hold, 5.0, 0.004, plant_step=0.004)
-    assert np.abs(run.q[-1] - run.q_ref[-1]).max() < 1e-4
 
 
 NETWORKS = Potential(np.eye(2)), Damping(2, form="paper")

@@ -1,29 +1,27 @@
-"""The demos run and show what their first lines promise; apart, without the shape checks that slow a loop down."""
+"""The demos run and show what their first lines promise."""
 
+import contextlib
+import io
 import json
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import nbs_pin as nbs
+
 DEMOS = Path(__file__).parent.parent / "demos"
 
 
 def run_demo(name, folder, call):
-    """What `call` of the demo's names returns, as JSON, and what it printed."""
-    code = f"""
-import json, runpy, warnings, numpy as np, nbs_pin as nbs
-from pathlib import Path
-warnings.simplefilter("error", UserWarning)
-demo = runpy.run_path({str(DEMOS / f"{name}.py")!r})
-print(json.dumps((lambda main: {call})(demo["main"])))
-"""
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    *printed, last = done.stdout.splitlines()
-    return json.loads(last), "\n".join(printed)
+    """What `call` of the demo's `main` returns, as JSON, and what it printed."""
+    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as printed:
+        demo = runpy.run_path(str(DEMOS / f"{name}.py"))
+        found = eval(call, {"main": demo["main"], "nbs": nbs})
+    return json.loads(json.dumps(found)), printed.getvalue()
 
 
 def test_every_demo_says_first_what_to_see():
@@ -36,6 +34,15 @@ def test_every_demo_says_first_what_to_see():
 def test_every_demo_is_run_here():
     run = set(re.findall(r'run_demo\(\s*"(\w+)"', Path(__file__).read_text()))
     assert run == {demo.stem for demo in DEMOS.glob("*.py")}
+
+
+def test_a_demo_is_a_program(tmp_path):
+    """In an interpreter of its own, as a reader types it."""
+    program = [sys.executable, str(DEMOS / "any_urdf.py"), "two_link"]
+    done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "Robot('two_link', 2 joints" in done.stdout
+    assert (tmp_path / "out" / "demo" / "two_link.html").is_file()
 
 
 def test_three_arms_meet_their_reference_and_leave_replays(tmp_path):

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
+from jaxtyping import TypeCheckError
 
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.intervals import Interval
 from nbs_pin.controllers.activations import SmoothedReLU, Squareplus
 from nbs_pin.controllers.convex import FICNN
 from nbs_pin.controllers.damping import Damping
+from nbs_pin.controllers.gains import largest_inertia
 from nbs_pin.controllers.potential import POTENTIALS, Potential
 
 seeds = st.integers(0, 2**31 - 1)
@@ -34,6 +36,12 @@ def random_potential(form: str, nv: int, seed: int) -> Potential:
     potential = Potential(stiffness, form=form, widths=(16, 8), scale=rng.uniform(0.3, 3.0, nv))
     randomise(potential, seed, gain=2.0)
     return potential
+
+
+def test_annotations_are_executed_here():
+    """A session without them meets an AttributeError."""
+    with pytest.raises(TypeCheckError):
+        largest_inertia("panda", None)
 
 
 @pytest.mark.parametrize("activation", [SmoothedReLU(0.3), Squareplus(0.7)])

@@ -15,8 +15,9 @@ from nbs_pin.robots.robot import load_robot
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
 from nbs_pin.training.train import train
+from tests.test_closed_loops import check_storage_falls
 from tests.test_compiled import assert_one_law
-from tests.test_controllers import arguments, check_lyapunov_identity, check_storage_falls
+from tests.test_controllers import arguments, check_lyapunov_identity
 from tests.test_networks import check_floor, check_psi, check_strong_convexity, randomise
 
 

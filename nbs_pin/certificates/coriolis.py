@@ -163,7 +163,7 @@ class _Arm(NamedTuple):
     """`single` for the rates of links."""
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _arm(key: _Key) -> _Arm:
     tree, n, links = RigidTree.of(key.robot), key.robot.nv, link_rates(key.robot)
     relative, single = inertia_derivatives(tree), single_rates(tree)
@@ -174,7 +174,7 @@ def _arm(key: _Key) -> _Arm:
     return _Arm(relative, single, turn, sum_m, largest_diagonal(tree), links, link_relative, by_links)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _of_shape(key: _Key, shape_bytes: bytes, n: int) -> tuple[JointArray, JointArray]:
     return _both(key, np.frombuffer(shape_bytes).reshape(n, n))
 
@@ -198,7 +198,7 @@ def _by_floor(key: _Key, floor: Float[np.ndarray, "n n"]) -> tuple[JointArray, J
     return joints * scale, links * scale
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> CoriolisBounds:
     floor, rate = np.frombuffer(floor_bytes).reshape(n, n), np.frombuffer(rate_bytes)
     tree, inverse = RigidTree.of(key.robot), np.abs(np.linalg.inv(floor))

@@ -8,6 +8,7 @@ of that shape that certifies the wanted error (docs/certificates.md §10).
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -136,11 +137,11 @@ def propose(
     light = [c for c in candidates if c.share(arm, robot) <= 1.0]
     if not light:
         raise ArgumentError(_too_weak(robot, arm, candidates, admissible))
-    longest = [(_longest_period(c, arm, robot, dynamics, seed), c) for c in light]
+    light.sort(key=lambda c: c.answer(arm, robot))
+    allowed = cache(lambda c: _longest_period(c, arm, robot, dynamics, seed))  # of few: the first calm one may do
     why = ""
     for period in choice:
-        calm = [c for allowed, c in longest if allowed > period]
-        for best in sorted(calm, key=lambda c: c.answer(arm, robot)):
+        for best in (c for c in light if c.longest(arm) > period and allowed(c) > period):
             found = _designed(best, period, arm, robot, dynamics, seed, (admissible, wanted, motion, duration))
             if isinstance(found, Proposal):
                 return found
@@ -151,7 +152,7 @@ def propose(
         )
     raise ArgumentError(
         f"a control period of {1e3 * choice[-1]:g} ms forbids it: the sampled loop might not stay calm; take a period"
-        f" of at most {0.9995e3 * max(allowed for allowed, _ in longest):.3g} ms, or want a larger error."
+        f" of at most {0.9995e3 * max(map(allowed, light)):.3g} ms, or want a larger error."
     )
 
 
@@ -217,6 +218,10 @@ class _Candidate:
     def stiff(self, arm: _Arm, period: float) -> float:
         return float(np.sqrt(self.gains.stiffness / arm.effective).max()) * period
 
+    def longest(self, arm: _Arm) -> float:
+        """The control period that it cannot exceed, whatever its networks are [s]."""
+        return min(STIFF / self.stiff(arm, 1.0), FAST / self.gains.bandwidth)
+
     def torque(self, arm: _Arm) -> np.ndarray:
         return arm.reference_torque + arm.disturbance + self.gains.stiffness * self.joint_errors
 
@@ -253,7 +258,7 @@ def _longest_period(
     candidate: _Candidate, arm: _Arm, robot: Robot, dynamics: DynamicsProvider | None, seed: int
 ) -> float:
     """The longest control period [s] at which √(K/M)h, ωh and the rule of `certify` stay within their limits."""
-    longest = min(STIFF / candidate.stiff(arm, 1.0), FAST / candidate.gains.bandwidth)
+    longest = candidate.longest(arm)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a candidate that may not be chosen
         controller = candidate.controller(robot, dynamics, longest, seed)

@@ -82,9 +82,18 @@ def picture(
         if heading is not None:
             _head(figure, heading)
         yield figure
+        _lay_out(figure)
         buffer = io.BytesIO()
         figure.savefig(buffer, format=kind, metadata={} if kind == "png" else _UNDATED[kind])
     write_whole(path, buffer.getvalue())
+
+
+def _lay_out(figure: Figure) -> None:
+    """Arrange the axes, as savefig would by drawing the figure once in vain."""
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
+    figure.set_layout_engine("none")
 
 
 def _head(figure: Figure, heading: Heading) -> None:

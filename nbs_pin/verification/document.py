@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -66,22 +67,32 @@ def check_arm(path: Path, stated: dict[str, Any] | None, robot: Arm) -> None:
 
 def read_document(path: Path) -> dict[str, Any]:
     """The content of the file; raises FileFormatError unless it fits the schema and its own number of joints."""
-    schema = json.loads(files("nbs_pin.verification").joinpath("certificate.schema.json").read_text("utf-8"))
     content = file_content(path)
     try:
         document: dict[str, Any] = json.loads(
             content, object_pairs_hook=_unique, parse_float=_finite, parse_constant=_finite, parse_int=_whole
         )
-        jsonschema.validate(document, schema)
+        fault = jsonschema.exceptions.best_match(_schema().iter_errors(document))
+        if fault is not None:
+            raise fault
         _check_sizes(document)
         _check_premises(document)
     except jsonschema.ValidationError as error:
         rule = f"it does not satisfy {error.validator} {error.validator_value}"
-        fault = error.message if len(error.message) < 160 else f"{rule:.160}"
-        raise FileFormatError(f"{path}: {error.json_path}: {fault}; write the file again.") from error
+        words = error.message if len(error.message) < 160 else f"{rule:.160}"
+        raise FileFormatError(f"{path}: {error.json_path}: {words}; write the file again.") from error
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: no certificate of format 1 ({error}); write the file again.") from error
     return document
+
+
+@cache
+def _schema() -> Any:
+    """What holds documents against the schema, which is checked itself only once: that takes longer than a document."""
+    schema = json.loads(files("nbs_pin.verification").joinpath("certificate.schema.json").read_text("utf-8"))
+    kind = jsonschema.validators.validator_for(schema)
+    kind.check_schema(schema)
+    return kind(schema)
 
 
 def file_content(path: Path) -> bytes:
