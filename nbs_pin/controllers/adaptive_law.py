@@ -25,7 +25,7 @@ from nbs_pin.controllers.compiled_adaptive import (
 )
 from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.estimates import Estimate
+from nbs_pin.controllers.estimates import Estimate, estimate_of
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -205,7 +205,7 @@ class AdaptiveLaw(Controller, nn.Module):
     def estimates(self, recorded: np.ndarray) -> tuple[np.ndarray, list[str]]:
         """`Estimate.values` of these duals, and its names."""
         (duals,) = as_vectors(len(self.unknowns.start), recorded=recorded)
-        found = Estimate.of_duals(self.robot, self._believed, self.unknowns, np.asarray(duals, dtype=float))
+        found = estimate_of(self.robot, self._believed, self.unknowns, np.asarray(duals, dtype=float))
         return found.values, found.names
 
     def step(
@@ -242,7 +242,7 @@ class AdaptiveLaw(Controller, nn.Module):
         if recorded is None or isinstance(recorded, AdaptiveMemory):
             given = self.unknowns.start if recorded is None else recorded.duals
             (duals,) = as_vectors(len(self.unknowns.start), duals=given)
-            return Estimate.of_duals(*known, np.asarray(duals, dtype=float))
+            return estimate_of(*known, np.asarray(duals, dtype=float))
         (values,) = as_vectors(len(self.unknowns.start), estimates=recorded)
         return Estimate(*known, values)
 

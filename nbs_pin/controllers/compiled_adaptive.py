@@ -13,7 +13,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import joints_told
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.estimates import Estimate
+from nbs_pin.controllers.estimates import estimate_of
 from nbs_pin.controllers.passive_outputs import Output
 from nbs_pin.controllers.unknowns import Unknowns
 from nbs_pin.kernels.adaptation import adaptive_law, adaptive_workspace, compile_adaptive_law, pack_adaptive
@@ -99,7 +99,7 @@ class CompiledAdaptiveLaw(Controller):
         """`Estimate.values` of these duals, and its names."""
         _, tree, unknowns, *_, robot = self._given
         (duals,) = as_vectors(len(self._start), recorded=recorded)
-        found = Estimate.of_duals(robot, tree, unknowns, np.asarray(duals, dtype=float))
+        found = estimate_of(robot, tree, unknowns, np.asarray(duals, dtype=float))
         return found.values, found.names
 
     def step(

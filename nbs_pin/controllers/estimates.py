@@ -46,23 +46,6 @@ class Estimate(Shown):
     values: Float[np.ndarray, "*batch k"]
     """What `names` lists: ten parameters of every body in Pinocchio's order, then the numbers of the joints."""
 
-    @classmethod
-    def of_duals(
-        cls, robot: Robot, tree: Packed, unknowns: Unknowns, duals: Float[np.ndarray, "*batch m"]
-    ) -> "Estimate":
-        """From the memory of the law."""
-        given = Duals.of(duals, len(unknowns.bodies))
-        x, _ = logistic_and_cut(given.bodies)
-        parts = []
-        for k, body in enumerate(unknowns.bodies):
-            p = body.factor @ x[..., k, :, :] @ body.factor.T
-            back = np.linalg.inv(body.place)
-            parts.append(inertial_parameters(back @ (p - body.known if body.is_load else p) @ back.T))
-        for k, number in enumerate(unknowns.numbers):
-            share = 1.0 / (1.0 + np.exp(-np.clip(given.numbers[..., k], -FARTHEST, FARTHEST)))
-            parts.append((number.lowest + number.width * share)[..., None])
-        return cls(robot, tree, unknowns, np.concatenate(parts, axis=-1))
-
     @property
     def names(self) -> list[str]:
         """What every value is, with its unit."""
@@ -168,3 +151,18 @@ class Estimate(Shown):
             if number.code == code:
                 found[..., number.joint] = self.values[..., begin + k]
         return found
+
+
+def estimate_of(robot: Robot, tree: Packed, unknowns: Unknowns, duals: Float[np.ndarray, "*batch m"]) -> Estimate:
+    """The estimate that the memory of a law holds."""
+    given = Duals.of(duals, len(unknowns.bodies))
+    x, _ = logistic_and_cut(given.bodies)
+    parts = []
+    for k, body in enumerate(unknowns.bodies):
+        p = body.factor @ x[..., k, :, :] @ body.factor.T
+        back = np.linalg.inv(body.place)
+        parts.append(inertial_parameters(back @ (p - body.known if body.is_load else p) @ back.T))
+    for k, number in enumerate(unknowns.numbers):
+        share = 1.0 / (1.0 + np.exp(-np.clip(given.numbers[..., k], -FARTHEST, FARTHEST)))
+        parts.append((number.lowest + number.width * share)[..., None])
+    return Estimate(robot, tree, unknowns, np.concatenate(parts, axis=-1))
