@@ -18,7 +18,8 @@ def carrying(robot: Robot, loads: Iterable[tuple[str, Payload]]) -> Robot:
     Raises:
         RobotError: If there is no such link.
     """
-    own = read_options(layered(find(robot.source).options, robot.options)).payload
+    options = layered(find(robot.source).options, robot.options)
+    own = read_options({"payload": options.get("payload")}).payload
     last = end_link(robot)
     taken = {link or last for link in own}
     for link, load in loads:
