@@ -73,6 +73,7 @@ class AdaptiveLaw(Controller, nn.Module):
         law=a(LyapunovLaw, "a law with a Lyapunov function, such as NeuralBackstepping.for_robot(robot)"),
         adapts=texts,
         frame=maybe(text),
+        links=texts,
         load_mass=maybe(number(above=0.0, unit="kg")),
         load_radius=number(above=0.0, most=100.0, unit="m"),
         gain=number(above=0.0, below=1.0),

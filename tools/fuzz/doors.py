@@ -18,7 +18,7 @@ RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
-    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques",
+    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques", "Estimate",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -83,6 +83,12 @@ class Stock:
 
     def _run(self) -> Any:
         return nbs.simulate(self.plant, self.law, self.motion, 0.02, 0.001)
+
+    def _adaptive(self) -> Any:
+        return nbs.AdaptiveLaw(self.law, ["load", "friction"])
+
+    def _adapted(self) -> Any:
+        return nbs.simulate(self.plant, self.adaptive, self.motion, 0.02, 0.001)
 
     def _certificate(self) -> Any:
         return nbs.certify(self.law, [5.0, 5.0])
@@ -155,8 +161,12 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
     tensor = torch.zeros(4, 2, dtype=torch.float64)
     return {
         "AnalyticDynamics": {"masses": (1.0, 1.0), "lengths": (1.0, 1.0), "gravity": 9.8},
+        "AdaptiveLaw": {"law": s.law, "adapts": ["load", "friction"], "gain": 0.5, "rates": None},
+        "AdaptiveLaw.for_robot": {"adapts": ["load", "rotors"]},
         "Admissible.told": {"units": ["N·m", "N·m"]},
         "Admissible": {"box": np.ones(2), "radius": None},
+        "Estimate.of_duals": {"tree": s.adaptive.estimate().tree, "unknowns": s.adaptive.unknowns,
+                              "duals": s.adaptive.unknowns.start},
         "Dataset": {**{name: getattr(s.data, name) for name in _COLUMNS}, "robot": "arm", "about": {}},
         "ChangingPlant": {"first": s.plant, "changes": [(0.005, nbs.MujocoPlant(s.robot))]},
         "Damping": {"floor": np.eye(2), "gain": 0.2, "scale": np.ones(2), "ceiling": 1.0, "widths": (4,)},
@@ -167,6 +177,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "SlotineLi.losses": {"e": s.law.errors(Q, V, Z, Z, Z)},
         "SlidingMode.losses": {"e": s.law.errors(Q, V, Z, Z, Z)},
         "IdentifiedDynamics": {"parameters": s.identified.parameters},
+        "IdentifiedDynamics.write_urdf": {"path": s.folder / "written.urdf"},
         "LagrangianDynamics": {"network": s.learned.network},
         "ResidualDynamics": {"network": s.residual.network},
         "JointFriction": {"viscous": Z, "coulomb": Z, "transition": 0.01},
@@ -230,6 +241,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "monitor": {"start": 0},
         "paper_controller": {"m": 0.001},
         "plot_tracking": {"path": s.folder / "plot.png", "external": s.observer.observe(s.run)},
+        "plot_estimates": {"path": s.folder / "estimates.png", "run": s.adapted},
         "propose": {"error": 0.1, "disturbance": [1.0, 1.0], "duration": 0.5, "periods": (0.01,)},
         "replay": {"path": s.folder / "replay.html"},
         "tool_motion": {"path": s.tool_path, "frame": "tip", "posture": BENT, "duration": 5.0},
@@ -356,4 +368,4 @@ _FULL = (
     "NeuralBackstepping.for_robot",
 )
 """Doors that get the common values of optional arguments too."""
-_FALLBACK = {"memory": None, "reference": nbs.Reference(Q, V, V)}
+_FALLBACK = {"memory": None, "reference": nbs.Reference(Q, V, V), "recorded": np.zeros((2, 0))}
