@@ -192,6 +192,8 @@ def test_loads_add_up_with_those_that_the_arm_carries(tmp_path):
         in_mujoco = nbs.MujocoPlant(carrying(robot, loads)).step(q, v, tau, 1e-3)
         np.testing.assert_allclose(in_mujoco, moved, rtol=0.0, atol=1e-9)
     assert carrying(bare, []) is bare
+    moon = nbs.load_robot("two_link", gravity=1.62)  # of the catalogue or given, it is not a matter of the load
+    assert carrying(moon, [("", Payload(0.5, (0.0, 0.0, 0.0)))]).gravity_vector[2] == -1.62
 
 
 def _mass(model, q):

@@ -157,3 +157,12 @@ def test_the_row_of_the_paper_is_in_the_spread_and_its_index_is_most_of_the_erro
         assert 1e-6 < shifted < 2e-6
         assert shifted > 10.0 * aligned
         assert 4.0 < convergence < 8.0
+
+
+def test_two_kilograms_that_nobody_told_the_law_are_found_and_forgotten(tmp_path):
+    found, _ = run_demo("adaptive", tmp_path, "main(duration=8.0)")
+    assert found["adaptive"] < 0.1 * found["fixed"]
+    assert abs(found["with"] - 2.0) < 0.1
+    assert abs(found["after"]) < 0.1
+    folder = tmp_path / "out" / "demo" / "adaptive"
+    assert sorted(path.name for path in folder.iterdir()) == ["estimates.png", "replay.html"]

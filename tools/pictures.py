@@ -26,6 +26,8 @@ RUNS = {
     "collect": "collect three_link --samples 1000 --encoder-bits 16 --torque-noise 0.5",
     "learn": "learn {collect}/data.npz --friction",
     "compare": "compare {learn}/model.nbs",
+    "adapt": "track panda --controller nbs,adaptive --payload 2@5 --duration 20",
+    "adapt-one": "track panda --controller adaptive --payload 2@5-14 --duration 20",
     "my-track": "track {arm} --start-error 0.3 --duration 4",
     "my-certify": "certify {arm} --disturbance 2",
 }
@@ -35,6 +37,8 @@ CHARTS = {
     "learning": ("train", "learning"),
     "errors": ("compare", "errors"),
     "tracking": ("track", "tracking"),
+    "adapt-comparison": ("adapt", "comparison"),
+    "adapt-estimates": ("adapt-one", "estimates"),
     "tutorial-tracking": ("my-track", "tracking"),
     "tutorial-certificate": ("my-certify", "certificate"),
 }

@@ -41,7 +41,9 @@ class Track(Followed, Reported):
     """Simulator of the arm."""
     controller: Annotated[str, choices("--controller", LAWS, SAVED)] = "nbs"
     """A law by name, or a .nbs file with a controller and its gains; several, separated by commas, are compared.
-    nbs-paper: the paper's controller on two_link, its networks with gains for the arm on any other."""
+    nbs-paper: the paper's controller on two_link, its networks with gains for the arm on any other.
+    adaptive: nbs with a model that learns a load at the arm's end, friction and rotor inertia while it moves; writes
+    estimates.png, too. --payload 2@5 gives it something to learn."""
     period: Annotated[float, number("--period", least=1e-5, most=0.1, unit="s")] = 0.001
     """Control period [s]."""
     bandwidth: Annotated[float, number("--bandwidth", above=0.0, most=10_000.0, unit="rad/s")] = 8.0

@@ -88,6 +88,7 @@ class AdaptiveLaw(Controller, nn.Module):
         law=a(ModelLaw, "a law with a model, such as NeuralBackstepping.for_robot(robot)"),
         adapts=texts,
         frame=maybe(text),
+        links=texts,
         load_mass=maybe(number(above=0.0, unit="kg")),
         load_radius=number(above=0.0, most=100.0, unit="m"),
         gain=number(above=0.0, below=1.0),

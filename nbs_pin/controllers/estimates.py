@@ -67,9 +67,10 @@ class Estimate(Shown):
     def _facts(self) -> Iterable[str]:
         own = []
         if self._load >= 0 and self.values.ndim == 1:
-            centre = ", ".join(f"{1e3 * x:.0f}" for x in self.load_centre)
             name = self.unknowns.bodies[self._load].name.removeprefix(LOAD_AT)
-            own = [f"load {float(self.load_mass):.3g} kg at ({centre}) mm of {name}"]
+            centre = ", ".join(f"{1e3 * x:z.0f}" for x in self.load_centre)
+            there = f"load {float(self.load_mass):.3g} kg at ({centre}) mm of {name}"
+            own = [there if abs(self.load_mass) > NO_MASS else f"no load at {name}"]
         return self.robot.name, *own, f"{len(self.unknowns.bodies)} bodies, {len(self.unknowns.numbers)} numbers"
 
     @property

@@ -1,13 +1,14 @@
 """Rigid-body dynamics with the geometry of a URDF and identified inertial parameters."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
-from nbs_pin.base.arguments import checked
+from nbs_pin.base.arguments import checked, writable
 from nbs_pin.base.arrays import Array
 from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError
@@ -19,7 +20,9 @@ from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
 from nbs_pin.dynamics.structure import ModelClaims, rigid_tree_claims
 from nbs_pin.kernels.layout import Packed
+from nbs_pin.robots.joint_drive import Drive
 from nbs_pin.robots.robot import ARM, Robot
+from nbs_pin.robots.urdf_writer import write_urdf
 
 _ROUNDING = 1e-9
 """Allowance for rounding in the smallest eigenvalue of J, scaled to a unit diagonal."""
@@ -78,6 +81,33 @@ class IdentifiedDynamics(PinocchioDynamics):
     def packed_tree(self) -> Packed | None:
         """The joints and the identified bodies; None for a subclass, which may change equations."""
         return pack_model(self._model) if defines(self, "packed_tree") else None
+
+    @checked(path=writable)
+    def write_urdf(self, path: str | Path) -> Path:
+        """Write the arm's URDF with these bodies, rotor inertias and friction; returns its path.
+
+        `load_robot(path)` gives an arm whose M, C and G are those of this model. All that is fixed to the link behind a
+        joint, as a payload is, becomes part of that link's body. Friction that this model does not know stays as the
+        arm's; the speed `transition` of Coulomb friction has no place in URDF, as gravity has none: give `load_robot`
+        the arm's if it is not 9.81 m/s² downward. Meshes keep the addresses that they have in the arm's description.
+
+        Raises:
+            OSError: If it cannot be written.
+
+        Example:
+            >>> import tempfile
+            >>> import nbs_pin as nbs
+            >>> robot = nbs.load_robot("two_link")
+            >>> model = nbs.AdaptiveLaw.for_robot(robot).estimate().dynamics()
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     print(nbs.load_robot(model.write_urdf(f"{folder}/two_link.urdf")))
+            Robot('two_link', 2 joints, 2 kg, effort 100 N·m)
+        """
+        arm, friction = self.robot, self.friction
+        viscous, coulomb = (arm.damping, arm.friction) if friction is None else (friction.viscous, friction.coulomb)
+        numbers = zip(viscous.tolist(), coulomb.tolist(), self.rotor_inertia.tolist(), strict=True)
+        drives = {name: Drive(*own) for name, own in zip(arm.joint_names, numbers, strict=True)}
+        return write_urdf(arm, path, self._model, drives)
 
     def structure_claims(self) -> ModelClaims | None:
         """The claims of a rigid tree."""

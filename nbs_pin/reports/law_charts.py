@@ -7,11 +7,8 @@ import numpy as np
 
 from nbs_pin.base.records import Run
 from nbs_pin.base.units import several
-from nbs_pin.reports.plotting import ACTUAL, ERROR, FAST, LIMIT, REFERENCE, TORQUE, Heading, draw_changes, picture, thin
+from nbs_pin.reports.plotting import DASHES, LIMIT, LINES, Heading, draw_changes, picture, thin
 from nbs_pin.simulation.metrics import squared_error
-
-_COLOURS = (ACTUAL, REFERENCE, TORQUE, FAST, ERROR, "#8c564b", "#17a2b8", "#6c757d")
-_DASHES = ("solid", (0, (5, 2)), (0, (1, 1.2)))
 
 
 def plot_laws(runs: Mapping[str, Run], path: str | Path, heading: Heading | None = None) -> Path:
@@ -25,7 +22,7 @@ def plot_laws(runs: Mapping[str, Run], path: str | Path, heading: Heading | None
         errors, torques = figure.subplots(1, 2)
         limited = bool(np.isfinite(first.effort_limit).any())
         for k, (name, run) in enumerate(runs.items()):
-            style = {"color": _COLOURS[k % len(_COLOURS)], "linestyle": _DASHES[k // len(_COLOURS) % len(_DASHES)]}
+            style = {"color": LINES[k % len(LINES)], "linestyle": DASHES[k // len(LINES) % len(DASHES)]}
             error = np.sqrt(squared_error(run))
             errors.semilogy(*thin(run.t, np.where(error > 0.0, error, np.nan)), label=name, linewidth=1.0, **style)
             share = np.abs(run.tau) / (run.effort_limit if limited else 1.0)

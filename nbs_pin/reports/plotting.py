@@ -46,6 +46,10 @@ _STYLE: Any = {
     "svg.fonttype": "path",
 }  # fmt: skip
 INK, NOTE, VIOLET = "#1d2733", "#5d6b7a", "#7a4fa3"
+LINES = (ACTUAL, REFERENCE, TORQUE, FAST, ERROR, "#8c564b", "#17a2b8", "#6c757d")
+"""Colours of many curves in one panel."""
+DASHES: Any = ("solid", (0, (5, 2)), (0, (1, 1.2)))
+"""Dashes of the curves, where there are more than colours: the second for those after the first `LINES`."""
 _COLOURS = {GOOD: TORQUE, WARNING: "#8a5a00", BAD: ERROR}
 _UNDATED: Any = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
 _WIDE: Any = {"color": "#ffc891", "linewidth": 4.5}  # of the reference, so that it shows beside the curve on it
@@ -157,7 +161,7 @@ def plot_tracking(
     tool = tool_of(run)
     robot = robot_of(run) if robot is None and tool is not None else robot
     rows = run.nv + (tool is not None)
-    with picture(path, 13.0, 1.15 + 1.5 * rows + (1.5 if tool else 0.0), heading=_heading(one, robot)) as figure:
+    with picture(path, 13.0, 1.15 + 1.5 * rows + (1.5 if tool else 0.0), heading=heading_of(one, robot)) as figure:
         heights = [1.0] * run.nv + [2.0] * (tool is not None)
         grid = figure.subplots(rows, 3, sharex=True, squeeze=False, height_ratios=heights)
         for joint, (position_axes, error_axes, torque_axes) in enumerate(grid[: run.nv]):
@@ -190,9 +194,9 @@ def _observed(external: ObservedTorques, run: Run, start: int) -> Float[np.ndarr
     return external.torque.reshape(len(run.t), -1, run.nv)[:, start]
 
 
-def _heading(run: Run, robot: Robot | None) -> Heading:
-    """Arm, law and settings, and what the errors of one start amount to, if they can be summed up."""
-    title, stopped = f"{arm_in_words(run)}: {law_in_words(run)}", {"stopped": run.info.get("stopped")}
+def heading_of(run: Run, robot: Robot | None = None, title: str = "") -> Heading:
+    """Title ("": arm and law) and settings, and what the errors of one start amount to, if they can be summed up."""
+    title, stopped = title or f"{arm_in_words(run)}: {law_in_words(run)}", {"stopped": run.info.get("stopped")}
     if len(run.t) < 3 or not np.isfinite(run.q).all():
         return Heading(title, settings_in_words(run), verdict_of(stopped) if stopped["stopped"] else None)
     verdict = verdict_of(figures(run, robot) | stopped, interrupted=run.info.get("interrupted") is True)
@@ -303,7 +307,7 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float, observed: boo
         axes.set_title(title, loc="left", fontsize=9.5, color=INK, pad=9)
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
-        axes.set_xlim(run.t[0], run.t[-1] if run.t[-1] > run.t[0] else run.t[0] + 1.0)
+        axes.set_xlim(*time_span(run))
     handles = [
         figure.axes[0].plot([], [], color=ACTUAL, label="actual")[0],
         figure.axes[0].plot([], [], **_WIDE, label="reference")[0],
@@ -317,6 +321,11 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float, observed: boo
         handles.append(figure.axes[0].plot([], [], label="the plant changes", **_CHANGE)[0])
     shown = handles if cut else [*handles[:2], *handles[3:]]
     figure.legend(handles=shown, loc="upper right", ncols=6, frameon=False)
+
+
+def time_span(run: Run) -> tuple[float, float]:
+    """The time axis of a run [s]; one second for a run of one instant."""
+    return float(run.t[0]), float(run.t[-1] if run.t[-1] > run.t[0] else run.t[0] + 1.0)
 
 
 def draw_changes(each: Iterable[Axes], run: Run) -> None:

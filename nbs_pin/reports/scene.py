@@ -16,8 +16,10 @@ from meshcat.path import Path as ScenePath
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.reports.pages import encoded
+from nbs_pin.robots.carrying import end_link
 from nbs_pin.robots.robot import Robot
 from nbs_pin.robots.visuals import Tip, Visual, link_visuals, tips
+from nbs_pin.simulation.run_figures import loads_of
 from nbs_pin.simulation.tool_errors import tool_of
 
 FRAME_RATE = 50.0
@@ -30,6 +32,8 @@ MAX_POINTS = 400
 """Most points of such a path."""
 SHORTEST_PATH = 1e-6
 """Shorter ones are not drawn [m]."""
+DENSITY = 2700.0
+"""Of the balls that stand for loads [kg/m³]."""
 MAX_FRAMES = 12_000
 """Longer runs get fewer frames per second, so that the page stays small."""
 
@@ -57,6 +61,7 @@ def scene_of(run: Run, robot: Robot, package_dirs: Iterable[str | Path] = ()) ->
             if frame.type == pin.FrameType.BODY
         },
         "tips": [{"name": tip.name, "body": tip.joint, "point": tip.point.tolist()} for tip in tips_of(run, robot)],
+        "loads": _loads(run, robot),
         "path": "" if tool is None else encoded(_path(robot, run.q_ref, tool["frame"])),
         "view": _view(robot, visuals, poses),
         "commands": [base64.b64encode(umsgpack.packb(command)).decode() for command in scene_commands(robot, visuals)],
@@ -103,6 +108,23 @@ def _path(robot: Robot, q_ref: Float[np.ndarray, "rows n"], frame: str) -> Float
     if along[-1] < SHORTEST_PATH:
         return points[:0]
     return np.asarray(points[np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], MAX_POINTS)))])
+
+
+def _loads(run: Run, robot: Robot) -> list[dict[str, Any]]:
+    """Balls for the loads that appeared in the plant: the body that carries each, its centre there [m], its times [s].
+
+    They have the size that aluminium of their mass has. One at a link that this arm does not have is left out.
+    """
+    balls = []
+    for load in loads_of(run):
+        link, centre = load["link"] or end_link(robot), np.array(load.get("com_m", np.zeros(3)), dtype=float)
+        if not robot.model.existFrame(link, pin.FrameType.BODY) or centre.shape != (3,):
+            continue
+        frame = robot.model.frames[robot.model.getFrameId(link, pin.FrameType.BODY)]
+        place = {"body": int(frame.parentJoint), "point": (frame.placement * centre).tolist()}
+        radius = float(np.cbrt(3.0 * abs(load["mass_kg"]) / (4.0 * np.pi * DENSITY)))
+        balls.append({**place, "radius": radius, "from": load["from_s"], "until": load["until_s"]})
+    return balls
 
 
 def _frame_rows(t: Float[np.ndarray, " rows"], least: int = 0) -> Int[np.ndarray, " frames"]:

@@ -9,6 +9,7 @@ from nbs_pin.base.records import Run
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.momentum_observer import MomentumObserver
 from nbs_pin.reports.captions import friction_of
+from nbs_pin.reports.estimate_panels import panels_of
 from nbs_pin.reports.pages import encoded
 from nbs_pin.reports.plotting import stretches
 from nbs_pin.reports.scene import positions, tips_of
@@ -42,7 +43,12 @@ def signals_of(run: Run, robot: Robot, most: int = MAX_ROWS) -> dict[str, Any]:
         "tip": encoded(np.linalg.norm(gap, axis=-1)),
         "saturated": [[(float(t[i]), float(t[j])) for i, j in stretches(of_joint)] for of_joint in cut.T],
         "disturbed": bool(run.disturbance.any()),
-    }
+        "estimates": [
+            {"title": title, "unit": unit, "names": list(curves), "of_joints": of_joints,
+             "values": encoded(np.stack(list(curves.values()), axis=-1)[rows])}
+            for title, unit, curves, of_joints in panels_of(run)
+        ],
+    }  # fmt: skip
 
 
 def _rows(run: Run, most: int) -> Int[np.ndarray, " rows"]:

@@ -8,15 +8,13 @@ import numpy as np
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.units import measured, several
-from nbs_pin.simulation.run_figures import load_of
+from nbs_pin.simulation.run_figures import LIGHT, load_of
 
 GOOD, WARNING, BAD, NOTE = "good", "warning", "bad", "note"
 """How a verdict is coloured: kept, to be looked at, broken, and neither."""
 _SEVERITY = (NOTE, GOOD, WARNING, BAD)
 _IN_TIME = 0.7
 """Share of the time by which an arm must have converged: one that is near its motion later may only be passing it."""
-_LIGHT = 0.02
-"""A learned load of less than this [kg] is none."""
 _USABLE = 0.1
 """Torque error over the standard deviation of the torque below which a learned model is good."""
 _CONSTANT = 100.0
@@ -135,9 +133,9 @@ def _load_learned(figures: Mapping[str, Any]) -> tuple[str, ...]:
     if found is None:
         return ()
     link, mass, centre = found
-    if abs(mass) < _LIGHT:
+    if abs(mass) < LIGHT:
         return (f"the law has learned that {link} carries no load",)
-    at = ", ".join(f"{1e3 * x:.0f}" for x in centre)
+    at = ", ".join(f"{1e3 * x:z.0f}" for x in centre)
     return (f"the law has learned a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm",)
 
 

@@ -18,8 +18,9 @@ def carrying(robot: Robot, loads: Iterable[tuple[str, Payload]]) -> Robot:
     Raises:
         RobotError: If there is no such link.
     """
-    own = read_options(layered(find(robot.source).options, robot.options)).payload
-    last = _last_link(robot) or tool_frame(robot)
+    options = layered(find(robot.source).options, robot.options)
+    own = read_options({"payload": options.get("payload")}).payload
+    last = end_link(robot)
     taken = {link or last for link in own}
     for link, load in loads:
         at = link or last
@@ -31,8 +32,11 @@ def carrying(robot: Robot, loads: Iterable[tuple[str, Payload]]) -> Robot:
     return robot
 
 
-def _last_link(robot: Robot) -> str:
-    """The only link without a child, apart from those of payloads; "" if there are several."""
+def end_link(robot: Robot) -> str:
+    """The link that carries a load for which none is named: the only one without a child, apart from payloads.
+
+    Where there are several, it is the frame of the tool.
+    """
     arm = ET.fromstring(robot.urdf.xml)
     ends = {link.get("name", "") for link in arm.iterfind("link")}
     for joint in arm.iterfind("joint"):
@@ -40,4 +44,4 @@ def _last_link(robot: Robot) -> str:
         if parent is not None and child is not None:
             at, on = parent.get("link", ""), child.get("link", "")
             ends.discard(on if on == f"payload_{at}" else at)
-    return ends.pop() if len(ends) == 1 else ""
+    return ends.pop() if len(ends) == 1 else tool_frame(robot)

@@ -13,6 +13,9 @@ from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation import metrics
 from nbs_pin.simulation.tool_errors import tool_errors, tool_of
 
+LIGHT = 0.02
+"""A learned load of less than this [kg] is none."""
+
 
 def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     """`metrics.summary` of the run and the RMS error over its last 30 %, as JSON can store them.

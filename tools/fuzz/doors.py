@@ -19,7 +19,7 @@ RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
-    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques",
+    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques", "Estimate",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -171,6 +171,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "AdaptiveLaw.estimate": {"recorded": None},
         "plot_estimates": {"path": s.folder / "estimates.png", "run": s.adapted},
         "AnalyticDynamics": {"masses": (1.0, 1.0), "lengths": (1.0, 1.0), "gravity": 9.8},
+        "AdaptiveLaw.for_robot": {"adapts": ["load", "rotors"]},
         "Admissible.told": {"units": ["N·m", "N·m"]},
         "Admissible": {"box": np.ones(2), "radius": None},
         "Dataset": {**{name: getattr(s.data, name) for name in _COLUMNS}, "robot": "arm", "about": {}},
@@ -183,6 +184,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "SlotineLi.losses": {"e": s.law.errors(Q, V, Z, Z, Z)},
         "SlidingMode.losses": {"e": s.law.errors(Q, V, Z, Z, Z)},
         "IdentifiedDynamics": {"parameters": s.identified.parameters},
+        "IdentifiedDynamics.write_urdf": {"path": s.folder / "written.urdf"},
         "LagrangianDynamics": {"network": s.learned.network},
         "ResidualDynamics": {"network": s.residual.network},
         "JointFriction": {"viscous": Z, "coulomb": Z, "transition": 0.01},

@@ -11,6 +11,7 @@ const SIGNALS = {
   saturation: {chip: "saturation", title: "torque asked for", unit: "% of the limit", parts: [["share", (x) => 100 * x]], line: 100, note: "above 100 % it is cut"},
   disturbance: {chip: "disturbance", title: "disturbance", of: "torque", parts: [["disturbance"]]},
   external: {chip: "from outside", title: "torque from outside, by the momentum", of: "torque", parts: [["external"], ["disturbance", null, [6, 4]]], dashed: "simulated", note: "dashed: the simulated disturbance, if any"},
+  estimates: {chip: "estimates", title: "learned", parts: [["estimates"]]},
   tip: {chip: "tip", title: "tip, distance from the reference", log: true, unit: "mm", parts: [["tip", (x) => 1000 * x]]},
 };
 
@@ -30,8 +31,10 @@ function createCharts(root, runs, clock, shown, height) {
   const sizeOf = (k) => Math.max(...runs.map((run, r) => (joints[k].at[r] < 0 ? 0 : Math.hypot(...run.column("error", joints[k].at[r])))));
   const worst = () => joints.reduce((most, _, k) => (sizeOf(k) > sizeOf(most) ? k : most), 0);
   const chosen = new Set(several ? [worst()] : joints.map((_, k) => k));
-  let tip = 0, plots = [], zooming = false;
-  const names = Object.keys(SIGNALS).filter((name) => name !== "disturbance" || runs.some((run) => run.signals.disturbed));
+  const panels = [...new Set(runs.flatMap((run) => run.signals.estimates.map(({title, unit}) => `${title} [${unit}]`)))];
+  let tip = 0, panel = panels[0], plots = [], zooming = false;
+  const there = {disturbance: runs.some((run) => run.signals.disturbed), estimates: panels.length > 0};
+  const names = Object.keys(SIGNALS).filter((name) => there[name] ?? true);
 
   root.innerHTML = `<div class="chips signals" role="group" aria-label="signals"></div><div class="chips joints" role="group" aria-label="joints"></div><div class="plots"></div>`;
   const [signalChips, jointChips, place] = root.children;
@@ -88,10 +91,23 @@ function createCharts(root, runs, clock, shown, height) {
     zooming = false;
   }
 
+  function learnedLines(run, index) {   // the lines of the panel of estimates that is chosen, those of the chosen joints
+    const of = run.signals.estimates.find(({title, unit}) => `${title} [${unit}]` === panel);
+    if (!of) return [];
+    const all = of.decoded ??= decoded(of.values, Float32Array), width = of.names.length;
+    const placed = of.names.map((name) => (of.of_joints ? joints.findIndex(({at}) => at[index] >= 0 && run.joints[at[index]].name === name) : -1));
+    return of.names.map((name, k) => ({
+      label: several ? `${run.label}, ${name}` : name, aside: false, dash: name === "carried" && !of.of_joints ? [2, 3] : undefined,
+      colour: several ? colour(index) : colour(of.of_joints ? placed[k] : k), unit: of.unit, width: 1.3,
+      values: Array.from(run.columns.times, (_, row) => all[row * width + k]).map((x) => (Number.isNaN(x) ? null : x)),
+    })).filter((_, k) => !of.of_joints || chosen.has(placed[k]));
+  }
+
   function linesOf(signal, run, index) {   // label, colour, values and dashes of every line of a run
+    if (signal === SIGNALS.estimates) return learnedLines(run, index);
     const all = signal.parts[0][0] === "tip" ? tips : joints, picked = all === tips ? [tip] : [...chosen].sort((a, b) => a - b);
     return picked.filter((k) => all[k].at[index] >= 0).flatMap((k) => signal.parts.filter(([name, , dash]) => !dash || name !== "disturbance" || run.signals.disturbed).map(([name, change, dash]) => ({
-      label: several ? run.label : all[k].name, beside: signal.dashed ?? "reference", dash: dash ?? (several && index > 9 ? [2, 2] : undefined),
+      label: several ? run.label : all[k].name, beside: signal.dashed ?? "reference", aside: Boolean(dash), dash: dash ?? (several && index > 9 ? [2, 2] : undefined),
       colour: several ? colour(index) : all === tips ? themed("--ink") : colour(k), unit: signal.unit ?? run.joints[all[k].at[index]][signal.of],
       values: run.column(name, all[k].at[index]).map((x) => (x = change ? change(x) : x, signal.log && !(x > 0) ? null : x)),
       width: dash ? 1 : 1.3,
@@ -137,7 +153,11 @@ function createCharts(root, runs, clock, shown, height) {
     const units = [...new Set(lines.map((line) => line.unit))].join(", ");
     const heading = box.appendChild(document.createElement("h3"));
     heading.textContent = `${signal.title}${units ? ` [${units}]` : ""}`;
-    if (signal.parts[0][0] === "tip" && tips.length > 1) heading.append(tipChoice());
+    if (name === "tip" && tips.length > 1) heading.append(choice("tip", tips.map((one) => one.name), tip, (k) => { tip = k; }));
+    if (name === "estimates") {
+      heading.textContent = signal.title;   // the panels name their units
+      heading.append(choice("what was learned", panels, panels.indexOf(panel), (k) => { panel = panels[k]; }));
+    }
     if (signal.note) heading.appendChild(document.createElement("span")).textContent = signal.note;
     const data = uPlot.join(tables.map(({run, lines: own}) => [run.columns.times, ...own.map((line) => line.values)]));
     const hovered = {is: false, from: 0};
@@ -186,12 +206,13 @@ function createCharts(root, runs, clock, shown, height) {
     plots.push({plot, marker, box});
   }
 
-  function tipChoice() {
+  function choice(what, options, chosenOne, choose) {
     const select = document.createElement("select");
-    tips.forEach(({name}, k) => select.add(new Option(name, k, k === tip, k === tip)));
+    options.forEach((text, k) => select.add(new Option(text, k, k === chosenOne, k === chosenOne)));
     select.style.height = "22px";
-    select.setAttribute("aria-label", "tip");
-    select.onchange = () => { tip = Number(select.value); draw(); };
+    select.style.maxWidth = "70vw";
+    select.setAttribute("aria-label", what);
+    select.onchange = () => { choose(Number(select.value)); draw(); };
     return select;
   }
 
@@ -205,10 +226,10 @@ function createCharts(root, runs, clock, shown, height) {
       let at = idx;   // of runs with other times, the last value before
       while (at > 0 && plot.data[k + 1][at] === undefined) at -= 1;
       const value = plot.data[k + 1][at];
-      if (value === null || value === undefined || line.dash && several) return;
+      if (value === null || value === undefined || line.aside && several) return;
       const row = tooltip.appendChild(document.createElement("div"));
       Object.assign(row.appendChild(document.createElement("span")), {className: "swatch"}).style.background = line.colour;
-      row.append(line.label + (line.dash ? ` (${line.beside})` : ""));
+      row.append(line.label + (line.aside ? ` (${line.beside})` : ""));
       const also = beside(value, line.unit);
       row.appendChild(document.createElement("span")).textContent = `${told(value)} ${line.unit}${also ? ` (${also})` : ""}`;
     });

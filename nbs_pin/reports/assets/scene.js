@@ -96,6 +96,15 @@ function createScene(box, run, clock, room = () => ({left: 0, top: 0, bottom: 0}
     viewer.scene.add(grid, shadow);
   }
 
+  // --- what the plant carries besides the arm, while it does
+  const loads = data.loads.map(({body, point, radius: size, from, until}) => {
+    const ball = new THREE.Mesh(new THREE.SphereGeometry(size, 32, 20), new THREE.MeshPhongMaterial({color: 0x7a4fa3, specular: 0x2a2a2a}));
+    ball.position.fromArray(point);
+    ball.castShadow = ball.receiveShadow = true;
+    groups[0][body].add(ball);
+    return {ball, from, until};
+  });
+
   // --- the traces of the tip: where it was, and the path or the trace of the reference
   const dark = new THREE.LineBasicMaterial({transparent: true, opacity: .9});
   const pale = new THREE.LineBasicMaterial({transparent: true, opacity: .55});
@@ -182,6 +191,7 @@ function createScene(box, run, clock, room = () => ({left: 0, top: 0, bottom: 0}
       group.position.fromArray(poses, i).lerp(point.fromArray(poses, j), part);
       group.quaternion.fromArray(poses, i + 3).slerp(turn.fromArray(poses, j + 3), part);
     }));
+    for (const {ball, from, until} of loads) ball.visible = clock.now >= from && (until === null || clock.now < until);
     traces[0].geometry.setDrawRange(0, a + 1);
     viewer.set_dirty();
   }
