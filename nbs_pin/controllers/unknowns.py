@@ -31,7 +31,7 @@ _UPPER = np.triu_indices(4)
 _LEAST_SHARE = 1e-4  # what every direction of a body begins with, where the model has less, as a share of the largest
 _REACH = 2.0  # a link's largest body, as a multiple of the one that the model has
 _LENGTH, _SPREAD = 0.05, 0.02  # what a link's largest body has besides, so that a point mass is within it [m, share]
-_FRICTION = 0.1  # largest Coulomb friction and offset, as a share of the effort limit
+_FRICTION, _OFFSET = 0.1, 0.5  # largest Coulomb friction and constant torque, as shares of the effort limit
 _BEND = 1e-5  # friction may seem to be below zero by what bends a joint by this much [rad, m]
 _ROTOR, _LIGHTER = 0.25, 0.2  # largest rotor, of the arm's largest inertia; how much lighter the joints may seem
 _ANY = 1e-3  # a bandwidth [rad/s], on which the stiffness does not depend
@@ -159,7 +159,7 @@ def unknown_numbers(
     speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, _FAST)
     n, zero, largest, dynamics = robot.nv, np.zeros(robot.nv), _FRICTION * effort, PinocchioDynamics(robot)
     if kind == "offsets":
-        return [UnknownNumber(NumberCode.OFFSET, i, -x, 2.0 * x, 0.0, 0.0) for i, x in enumerate(largest)]
+        return [UnknownNumber(NumberCode.OFFSET, i, -x, 2.0 * x, 0.0, 0.0) for i, x in enumerate(_OFFSET * effort)]
     if kind == "friction":
         own = (zero, zero) if friction is None else (friction.viscous, friction.coulomb)
         below = _BEND * gains_for_robot(robot, dynamics, bandwidth=_ANY, period=period).stiffness

@@ -12,34 +12,47 @@ from nbs_pin.kernels.layout import NumberCode
 
 _STATES = 200
 _SPEED, _START = 0.25, 0.5  # share of the velocity limits, and time in which all of it is reached [s]
-_SHARES = {NumberCode.VISCOUS: 0.03, NumberCode.COULOMB: 0.3, NumberCode.ROTOR: 0.3, NumberCode.OFFSET: 0.3}
+_SLOW = 0.02  # share of the velocity limits at which Coulomb friction has its full size
+_DELAY = 2.5  # periods from z2 to its effect: it is two instants old, and a held torque acts half a period late
+_SHARES = {NumberCode.VISCOUS: 0.03, NumberCode.COULOMB: 0.1, NumberCode.ROTOR: 0.1, NumberCode.OFFSET: 0.1}
 """How fast numbers adapt beside bodies: slowly, as each explains an error of its joint at once, rightly or not."""
 
 
 def update_rates(
     law: LyapunovLaw, unknowns: Unknowns, tree: RigidTree, gravity: np.ndarray, *, gain: float, period: float
 ) -> Float[np.ndarray, " unknowns"]:
-    """γ of every unknown [1/J]: a step of all costs at most `gain` times z2ᵀ(ωM + D₀)z2 in usual motions.
+    """γ of every unknown [1/J], as large as two conditions allow; below, Z = ωM + D₀.
 
     A step from Q to Q − γhS costs (γh)²‖S‖²/8 of divergence, as the conjugate of the Fermi–Dirac entropy,
-    tr log(1 + e^Q), has a Hessian ≤ ¼, so Σ γh‖S‖²/8 of V̇ (docs/theory.md §10). S is linear in z2: with
-    ℓ² = max λ(SᵀS, ωM + D₀) for every unknown, shares s and λ = max λ(Σ s SᵀS/ℓ², ωM + D₀), γ = gain·8s/(h ℓ² λ). The
-    largest are over sampled poses, velocities up to a quarter of the limits and accelerations that reach the limits in
-    half a second.
+    tr log(1 + e^Q), has a Hessian ≤ ¼, so Σ γh‖S‖²/8 of V̇ (docs/theory.md §10). S is linear in z2: in usual motions
+    all costs together are at most `gain` times z2ᵀZz2. These are sampled poses, velocities up to a quarter of the
+    limits and accelerations that reach the limits in half a second.
+
+    Friction and offsets do not vanish in slow motions, where S is constant: their estimates are integral action of a
+    stiffness I = Σ γSᵀS/4 at most, and M z̈2 + Z ż2 + I z2(t − d) = 0 with the delay d = 2.5h is stable for I d ≺ Z. So
+    numbers are slower where I d, for numbers alone, would be above `gain`·Z.
     """
     n, robot, count = law.nv, law.dynamics.robot, len(unknowns.bodies)
     assert robot is not None
     rng, q = np.random.default_rng(0), sample_configurations(robot, _STATES)
     speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, np.pi)
     v, a = rng.uniform(-_SPEED, _SPEED, q.shape) * speed, rng.uniform(-1.0, 1.0, q.shape) * speed / _START
-    now = AdaptingModel.of(unknowns, tree, gravity, np.tile(unknowns.start, (_STATES, 1)), q, v, v, a)
-    units = [now.slopes(np.tile(unit, (_STATES, 1))) for unit in np.eye(n)]
-    bodies = np.stack([unit.bodies.reshape(_STATES, count, 16) for unit in units], axis=-1)
-    numbers = np.stack([unit.numbers for unit in units], axis=-1)
-    forms = np.concatenate([bodies.swapaxes(-1, -2) @ bodies, numbers[..., :, None] * numbers[..., None, :]], axis=1)
     root = np.linalg.cholesky(law.inertial_rate * law.dynamics.mass_matrix(q) + law.lyapunov().floor)[:, None]
-    forms = np.linalg.solve(root, np.linalg.solve(root, forms).swapaxes(-1, -2))
-    sizes = np.linalg.eigvalsh(forms)[..., -1].max(axis=0)
-    shares = np.array([1.0] * count + [_SHARES[number.code] for number in unknowns.numbers]) / sizes
-    together = np.linalg.eigvalsh(np.einsum("k,skij->sij", shares, forms)).max()
-    return np.asarray(gain * 8.0 * shares / (period * together))
+
+    def forms(v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """SᵀS of every state and unknown in the metric Z."""
+        now = AdaptingModel.of(unknowns, tree, gravity, np.tile(unknowns.start, (_STATES, 1)), q, v, v, a)
+        units = [now.slopes(np.tile(unit, (_STATES, 1))) for unit in np.eye(n)]
+        bodies = np.stack([unit.bodies.reshape(_STATES, count, 16) for unit in units], axis=-1)
+        numbers = np.stack([unit.numbers for unit in units], axis=-1)
+        own = np.concatenate([bodies.swapaxes(-1, -2) @ bodies, numbers[..., :, None] * numbers[..., None, :]], axis=1)
+        return np.asarray(np.linalg.solve(root, np.linalg.solve(root, own).swapaxes(-1, -2)))
+
+    moving, slow = forms(v, a), forms(_SLOW * np.sign(v) * speed, 0.0 * a)
+    shares = np.array([1.0] * count + [_SHARES[number.code] for number in unknowns.numbers])
+    shares = shares / np.linalg.eigvalsh(moving)[..., -1].max(axis=0)
+    usual = np.linalg.eigvalsh(np.einsum("k,skij->sij", shares, moving)).max()
+    rest = np.linalg.eigvalsh(np.einsum("k,skij->sij", shares[count:], slow[:, count:])).max()
+    at_most = np.full(len(shares), 8.0 / usual)
+    at_most[count:] = min(8.0 / usual, 4.0 / (_DELAY * rest)) if rest > 0.0 else 8.0 / usual
+    return np.asarray(gain / period * shares * at_most)
