@@ -238,7 +238,8 @@ def with_encoders(one: Arm, law: nbs.Controller, seconds: float, bits: int = 16)
 
 def encoders(name: str, options: Options) -> Iterator[Finding]:
     """Row e."""
-    for what, law, asked in zip(("RMS error, last quarter", "  of the fixed law"), laws(name)[::-1], (3.0, None)):
+    rows = zip(("RMS error, last quarter", "  of the fixed law"), laws(name)[::-1], (3.0, None), strict=True)
+    for what, law, asked in rows:
         found = with_encoders(arm(name), law, options.seconds)
         rms = np.sqrt(np.square(found[len(found) * 3 // 4 :]).mean(axis=0)).max()
         yield Finding("e", name, what, 1e3 * float(rms), "mrad", asked)

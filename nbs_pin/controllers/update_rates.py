@@ -23,6 +23,8 @@ _SHARES = {
     NumberCode.ACCELERATION: 0.1,
 }
 """How fast numbers adapt beside bodies: slowly, as each explains an error of its joint at once, rightly or not."""
+_OFFSETS = (NumberCode.OFFSET, NumberCode.ACCELERATION)
+_WELL_DAMPED = 0.15  # of what the delay allows: offsets act at every speed, and so are to be damped well
 
 
 def update_rates(
@@ -70,4 +72,8 @@ def update_rates(
     rest = np.linalg.eigvalsh(np.einsum("k,skij->sij", shares[delayed], slow[:, delayed])).max(initial=0.0)
     if rest > 0.0:
         at_most[delayed] = np.minimum(at_most[delayed], 4.0 / (_DELAY * rest))
-    return np.asarray(gain / period * shares * at_most)
+    rates = shares * at_most
+    for k, number in enumerate(unknowns.numbers, start=count):
+        if number.code in _OFFSETS:
+            rates[k] = min(rates[k], _WELL_DAMPED * 4.0 / (_DELAY * float(np.linalg.eigvalsh(slow[:, k])[:, -1].max())))
+    return np.asarray(gain / period * rates)
