@@ -334,7 +334,7 @@ def _fixed(
     for mass, centre in {(worst.mass, tuple(worst.centre)), (payload.mass, (0.0, 0.0, 0.0))}:
         loaded = law.robot.with_payload(frame, mass, com=centre) if mass > 0.0 else law.robot
         plant = DynamicsPlant(PinocchioDynamics(loaded), friction=inner.friction)
-        run = simulate(plant, inner.compile(), reference, length, _PERIOD)
+        run = simulate(plant, inner.compile(), reference, math.ceil(length / _PERIOD) * _PERIOD, _PERIOD)
         errors.append(np.abs(inner.dynamics.difference(run.q, run.q_ref)).max(axis=0))
     return FixedLaw(np.max(errors, axis=0), certificate, refused)
 
