@@ -117,7 +117,7 @@ def outcome(seed: int) -> Outcome:
     motion = motion_in(rng, loaded, duration)
     begin = motion(np.zeros(1))
     size = 0.0 if rng.uniform() < 0.5 else float(10.0 ** rng.uniform(-4.0, -1.0))
-    q0 = begin.q[0] + size * rng.uniform(-1.0, 1.0, robot.nv)
+    q0 = np.clip(begin.q[0] + size * rng.uniform(-1.0, 1.0, robot.nv), robot.lower, robot.upper)
     v0 = begin.v[0] + size * rng.uniform(-1.0, 1.0, robot.nv)
     truth = nbs.PinocchioDynamics(loaded)
     start = float(storage(inner, truth, q0, v0, begin.q[0], begin.v[0])[0])

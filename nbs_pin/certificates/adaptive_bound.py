@@ -54,7 +54,7 @@ class TransientBound(Shown):
         >>> import nbs_pin as nbs
         >>> law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(nbs.load_robot("panda")), load_mass=2.0)
         >>> nbs.transient_bound(law, 2.0)
-        TransientBound(panda, 0 to 2 kg at panda_hand_tcp, PROVED ‖z1‖ ≤ 2.95° in continuous time)
+        TransientBound(panda, 0 to 2 kg at panda_hand_tcp, PROVED ‖z1‖ ≤ 0.0217 rad (1.24°) for 10 s in continuous time)
     """
 
     law: AdaptiveLaw

@@ -93,8 +93,8 @@ def _controller(options: Certify, truth: Robot | None) -> LyapunovLaw:
         )
         if isinstance(law, (AdaptiveLaw, CompiledAdaptiveLaw)):
             raise CertificateRefused(
-                f"{what}, which adapts, and a certificate is of a law that does not; call nbs.transient_bound in "
-                "Python for its bound, or give the law that it is about."
+                f"{what}, which adapts, and a certificate is of a law that does not; transient_bound in "
+                "Python bounds its error, or give the law that it is about."
             )
         raise CertificateRefused(
             f"{what}, of which no Lyapunov function is known; give one that has it, such as nbs or slotine-li."
