@@ -8,7 +8,8 @@ the bound is for: no load, a point or five points, often the heaviest at the edg
 it, with V(0) of the loaded arm counted, and follows a random smooth motion at 1 kHz, every third time under an
 admissible disturbance. Every other arm has effort limits that it never reaches. A run whose torque is cut off is
 counted and left out, since the bound assumes that none is. V and every |z1_i| at each instant are compared with the
-bounds; the exit code is 1 if one is exceeded. Ctrl-C reports what is done.
+bounds; the exit code is 1 if one is exceeded, and the run is repeated with a quarter of the period, as the bound is proved in
+continuous time. Ctrl-C reports what is done.
 """
 
 import argparse
@@ -103,8 +104,8 @@ def motion_in(rng: np.random.Generator, robot: nbs.Robot, duration: float) -> An
             return motion
 
 
-def outcome(seed: int) -> Outcome:
-    """One run against its bound."""
+def outcome(seed: int, period: float = PERIOD) -> Outcome:
+    """One run against its bound, with this control period [s]."""
     rng = np.random.default_rng(seed)
     name, ample = str(rng.choice(ARMS)), seed % 2 == 1
     law = law_of(name, ample, float(rng.choice((4.0, 8.0))), int(rng.integers(3)))
@@ -131,7 +132,7 @@ def outcome(seed: int) -> Outcome:
         given["disturbance"] = lambda t, q, v: wave[min(int(t / PERIOD + 1e-6), steps - 1)]
     none = nbs.JointFriction(np.zeros(robot.nv), np.zeros(robot.nv))
     bound = nbs.transient_bound(law, mass, radius, start, disturbance=box, friction=none, duration=duration)
-    run = nbs.simulate(nbs.MujocoPlant(loaded), law.compile(), motion, duration, PERIOD, q0=q0, v0=v0, **given)
+    run = nbs.simulate(nbs.MujocoPlant(loaded), law.compile(), motion, duration, period, q0=q0, v0=v0, **given)
     cut = bool((run.tau != run.tau_command).any())
     values, z1 = storage(inner, truth, run.q, run.v, run.q_ref, run.v_ref)
     largest, errors = max(float(np.max(values)), _LEAST), np.maximum(np.abs(z1).max(axis=0), _LEAST)
@@ -185,7 +186,11 @@ def report(found: list[Outcome]) -> int:
                 )
     broken = [x for x in found if x.broken]
     for x in broken:
-        print(f"BROKEN, seed {x.seed}: √V {x.storage:.4f}, |z1_i| {x.joint:.4f}, {x.told}")
+        again = outcome(x.seed, 0.25 * PERIOD)
+        print(
+            f"BROKEN, seed {x.seed}: √V {x.storage:.4f}, |z1_i| {x.joint:.4f}, and with a quarter of the period "
+            f"{again.storage:.4f} and {again.joint:.4f}, {x.told}"
+        )
     print(f"broken bounds: {len(broken)} of {len(whole)}")
     return 1 if broken else 0
 

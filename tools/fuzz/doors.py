@@ -18,7 +18,7 @@ RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
-    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques", "TransientBound", "Estimate",
+    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques", "TransientBound",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -160,7 +160,6 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
     single = nbs.Reference(Q, V, V)
     tensor = torch.zeros(4, 2, dtype=torch.float64)
     return {
-        "AdaptiveLaw": {"law": s.law, "adapts": ["load"], "load_mass": 0.5, "gain": 0.5},
         "AnalyticDynamics": {"masses": (1.0, 1.0), "lengths": (1.0, 1.0), "gravity": 9.8},
         "Admissible.told": {"units": ["N·m", "N·m"]},
         "Admissible": {"box": np.ones(2), "radius": None},
