@@ -1,6 +1,6 @@
 """How often the transient bound of an adaptive law is wrong: random loads, starts, motions and disturbances in MuJoCo.
 
-    python tools/adaptive_bound_campaign.py                # 1,000 runs on two cores, about ten minutes
+    python tools/adaptive_bound_campaign.py                # 1,000 runs on two cores, about twenty minutes
     python tools/adaptive_bound_campaign.py --count 100 --seed 7
 
 Each run is an arm with an `AdaptiveLaw` that knows nothing of its load, of random mass and place within the box that
@@ -8,8 +8,8 @@ the bound is for: no load, a point or five points, often the heaviest at the edg
 it, with V(0) of the loaded arm counted, and follows a random smooth motion at 1 kHz, every third time under an
 admissible disturbance. Every other arm has effort limits that it never reaches. A run whose torque is cut off is
 counted and left out, since the bound assumes that none is. V and every |z1_i| at each instant are compared with the
-bounds; the exit code is 1 if one is exceeded, and the run is repeated with a quarter of the period, as the bound is proved in
-continuous time. Ctrl-C reports what is done.
+bounds; the exit code is 1 if one is exceeded, and such a run is repeated with a quarter of the period, as the bound is
+proved in continuous time. Ctrl-C reports what is done.
 """
 
 import argparse
