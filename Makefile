@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo demos test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign export-check faults hostile-samples bench-history clean
+.PHONY: help setup demo demos test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign certificate-campaign adaptive-bound-campaign export-check faults hostile-samples bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make demos          every demo in demos/, at its full length; some minutes"
@@ -19,6 +19,7 @@ help:
 	@echo "make random-arms    50 random arms with rotors and friction, untuned; about five minutes"
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
+	@echo "make adaptive-bound-campaign  1,000 unknown loads against the bound of adaptive laws; about 20 minutes"
 	@echo "make export-check   exported C under gcc, clang, sanitizers, qemu and frama-c, as far as they are here; about ten minutes"
 	@echo "make faults         the fault matrix of docs/runtime.md, 5 trials a row; up to 20 minutes"
 	@echo "make hostile-samples  ten million hostile samples through the guard; about 3 minutes"
@@ -79,6 +80,9 @@ monitor-campaign: $(READY)
 
 certificate-campaign: $(READY)
 	$(BIN)/python tools/certificate_campaign.py
+
+adaptive-bound-campaign: $(READY)
+	$(BIN)/python tools/adaptive_bound_campaign.py
 
 export-check: $(READY)
 	$(BIN)/python tools/export_check.py

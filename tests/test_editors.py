@@ -60,6 +60,7 @@ def public_objects():
     model = nbs.PinocchioDynamics(robot)
     laws = (nbs.ComputedTorque, nbs.PD, nbs.PID, nbs.SlotineLi, nbs.SlidingMode)
     return [
+        nbs.transient_bound(nbs.AdaptiveLaw(law, load_mass=0.5), 0.5),
         nbs.ChangingPlant(plant, [(0.5, nbs.MujocoPlant(robot))]),
         robot, law, law.compile(), *(kind.for_robot(robot) for kind in laws), nbs.PID.for_robot(robot).compile(), model,
         nbs.AnalyticDynamics(), plant, nbs.MujocoPlant(robot), run, certificate, nbs.Watch(certificate),

@@ -35,7 +35,10 @@ _OF_BOUND, _OF_TORQUE = 1e-2, 1e-3  # smaller torques are within the error of fi
 def check_certificate(certificate: Any) -> None:
     """Raises ArgumentError unless it is a `Certificate`."""
     if not isinstance(certificate, Certificate):
-        raise ArgumentError(f"certificate is a {type(certificate).__name__}; give the certificate that certify made.")
+        raise ArgumentError(
+            f"certificate is a {type(certificate).__name__}; give the certificate that certify made (for an "
+            "AdaptiveLaw there is transient_bound)."
+        )
     if certificate.bodies is not None:
         raise ArgumentError(
             "a run is checked by its balance of power, which needs exact bodies; give one without uncertainty."

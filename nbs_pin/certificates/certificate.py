@@ -280,7 +280,7 @@ class Certificate(Shown):
         }
 
 
-CERTIFICATE = a(Certificate, "a Certificate, as certify returns it")
+CERTIFICATE = a(Certificate, "a Certificate, as certify returns it (for an AdaptiveLaw there is transient_bound)")
 """The check of an argument that is a certificate."""
 
 

@@ -13,6 +13,8 @@ from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.progress import tracked
 from nbs_pin.base.records import Run
+from nbs_pin.controllers.adaptive_law import AdaptiveLaw
+from nbs_pin.controllers.compiled_adaptive import CompiledAdaptiveLaw
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
@@ -133,6 +135,11 @@ class LoopEnsemble:
 
 def law_of(controller: Any) -> ModelLaw:
     """The controller, if it is a law with a model; raises ArgumentError otherwise."""
+    if isinstance(controller, (AdaptiveLaw, CompiledAdaptiveLaw)):
+        raise ArgumentError(
+            f"attack does not follow the estimates of a {type(controller).__name__}; transient_bound bounds its error, "
+            "or give the law that it is about."
+        )
     if not isinstance(controller, ModelLaw):
         raise ArgumentError(
             f"a {type(controller).__name__} is not a law with a model, which gradients of a motion need; give a "

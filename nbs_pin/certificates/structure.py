@@ -8,6 +8,8 @@ from nbs_pin.base.arrays import matvec
 from nbs_pin.base.claims import Claim, Label, known, refuse
 from nbs_pin.base.known_code import foreign_code
 from nbs_pin.certificates.model_structure import check_finite, check_model, sample_states
+from nbs_pin.controllers.adaptive_law import AdaptiveLaw
+from nbs_pin.controllers.compiled_adaptive import CompiledAdaptiveLaw
 from nbs_pin.controllers.lyapunov_law import Lyapunov, LyapunovLaw
 from nbs_pin.dynamics.structure import ModelClaims
 from nbs_pin.robots.robot import Robot
@@ -40,6 +42,11 @@ def check_structure(controller: Any, robot: Robot | None = None) -> Lyapunov:
 
 def lyapunov_law(controller: Any) -> LyapunovLaw:
     """The controller, if it has a Lyapunov function; raises CertificateRefused if not."""
+    if isinstance(controller, (AdaptiveLaw, CompiledAdaptiveLaw)):
+        refuse(
+            f"the V of a {type(controller).__name__} has its estimates in it, which no certificate has",
+            "call transient_bound for it, or give the law that it is about",
+        )
     if not isinstance(controller, LyapunovLaw):
         refuse(
             f"a {type(controller).__name__} has no Lyapunov function here",

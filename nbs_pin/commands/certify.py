@@ -24,6 +24,8 @@ from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import print_certificate
 from nbs_pin.commands.results import Results, drawing
+from nbs_pin.controllers.adaptive_law import AdaptiveLaw
+from nbs_pin.controllers.compiled_adaptive import CompiledAdaptiveLaw
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.friction import JointFriction
@@ -89,6 +91,11 @@ def _controller(options: Certify, truth: Robot | None) -> LyapunovLaw:
             if name.endswith(SAVED)
             else f"--law {options.law}"
         )
+        if isinstance(law, (AdaptiveLaw, CompiledAdaptiveLaw)):
+            raise CertificateRefused(
+                f"{what}, which adapts, and a certificate is of a law that does not; transient_bound in "
+                "Python bounds its error, or give the law that it is about."
+            )
         raise CertificateRefused(
             f"{what}, of which no Lyapunov function is known; give one that has it, such as nbs or slotine-li."
         )

@@ -11,7 +11,7 @@ from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, maybe, n
 from nbs_pin.base.arrays import Array, Vectors, array_namespace, as_vectors, constant_like, finite_result, matvec
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.known_code import defines
+from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import joints_told
 from nbs_pin.base.storable import storable
@@ -44,6 +44,7 @@ _LOAD = 0.25  # largest load as a share of the arm's mass
 _TRANSITION = 0.01  # speed scale of Coulomb friction where the law feeds none forward [rad/s]
 
 
+@known_code
 @storable(
     ("adapts", "frame", "links", "load_mass", "load_radius", "gain", "leak", "period", "rates", "output_rate"),
     parts=("law",),

@@ -19,7 +19,7 @@ RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
-    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques", "Estimate",
+    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques", "Estimate", "TransientBound",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -68,10 +68,13 @@ class Stock:
         return nbs.NeuralBackstepping.for_robot(self.robot)
 
     def _adaptive(self) -> Any:
-        return nbs.AdaptiveLaw(self.law)
+        return nbs.AdaptiveLaw(self.law, load_mass=0.5)
 
     def _adapted(self) -> Any:
         return nbs.simulate(self.plant, self.adaptive, self.motion, 0.02, 0.001)
+
+    def _transient(self) -> Any:
+        return nbs.transient_bound(self.adaptive, 0.5)
 
     def _friction(self) -> Any:
         return nbs.JointFriction([0.1, 0.1], [0.2, 0.1])
@@ -267,6 +270,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "simulate": {"disturbance": None, "q0": Q, "v0": Z, "workers": 1},
         "stream": {"disturbance": None, "q0": Q, "v0": Z, "block": 5},
         "squared_error": {"tau": V},
+        "transient_bound": {"law": s.adaptive, "load_mass": 0.5, "load_radius": 0.0, "start": 0.1},
         "train": {**quick, "disturbance": None, "cost": nbs.squared_error},
         "verify": {"path": s.path("certificate.json", functools.partial(nbs.write_certificate, s.certificate))},
         "write_certificate": {"path": s.folder / "certificate-out.json"},
@@ -280,6 +284,7 @@ def _subjects(s: Stock) -> dict[str, Any]:
     """An object of each class to call methods of."""
     found = [
         nbs.Admissible(box=np.ones(2)), nbs.AnalyticDynamics(), nbs.ComputedTorque.for_robot(s.robot), s.certificate,
+        s.transient,
         nbs.ConstantTorque([1.0, 2.0]), s.law.damping, s.data, s.plant, nbs.Encoders(1e-4), nbs.Hold(Q), s.identified,
         s.friction, s.learned, nbs.MinimumJerk([[0.0, 0.0], [1.0, 1.0]], [0.0, 2.0]), nbs.MujocoPlant(s.robot), s.law,
         s.adaptive, s.adaptive.estimate(), nbs.PD.for_robot(s.robot), nbs.PID.for_robot(s.robot), s.model,

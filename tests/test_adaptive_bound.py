@@ -1,0 +1,232 @@
+"""The transient bound of adaptive laws: its mathematics, simulated arms against it, and what is refused."""
+
+import itertools
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import nbs_pin as nbs
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
+from nbs_pin.base.known_code import foreign_code
+from nbs_pin.certificates.worst_load import Divergence, of_number
+from nbs_pin.controllers.matrix_logistic import logistic_and_cut
+from nbs_pin.controllers.unknowns import model_body
+from nbs_pin.dynamics.pinocchio_tree import pack_model
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
+
+LOADS = {"two_link": 0.5, "panda": 2.0, "ur5": 2.0, "xarm7": 2.0}
+FREE = {name: nbs.JointFriction(np.zeros(n), np.zeros(n)) for name, n in (("two_link", 2), ("panda", 7), ("xarm7", 7))}
+
+
+def law_for(name, adapts=("load",), **given):
+    given = {"load_mass": LOADS[name]} | given
+    return nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(nbs.load_robot(name)), adapts, **given)
+
+
+@pytest.fixture(scope="module", params=list(LOADS))
+def body(request):
+    return law_for(request.param).unknowns.bodies[0]
+
+
+def in_ball(rng, radius, count):
+    x = rng.normal(size=(count, 3))
+    x *= radius / np.linalg.norm(x, axis=1)[:, None]
+    x[count // 2 :] *= rng.uniform(size=(count - count // 2, 1)) ** (1.0 / 3.0)
+    return x
+
+
+def bregman(x, y, dual):
+    """F(X) − F(Y) − tr Q(X − Y), term by term."""
+
+    def entropy(z):
+        values = np.clip(np.linalg.eigvalsh(z), 1e-300, 1.0 - 1e-16)
+        return float((values * np.log(values) + (1.0 - values) * np.log1p(-values)).sum())
+
+    return entropy(x) - entropy(y) - float((dual * (x - y)).sum())
+
+
+def test_the_divergence_is_the_bregman_distance_from_the_first_estimate(body):
+    found, first = Divergence(body), logistic_and_cut(body.start)[0]
+    for at in in_ball(np.random.default_rng(0), 0.08, 20):
+        x = found.loaded(0.3, at)
+        assert float(found.value(x)) == pytest.approx(bregman(x, first, body.start), rel=1e-7, abs=1e-8)
+    assert found.value(first) == pytest.approx(0.0, abs=1e-8)
+
+
+def test_a_load_has_the_pseudo_inertia_of_the_loaded_arm():
+    robot, at = nbs.load_robot("panda"), np.array([0.02, -0.03, 0.05])
+    law = law_for("panda")
+    body = law.unknowns.bodies[0]
+    p = body.factor @ Divergence(body).loaded(1.5, at) @ body.factor.T
+    loaded = robot.with_payload("panda_hand_tcp", 1.5, com=at)
+    np.testing.assert_allclose(p, model_body(pack_model(loaded.model), body.joint), rtol=0.0, atol=1e-12)
+
+
+def test_branch_and_bound_is_above_dense_samples_and_within_its_gap(body):
+    found, mass = Divergence(body), LOADS["panda"] if "panda" in body.name else 0.5
+    for radius in (0.02, 0.1):
+        worst = found.worst(mass, radius)
+        dense = found.value(found.loaded(mass, in_ball(np.random.default_rng(1), radius, 20_000)))
+        assert dense.max() <= worst.bound
+        assert worst.found <= worst.bound <= 1.025 * max(worst.found, float(dense.max())) + 1e-9
+        assert np.linalg.norm(worst.centre) <= radius * (1.0 + 1e-12)
+
+
+def test_loads_of_several_points_are_no_worse_than_the_worst_point(body):
+    """The divergence is convex in the load, so its maximum is at a point mass or no load."""
+    found, rng = Divergence(body), np.random.default_rng(2)
+    bound = found.worst(0.5, 0.06).bound
+    for _ in range(200):
+        masses, places = 0.5 * rng.dirichlet(np.ones(6))[:5], in_ball(rng, 0.06, 5)
+        x = found.known() + sum(found.loaded(m, at) - found.known() for m, at in zip(masses, places, strict=True))
+        assert float(found.value(x)) <= bound
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1e-12, 1e-6, 1e-3]), st.floats(0.0, 1.0))
+def test_the_continued_divergence_is_convex_and_close_below(seed, bend, share):
+    found, rng = Divergence(law_for("ur5").unknowns.bodies[0]), np.random.default_rng(seed)
+    x, y = (_symmetric(rng) for _ in range(2))
+    mixed = float(found.value(share * x + (1.0 - share) * y, bend))
+    parts = [float(found.value(z, bend)) for z in (x, y)]
+    assert mixed <= share * parts[0] + (1.0 - share) * parts[1] + 1e-9 * (1.0 + abs(parts[0]) + abs(parts[1]))
+    inside = logistic_and_cut(10.0 * x)[0]
+    gap = bregman(inside, logistic_and_cut(found.dual)[0], found.dual) - float(found.value(inside, bend))
+    assert -1e-7 <= gap <= 4.0 * -math.log1p(-bend) + 1e-7
+
+
+def _symmetric(rng):
+    x = rng.normal(size=(4, 4))
+    return 0.5 * (x + x.T)
+
+
+def test_a_point_at_the_origin_has_a_closed_form_and_boxes_grow():
+    law = law_for("panda")
+    found, bounds = Divergence(law.unknowns.bodies[0]), []
+    x = found.loaded(2.0, np.zeros(3))
+    first = logistic_and_cut(law.unknowns.bodies[0].start)[0]
+    closed = bregman(x, first, law.unknowns.bodies[0].start) / law.rates[0]
+    assert nbs.transient_bound(law, 2.0).divergence == pytest.approx(closed, rel=1e-6)
+    for mass, radius in ((0.5, 0.0), (1.0, 0.0), (1.0, 0.03), (1.0, 0.1), (2.0, 0.1)):
+        worst = found.worst(mass, radius)
+        bounds.append((worst.found, worst.bound))
+    for less, more in itertools.pairwise(bounds):
+        assert less[0] < more[0]
+        assert less[1] < more[1]
+
+
+def test_what_the_model_has_costs_nothing_unless_its_first_estimate_was_cut():
+    panda = law_for("panda", ["load", "links", "friction", "rotors", "offsets"])
+    assert [Divergence(body).at_known() for body in panda.unknowns.bodies if not body.is_load] == [0.0] * 6
+    assert sum(of_number(x) for x in panda.unknowns.numbers) <= 1e-8
+    point = Divergence(law_for("two_link", ["links"]).unknowns.bodies[0])  # a point mass: its shares were cut
+    assert 1e-5 < point.at_known() < 1e-2
+    assert point.at_known() >= bregman(point.known(), logistic_and_cut(point.dual)[0], point.dual)
+
+
+@pytest.mark.parametrize("given", [{"load_mass": 3.0}, {"load_radius": 0.2}])
+def test_loads_beyond_those_of_the_law_are_refused(given):
+    with pytest.raises(CertificateRefused, match=r"beyond what the law can learn, 2 kg within 0\.1 m; give a law"):
+        nbs.transient_bound(law_for("panda"), **{"load_mass": 2.0} | given)
+
+
+def test_laws_that_learn_no_load_are_refused():
+    with pytest.raises(CertificateRefused, match="adapts friction and no load; give one"):
+        nbs.transient_bound(law_for("panda", ["friction"]), 1.0)
+    with pytest.raises(CertificateRefused, match="the rate of the load is 0"):
+        nbs.transient_bound(law_for("panda", rates=[0.0]), 1.0)
+    with pytest.raises(ArgumentError, match="the AdaptiveLaw that it was compiled from"):
+        nbs.transient_bound(law_for("panda").compile(), 1.0)
+    edited = law_for("panda")
+    edited.load_mass = 5.0
+    with pytest.raises(CertificateRefused, match="beyond the largest body"):
+        nbs.transient_bound(edited, 5.0)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_whatever_is_for_fixed_laws_names_the_bound_of_adaptive_ones(compiled):
+    law = law_for("two_link")
+    given = law.compile() if compiled else law
+    with pytest.raises(CertificateRefused, match="transient_bound"):
+        nbs.certify(given, [1.0, 1.0])
+    with pytest.raises(ArgumentError, match="transient_bound"):
+        nbs.attack(given, [1.0, 1.0])
+    run = nbs.simulate(nbs.MujocoPlant(law.robot), given, nbs.Hold([0.1, 0.2]), 0.01, 0.001)
+    with pytest.raises(ArgumentError, match="transient_bound"):
+        nbs.monitor(run, nbs.certify(law.law, [1.0, 1.0]))
+    with pytest.raises(ArgumentError, match="transient_bound"):
+        nbs.monitor(run, given)
+    with pytest.raises(ArgumentError, match="transient_bound"):
+        nbs.Watch(given)
+
+
+def test_labels_follow_the_code():
+    law = law_for("two_link")
+    assert foreign_code(law) == ""
+    bound = nbs.transient_bound(law, 0.5)
+    labels = {line.name: str(line.label) for line in bound.lines}
+    assert (str(bound.label), labels["‖z1‖"], labels["gain"]) == ("PROVED", "PROVED", "EMPIRICAL")
+
+    class Other(nbs.AdaptiveLaw):
+        pass
+
+    other = nbs.transient_bound(Other(law.law, load_mass=0.5), 0.5)
+    assert str(other.label) == "EMPIRICAL"
+    assert other.error == bound.error
+
+
+def test_a_disturbance_a_leak_and_a_start_only_add():
+    law, free = law_for("panda"), FREE["panda"]
+    plain = nbs.transient_bound(law, 2.0, friction=free)
+    assert plain.storage == plain.storage_within == plain.storage_always
+    assert math.isinf(plain.duration)
+    assert plain.potential < plain.storage
+    started = nbs.transient_bound(law, 2.0, 0.0, 0.5, friction=free)
+    assert started.storage == pytest.approx(plain.storage + 0.5)
+    pushed = [nbs.transient_bound(law, 2.0, disturbance=np.full(7, 0.5), friction=free, duration=t) for t in (1.0, 5.0)]
+    assert plain.storage < pushed[0].storage_within < pushed[1].storage_within <= pushed[1].storage_always
+    assert plain.error < pushed[0].error < pushed[1].error
+    assert pushed[0].duration == 1.0
+    leaking = nbs.transient_bound(law_for("panda", leak=1.0), 2.0, disturbance=np.full(7, 0.5), friction=free)
+    assert plain.storage < leaking.storage_always < pushed[0].storage_always
+    slow = nbs.transient_bound(law_for("panda", leak=1.0), 2.0, friction=free)
+    assert slow.storage_always == slow.storage
+
+
+def test_without_inertial_damping_nothing_is_known_at_all_times_under_a_disturbance():
+    robot = nbs.load_robot("two_link")
+    law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot, damping="bounded"), load_mass=0.5)
+    bound = nbs.transient_bound(law, 0.5, disturbance=[0.1, 0.1], duration=2.0)
+    assert math.isinf(bound.storage_always)
+    assert math.isfinite(bound.error)
+    assert bound.summary()["storage_always_J"] is None
+
+
+def test_the_fixed_law_is_told_beside_it():
+    law = law_for("panda")
+    bound = nbs.transient_bound(law, 2.0, reference=nbs.Sinusoid.for_robot(law.robot), duration=2.0)
+    assert bound.fixed is not None
+    assert bound.fixed.certificate is None
+    assert "lighter payload" in bound.fixed.refused
+    assert bound.fixed.joint_errors[5] > 2.0 * bound.joint_errors[5]  # the wrist, which the load bends most
+    assert "fixed law" in bound._repr_html_()
+    assert bound.summary()["fixed_joint_errors_rad"] == bound.fixed.joint_errors.tolist()
+    light = nbs.AdaptiveLaw(law.law, load_mass=0.1)
+    other = nbs.transient_bound(light, 0.1, reference=nbs.Sinusoid.for_robot(law.robot), duration=2.0)
+    assert other.fixed is not None
+    assert other.fixed.certificate is not None
+    assert (other.fixed.joint_errors <= other.fixed.certificate.joint_errors).all()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_simulated_arms_stay_within_the_bound(seed):
+    from adaptive_bound_campaign import outcome
+
+    found = outcome(seed)
+    assert not found.broken, found
+    assert found.cut or found.joint >= 1.0
