@@ -44,7 +44,7 @@ def lyapunov_law(controller: Any) -> LyapunovLaw:
     """The controller, if it has a Lyapunov function; raises CertificateRefused if not."""
     if isinstance(controller, (AdaptiveLaw, CompiledAdaptiveLaw)):
         refuse(
-            f"the V of a {type(controller).__name__} has its estimates in it, which no certificate has",
+            f"the V of {type(controller).__name__} has its estimates in it, which no certificate has",
             "call transient_bound for it, or give the law that it is about",
         )
     if not isinstance(controller, LyapunovLaw):
