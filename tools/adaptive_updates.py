@@ -7,7 +7,16 @@ from numba import njit
 
 import nbs_pin as nbs
 from nbs_pin.kernels.adaptation import (
-    BODIES, FIRST_BODY, LOWEST, NUMBERS, PER_BODY, PER_NUMBER, WIDTH, adaptive_law, adaptive_workspace, pack_adaptive,
+    BODIES,
+    FIRST_BODY,
+    LOWEST,
+    NUMBERS,
+    PER_BODY,
+    PER_NUMBER,
+    WIDTH,
+    adaptive_law,
+    adaptive_workspace,
+    pack_adaptive,
     value_of,
 )  # fmt: skip
 from nbs_pin.kernels.symmetric4 import TRIANGLE, congruent, eigen, logistic
