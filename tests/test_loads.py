@@ -9,6 +9,7 @@ from nbs_pin.base.claims import Label
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.loads import gravity_error, payload, total
+from nbs_pin.robots.places import tool_frame
 
 ARMS = ("two_link", "panda", "ur5", "kinova")
 

@@ -1,6 +1,6 @@
 """What the adaptive law keeps of its promises, with one set of default settings for all arms.
 
-    python tools/adaptive_campaign.py                        # every row on four arms; about an hour
+    python tools/adaptive_campaign.py                        # every row on four arms; half an hour
     python tools/adaptive_campaign.py --rows ab --arms panda fr3_like
     python tools/adaptive_campaign.py --rows d --arms panda --minutes 60
 
@@ -72,7 +72,7 @@ class Options(NamedTuple):
     minutes: float = 10.0
     updates: int = 10_000_000
     seconds: float = 20.0
-    longest: float = 120.0
+    longest: float = 60.0
     """How long row h waits for an error to vanish [s]."""
 
 
@@ -204,9 +204,8 @@ def hour(name: str, options: Options) -> Iterator[Finding]:
     quarter = max(1, len(blocks) // 4)
     early, late = (np.sqrt(x.mean(axis=0)).max(axis=-1) for x in (blocks[quarter : 2 * quarter], blocks[-quarter:]))
     for k, what in enumerate(("square wave", "sine", "random switching")):
-        yield Finding(
-            "d", name, f"{what}, {options.minutes:g} min: error, of the fixed law's", late[k] / of_fixed[k], "×", 1.1
-        )
+        ratio = late[k] / of_fixed[k]
+        yield Finding("d", name, f"{what}, {options.minutes:g} min: error, of the fixed law's", ratio, "×", 1.1)
         yield Finding("d", name, "  RMS error, last quarter", 1e3 * late[k], "mrad")
         yield Finding("d", name, "  drift: last quarter, of the second quarter's", late[k] / early[k], "×", 1.1)
         yield Finding("d", name, "  largest friction or rotor believed", size[k], "N·m")
@@ -238,8 +237,8 @@ def with_encoders(one: Arm, law: nbs.Controller, seconds: float, bits: int = 16)
 
 def encoders(name: str, options: Options) -> Iterator[Finding]:
     """Row e."""
-    rows = zip(("RMS error, last quarter", "  of the fixed law"), laws(name)[::-1], (3.0, None), strict=True)
-    for what, law, asked in rows:
+    fixed, own = laws(name)
+    for what, law, asked in ("RMS error, last quarter", own, 3.0), ("  of the fixed law", fixed, None):
         found = with_encoders(arm(name), law, options.seconds)
         rms = np.sqrt(np.square(found[len(found) * 3 // 4 :]).mean(axis=0)).max()
         yield Finding("e", name, what, 1e3 * float(rms), "mrad", asked)
@@ -286,9 +285,8 @@ def integral_action(name: str, options: Options) -> Iterator[Finding]:
     for kind, make in LAWS.items():
         law = nbs.AdaptiveLaw(make.for_robot(one.belief), ["offsets"])
         last, error = 0.0, np.inf
-        for run in nbs.stream(
-            one.bare, law, nbs.Hold(motion.offset), options.longest, PERIOD, disturbance=push, check=False
-        ):
+        longest = options.seconds if name == "fr3_like" else options.longest  # dry friction keeps an error of its own
+        for run in nbs.stream(one.bare, law, nbs.Hold(motion.offset), longest, PERIOD, disturbance=push, check=False):
             size = np.abs(nbs.metrics.error(run)).max(axis=-1)
             over, error = np.flatnonzero(size > 1e-6), float(size[-1])
             last = float(run.t[over[-1]]) if len(over) else last
@@ -329,13 +327,14 @@ def main() -> int:
     """Measure what is asked for; returns 1 if a figure misses."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", default="".join(ROWS), help="letters of the rows")
-    parser.add_argument("--arms", nargs="+", default=ARMS, choices=ARMS)
+    parser.add_argument("--arms", nargs="+", default=ARMS, help="fr3_like, or arms that load_robot knows")
     parser.add_argument("--motions", type=int, default=6, help="held-out motions of rows b and c")
     parser.add_argument("--minutes", type=float, default=10.0, help="simulated time of row d")
     parser.add_argument("--updates", type=int, default=10_000_000, help="random updates of row f, over all arms")
+    parser.add_argument("--seconds", type=float, default=20.0, help="simulated time of rows a, b, c, e and h")
     parser.add_argument("--out", type=Path, default=Path("out/adaptive-campaign.json"))
     given = parser.parse_args()
-    options = Options(given.motions, given.minutes, given.updates)
+    options = Options(given.motions, given.minutes, given.updates, given.seconds)
     console, found = Console(), []
     tasks = [(row, name) for row in given.rows for name in given.arms]
     with Progress(console=console) as progress:
