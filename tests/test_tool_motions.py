@@ -402,6 +402,7 @@ def test_a_circle_is_drawn_in_mujoco_within_a_tenth_of_a_millimetre(name, frame)
 
 BAD_PATHS = {
     "at least two": lambda: nbs.ToolPath.through([[0.1, 0.2, 0.3]]),
+    "points 1 and 2 of the path are the same": lambda: nbs.ToolPath.through([[0.0, 0.0, 0.0]] * 2),
     "points 2 and 3 are nearer to each other than": lambda: nbs.ToolPath.through(
         [[0.0, 0, 0], [1e20, 0, 0], [1e20, 1e-3, 0], [0, 0, 0]]
     ),
