@@ -58,7 +58,7 @@ def test_a_constant_torque_is_integrated_away(name):
     law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), ["offsets"])
     hold = nbs.Hold(nbs.Sinusoid.for_robot(robot).offset)
     push = nbs.ConstantTorque(5.0)
-    run = nbs.simulate(nbs.MujocoPlant(robot), law, hold, 5.0, 0.001, disturbance=push, check=False)
+    run = nbs.simulate(nbs.MujocoPlant(robot), law, hold, 7.0, 0.001, disturbance=push, check=False)
     assert np.abs(run.q - run.q_ref)[-500:].max() < 1e-8
     np.testing.assert_allclose(law.estimate(run.estimates[-1]).offset, -5.0, rtol=1e-6)
     assert np.abs(run.estimates).max() < FARTHEST  # no offset went to its bound, far above 5 N·m

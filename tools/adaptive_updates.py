@@ -8,9 +8,9 @@ from numba import njit
 import nbs_pin as nbs
 from nbs_pin.kernels.adaptation import (
     BODIES,
-    FIRST_BODY,
     LOWEST,
     NUMBERS,
+    OUTPUT_RATE,
     PER_BODY,
     PER_NUMBER,
     WIDTH,
@@ -53,14 +53,14 @@ def below_zero(matrix: Any, total: float, work: Any) -> float:
 
 
 @njit(nogil=True)
-def check(duals: Any, unknown_layout: Any, unknown: Any, found: Any) -> None:
-    """Add what is wrong with the estimates of these duals to found."""
+def check(duals: Any, first: int, unknown_layout: Any, unknown: Any, found: Any) -> None:
+    """Add what is wrong with the estimates of these duals to found; first: where bodies begin in `unknown`."""
     x, p, other, work = np.empty(16), np.empty(16), np.empty(16), np.empty(52)
     largest, one, count = np.empty(16), np.zeros(16), unknown_layout[BODIES]
     for k in range(4):
         one[5 * k] = 1.0
     for b in range(count):
-        factor = unknown[FIRST_BODY + PER_BODY * b : FIRST_BODY + PER_BODY * b + 16]
+        factor = unknown[first + PER_BODY * b : first + PER_BODY * b + 16]
         logistic(duals[TRIANGLE * b : TRIANGLE * (b + 1)], work, x)
         congruent(factor, x, other, p)
         congruent(factor, one, other, largest)
@@ -70,7 +70,7 @@ def check(duals: Any, unknown_layout: Any, unknown: Any, found: Any) -> None:
         if not (depth <= _ROUNDING and np.isfinite(p).all()):
             found[0] += 1
     for k in range(unknown_layout[NUMBERS]):
-        w = unknown[FIRST_BODY + PER_BODY * count + PER_NUMBER * k :]
+        w = unknown[first + PER_BODY * count + PER_NUMBER * k :]
         value = value_of(duals, TRIANGLE * count + k, w)
         if not w[LOWEST] <= value <= w[LOWEST] + w[WIDTH]:
             found[1] += 1
@@ -101,12 +101,12 @@ def campaign(
             found[2] += 1
             continue
         duals[:] = after
-        check(after, unknown_layout, unknown, found)
+        check(after, OUTPUT_RATE + n, unknown_layout, unknown, found)
 
 
 def updates(law: nbs.AdaptiveLaw, count: int, seed: int = 0) -> Updates:
     """`count` updates of the law's kernel at random states, with steps from 1 µs to 10⁶ s and no effort limit."""
-    tree, inner, unknown = law._believed, law.law.packed_law(), law.unknowns.packed(law.rates, law.leak)
+    tree, inner, unknown = law._believed, law.law.packed_law(), law.unknowns.packed(law.rates, law.leak, law.output)
     packed, work = tuple(pack_adaptive(inner, tree, unknown)), np.empty(adaptive_workspace(inner, tree))
     found = np.zeros(4)
     rng = np.random.default_rng(seed)
