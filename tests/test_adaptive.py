@@ -212,6 +212,19 @@ def test_estimates_wait_while_a_torque_is_cut_off():
             assert bool((after.duals != memory.duals).any()) is moves
 
 
+def test_a_reading_that_is_no_number_does_not_stay_in_the_memory():
+    robot = nbs.load_robot("two_link")
+    written = law_for(robot, list(ADAPTS))
+    for law in (written, written.compile()):
+        memory, zero = stirred(written, ()), np.zeros(2)
+        aim = Reference(np.full(2, 1e-3), zero, zero)
+        for k in range(6):
+            v = np.full(2, np.nan) if k == 1 else zero
+            tau, memory = law.step(memory, zero, v, aim, 0.001)
+            assert np.isfinite(tau).all() == (k != 1)
+            assert np.isfinite(memory.duals).all()
+
+
 @pytest.mark.parametrize("name", ["panda", "ur5", "xarm7"])
 def test_an_unknown_load_is_found(name):
     """2 kg that the law does not know: the error falls below a twentieth of the fixed law's, the mass is right."""

@@ -148,7 +148,7 @@ def test_a_load_at_a_link_that_the_arm_does_not_have_is_not_drawn(carried):
 def test_track_tells_the_load_and_another_law_takes_the_picture_away(tmp_path):
     folder, line = tmp_path / "out", ("track", "two_link", "--duration", "5", "--payload", "0.3@1")
     printed = printed_by(*line, "--controller", "adaptive", "--out", folder)
-    assert "the law has learned a load of 0.3 kg at tip" in printed.replace("\n", " ")
+    assert "the law believes in a load of 0.3 kg at tip" in printed.replace("\n", " ")
     assert str(folder / "estimates.png") in printed.replace("\n", "")
     files = {"run.npz", "tracking.png", "estimates.png", "replay.html", "summary.json"}
     assert contents(folder).keys() == files

@@ -266,6 +266,11 @@ def _bounded(law: AdaptiveLaw, payload: Payload, base: Certificate, start: float
     within = beginning.within()
     potential = min(within, beginning.potential())
     error, joint_errors = radians(base.stiffness, potential)
+    if (joint_errors[law.robot.continuous] >= math.pi).any():
+        refuse(
+            "the bound of a continuous joint is π or more, where its error jumps",
+            "give a smaller load, start or disturbance",
+        )
     code = known(foreign_code(law), f"V_a does not increase but by what is supplied, {_HERE}")
     is_free = comparison.t == comparison.power == law.leak == 0.0
     found = TransientBound(

@@ -116,7 +116,7 @@ class AdaptingModel:
         slopes, count = self.slopes(z2), len(self.unknowns.bodies)
         start = Duals.of(constant_like(z2, self.unknowns.start), count)
         keep = float(np.exp(-leak * period))
-        drive = constant_like(z2, rates * (period if leak == 0.0 else (1.0 - keep) / leak))
+        drive = constant_like(z2, rates * (period if leak == 0.0 else -np.expm1(-leak * period) / leak))
         return Duals(
             start.bodies + keep * (self.duals.bodies - start.bodies) - drive[:count, None, None] * slopes.bodies,
             start.numbers + keep * (self.duals.numbers - start.numbers) - drive[count:] * slopes.numbers,

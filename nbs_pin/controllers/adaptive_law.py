@@ -8,7 +8,16 @@ import numpy as np
 from torch import nn
 
 from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, maybe, number, numbers, text, texts
-from nbs_pin.base.arrays import Array, Vectors, array_namespace, as_vectors, constant_like, finite_result, matvec
+from nbs_pin.base.arrays import (
+    Array,
+    Vectors,
+    array_namespace,
+    as_vectors,
+    constant_like,
+    finite_result,
+    is_torch_array,
+    matvec,
+)
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import defines, known_code
@@ -50,12 +59,13 @@ _TRANSITION = 0.01  # speed scale of Coulomb friction where the law feeds none f
     parts=("law",),
 )
 class AdaptiveLaw(Controller, nn.Module):
-    """A backstepping or sliding law whose model learns what it does not know while the arm moves.
+    """A law whose model learns what it does not know while the arm moves.
 
     τ = law + Y(q, v, v_r, a_r)(π̂ − π_model). Every unknown body has P̂ = K X̂ Kᵀ with X̂ = (1 + e^−Q)⁻¹, which every
     symmetric Q makes a body that can exist, and Q̇ = −γ KᵀLK − σ(Q − Q₀), tr(LP) = z2ᵀY(P). With the Fermi–Dirac
     divergence d of X from X̂, V_a = V + Σ d/γ decreases as V does where the model is exact, for every weight of the law
-    (docs/theory.md §10). While a torque is at the effort limit the estimates wait.
+    (docs/theory.md §10). While a torque is beyond the effort limit of
+    the arm the estimates wait.
 
     Args:
         law: A law with a Lyapunov function, such as NeuralBackstepping, with the model that is believed at first; or PD
@@ -67,7 +77,7 @@ class AdaptiveLaw(Controller, nn.Module):
         load_mass: Largest load [kg]; None takes a quarter of the arm's mass.
         load_radius: The load lies within this distance of the frame's origin [m].
         gain: Speed of adaptation, the share of the damping's work that a sampled step costs at most in usual motions;
-            from 1 on it may be unstable.
+            with `rates` it says nothing.
         leak: σ [1/s], at which estimates return to the first ones; 0 for none.
         period: Longest control period h [s] that γ is stable for.
         rates: γ of every unknown, in place of those that `gain` gives.
@@ -207,7 +217,7 @@ class AdaptiveLaw(Controller, nn.Module):
     def estimates(self, recorded: np.ndarray) -> tuple[np.ndarray, list[str]]:
         """`Estimate.values` of these duals, and its names."""
         (duals,) = as_vectors(len(self.unknowns.start), recorded=recorded)
-        found = estimate_of(self.robot, self._believed, self.unknowns, np.asarray(duals, dtype=float))
+        found = estimate_of(self.robot, self._believed, self.unknowns, _plain(duals))
         return found.values, found.names
 
     def step(
@@ -228,25 +238,28 @@ class AdaptiveLaw(Controller, nn.Module):
             tau = tau + matvec(self.law.dynamics.mass_matrix(q), now.accelerations())
         tau = finite_result("the torque", tau, *given, duals)
         xp = array_namespace(q)
-        free = xp.all(abs(tau) <= constant_like(q, self.robot.effort_limit), axis=-1)[..., None]
-        after = xp.where(free, now.moved(before, self.rates, self.leak, period), now.duals.flat())
+        read = xp.isfinite(before)
+        free = xp.all((abs(tau) <= constant_like(q, self.robot.effort_limit)) & read, axis=-1)[..., None]
+        moved = now.moved(xp.where(read, before, 0.0 * output), self.rates, self.leak, period)
+        after = xp.where(free, moved, now.duals.flat())
         return tau, AdaptiveMemory(after, output, last)
 
     def _now(self, duals: Array, q: Array, v: Array, v_r: Array, a_r: Array) -> AdaptingModel:
         return AdaptingModel.of(self.unknowns, *self._tree, duals, q, v, v_r, a_r)
 
-    def estimate(self, recorded: AdaptiveMemory | Array | None = None) -> Estimate:
+    def estimate(self, believed: AdaptiveMemory | Array | None = None) -> Estimate:
         """What is believed of the unknowns with this memory, or over a run: `law.estimate(run.estimates)`.
 
-        None is the start. Raises ArgumentError for estimates of another law.
+        None is the start. An array has values in the units of the arm, not duals. Raises ArgumentError for another
+        number of them.
         """
         known = self.robot, self._believed, self.unknowns
-        if recorded is None or isinstance(recorded, AdaptiveMemory):
-            given = self.unknowns.start if recorded is None else recorded.duals
+        if believed is None or isinstance(believed, AdaptiveMemory):
+            given = self.unknowns.start if believed is None else believed.duals
             (duals,) = as_vectors(len(self.unknowns.start), duals=given)
-            return estimate_of(*known, np.asarray(duals, dtype=float))
-        (values,) = as_vectors(len(self.unknowns.start), estimates=recorded)
-        return Estimate(*known, values)
+            return estimate_of(*known, _plain(duals))
+        (values,) = as_vectors(len(self.unknowns.start), believed=believed)
+        return Estimate(*known, _plain(values))
 
     def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
         """The law as machine code (`Controller.compile`); itself for a subclass, or around a law that has none."""
@@ -254,6 +267,11 @@ class AdaptiveLaw(Controller, nn.Module):
             return self
         settings = self.rates, self.leak, self.period, self.output
         return CompiledAdaptiveLaw(self.law.packed_law(), self._believed, self.unknowns, *settings, self.robot)
+
+
+def _plain(x: Array) -> np.ndarray:
+    """A numpy array of the same numbers."""
+    return np.asarray(x.numpy(force=True) if is_torch_array(x) else x, dtype=float)
 
 
 def _geometry(tree: Packed) -> np.ndarray:

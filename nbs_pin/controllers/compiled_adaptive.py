@@ -58,6 +58,7 @@ class CompiledAdaptiveLaw(Controller):
         self, law: Packed, tree: Packed, unknowns: Unknowns, rates: Float[np.ndarray, " unknowns"], leak: float,
         period: float, output: Output, robot: Robot,
     ) -> None:  # fmt: skip
+        rates = np.array(rates)  # a snapshot
         self._given = law, tree, unknowns, rates, leak, period, output, robot
         compile_adaptive_law()
         self._packed = tuple(pack_adaptive(law, tree, unknowns.packed(rates, leak, output)))

@@ -128,7 +128,8 @@ class Estimate(Shown):
     def dynamics(self) -> IdentifiedDynamics:
         """The model with these bodies, rotors and friction, of one memory, which laws, `compare` and files take.
 
-        Estimates of friction and rotors a little below zero become zero.
+        Estimates of friction and rotors a little below zero become zero, and constant torques are left out. Raises
+        ArgumentError for an arm with a body without mass or extent.
         """
         friction = None
         if any(number.code == NumberCode.COULOMB for number in self.unknowns.numbers):

@@ -47,6 +47,12 @@ def output_of(law: ModelLaw, rate: Any = None) -> Output:
     """The output of a law, with this ε or λ; raises ArgumentError for a law of which none is known."""
     code, own = _usual(law)
     given = own if rate is None else np.array(numbers(law.nv, least=0.0, unit="1/s")("output_rate", rate))
+    if isinstance(law, LyapunovLaw) and given.any():
+        raise ArgumentError(
+            f"output_rate is for PD and ComputedTorque, and {type(law).__name__} has none; leave it out."
+        )
+    if isinstance(law, ComputedTorque) and (given >= law.kd).any():
+        raise ArgumentError("output_rate of ComputedTorque is to be below k_d; give a smaller one, or leave it out.")
     return Output(code, given)
 
 
@@ -82,7 +88,7 @@ def signals_of(law: ModelLaw, output: Output, q: Array, v: Array, q_ref: Array, 
 
 
 def damping_of(law: ModelLaw, output: Output, mass: Float[np.ndarray, "poses n n"]) -> Float[np.ndarray, "poses n n"]:
-    """A matrix Δ with V̇ ≤ −sᵀΔs without a wrong torque, at poses with these mass matrices."""
+    """A matrix Δ with V̇ ≤ −sᵀΔs without a wrong torque, at poses with these mass matrices; for PD without the εM."""
     if isinstance(law, LyapunovLaw):
         return np.asarray(law.inertial_rate * mass + law.lyapunov().floor)
     assert isinstance(law, PD | ComputedTorque)

@@ -142,8 +142,12 @@ def unknown_links(robot: Robot, tree: Packed, names: Sequence[str]) -> list[Unkn
 def _between(
     name: str, joint: int, known: np.ndarray, largest: np.ndarray, place: np.ndarray, is_load: bool
 ) -> UnknownBody:
-    """A body up to the largest one that begins as the known one."""
+    """A body up to the largest one that begins as the known one, apart from shares below 1e-4 or above 1 − 1e-4."""
     values, vectors = np.linalg.eigh(largest)
+    if not values[0] > 0.0:
+        raise ArgumentError(
+            f"{name}: no body has this inertia, a pseudo-inertia with the eigenvalue {values[0]:.3g}; correct it."
+        )
     factor = vectors * np.sqrt(values)
     share = np.linalg.solve(factor, np.linalg.solve(factor, known).T)
     shares, own = np.linalg.eigh(0.5 * (share + share.T))

@@ -14,7 +14,7 @@ from nbs_pin.kernels.layout import NumberCode
 _STATES = 200
 _SPEED, _START = 0.25, 0.5  # share of the velocity limits, and time in which all of it is reached [s]
 _SLOW = 0.02  # share of the velocity limits at which Coulomb friction has its full size
-_DELAY = 2.5  # periods from the output to its effect: it is two instants old, and a torque is held for one
+_DELAY = 2.5  # periods from the output to its effect with the look-ahead of `simulate`, 3 without it
 _SHARES = {
     NumberCode.VISCOUS: 0.03,
     NumberCode.COULOMB: 0.1,

@@ -112,7 +112,7 @@ def value_of(dual: Vec, k: int, w: Vec) -> float:
 def moved(now: float, start: float, rate: float, leak: float, period: float, slope: float) -> float:
     """The dual after a period of Q̇ = −γL − σ(Q − Q₀) with L held."""
     keep = math.exp(-leak * period)
-    drive = rate * period if leak == 0.0 else rate * (1.0 - keep) / leak
+    drive = rate * period if leak == 0.0 else -rate * math.expm1(-leak * period) / leak
     return start + keep * (now - start) - drive * slope
 
 
@@ -202,7 +202,7 @@ def adaptive_step(
     for i in range(n):
         tau[i] += feedback[i]
         free = free and abs(tau[i]) <= limit[i]
-    if free:  # a torque that is cut off does not do what the estimates expect: they wait
+    if free and is_finite(before):  # a torque that is cut off does not do what the estimates expect: they wait
         move_duals(before, period, unknown, own, signals, work, duals)
     output_of(state, target, v_r, law, unknown, output)
 

@@ -134,9 +134,9 @@ def _load_learned(figures: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     link, mass, centre = found
     if abs(mass) < LIGHT:
-        return (f"the law has learned that {link} carries no load",)
+        return (f"the law believes that {link} carries no load",)
     at = ", ".join(f"{1e3 * x:z.0f}" for x in centre)
-    return (f"the law has learned a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm",)
+    return (f"the law believes in a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm",)
 
 
 def _convergence(figures: Mapping[str, Any]) -> tuple[str, str]:

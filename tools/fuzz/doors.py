@@ -171,7 +171,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         },
         "AdaptiveLaw.estimates": {"recorded": s.adaptive.unknowns.start},
         "CompiledAdaptiveLaw.estimates": {"recorded": s.adaptive.unknowns.start},
-        "AdaptiveLaw.estimate": {"recorded": None},
+        "AdaptiveLaw.estimate": {"believed": None},
         "plot_estimates": {"path": s.folder / "estimates.png", "run": s.adapted},
         "AnalyticDynamics": {"masses": (1.0, 1.0), "lengths": (1.0, 1.0), "gravity": 9.8},
         "AdaptiveLaw.for_robot": {"adapts": ["load", "rotors"]},
