@@ -138,7 +138,7 @@ class Divergence:
             if found.max() > best:
                 best, place = float(found.max()), likely[int(found.argmax())]
             enough = max(best, least) * (1.0 + _GAP) + margin
-            still = uppers > enough
+            still = ~(uppers <= enough)
             children = (centres[still][:, None] + 0.5 * half * _CORNERS).reshape(-1, 3)
             nearest = np.linalg.norm(np.clip(np.abs(children) - 0.5 * half, 0.0, None), axis=-1)
             children = children[nearest <= radius * (1.0 + 1e-12)]

@@ -47,7 +47,7 @@ def panels_of(run: Run) -> list[Panel]:
 
 def _of_load(run: Run, link: str, mass: Float[np.ndarray, " rows"], centre: Float[np.ndarray, "rows 3"]) -> list[Panel]:
     carried = np.zeros(len(run.t))
-    for one in loads_of(run):
+    for one in (one for one in loads_of(run) if one["link"] in ("", link)):
         until = np.inf if one["until_s"] is None else one["until_s"]
         carried[(run.t >= one["from_s"]) & (run.t < until)] += one["mass_kg"]
     masses = {"learned": mass} | ({CARRIED: carried} if carried.any() else {})
