@@ -62,8 +62,8 @@ def check(duals: Any, first: int, unknown_layout: Any, unknown: Any, found: Any)
     for b in range(count):
         factor = unknown[first + PER_BODY * b : first + PER_BODY * b + 16]
         logistic(duals[TRIANGLE * b : TRIANGLE * (b + 1)], work, x)
-        congruent(factor, x, other, p)
-        congruent(factor, one, other, largest)
+        congruent(factor, 4, 1, x, other, p)
+        congruent(factor, 4, 1, one, other, largest)
         total = largest[0] + largest[5] + largest[10] + largest[15]
         depth = max(below_zero(p, total, work), below_zero(largest - p, total, work))
         found[3] = max(found[3], depth)

@@ -87,15 +87,9 @@ class AdaptingModel:
 
     def _excess(self, chosen: Callable[[NumberCode], bool]) -> Array:
         """What chosen numbers add beyond the known ones, per joint."""
-        numbers = self.unknowns.numbers
-        lowest, width, known, picked = (
-            (
-                constant_like(self.factors, np.array(x, dtype=float))
-                for x in zip(*((one.lowest, one.width, one.known, chosen(one.code)) for one in numbers), strict=True)
-            )
-            if numbers
-            else 4 * (0.0 * self.factors,)
-        )
+        rows = [(one.lowest, one.width, one.known, chosen(one.code)) for one in self.unknowns.numbers]
+        table = np.array(rows, dtype=float).reshape(-1, 4).T
+        lowest, width, known, picked = (constant_like(self.factors, x) for x in table)
         added = (lowest + width * self.shares.numbers - known) * picked * self.factors
         return added @ constant_like(self.factors, self._joints())
 

@@ -100,13 +100,6 @@ class Unknowns(NamedTuple):
         return Packed(np.array(layout, dtype=np.int64), np.concatenate(weights))
 
 
-def triangle_matrices(duals: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (..., 4, 4) of upper triangles (..., 10)."""
-    matrix = np.zeros((*duals.shape[:-1], 4, 4))
-    matrix[..., _UPPER[0], _UPPER[1]] = matrix[..., _UPPER[1], _UPPER[0]] = duals
-    return matrix
-
-
 def unknown_load(robot: Robot, tree: Packed, frame: str | None, mass: float, radius: float) -> UnknownBody:
     """The body of a link with a load of at most `mass` [kg] within `radius` [m] of its origin; None: the arm's end.
 

@@ -19,7 +19,7 @@ from nbs_pin.kernels.jit import compile_for, inlined, kernel
 from nbs_pin.kernels.laws import difference, fit, is_finite, law_workspace, pack_tree_law, signals_of
 from nbs_pin.kernels.layout import NumberCode, OutputCode, Packed
 from nbs_pin.kernels.records import Motion, Signals, State, Target, Vec
-from nbs_pin.kernels.symmetric4 import FARTHEST, TRIANGLE, congruent, congruent_back, logistic
+from nbs_pin.kernels.symmetric4 import FARTHEST, TRIANGLE, congruent, logistic
 from nbs_pin.kernels.tree_bodies import joint_of
 from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY, MASS
 from nbs_pin.kernels.tree_parameters import COLUMNS, INERTIA, inertia_bars
@@ -125,7 +125,7 @@ def put_estimates(duals: Vec, unknown: Packed, own: Packed, signals: Signals, wo
     for b in range(count):
         w, i = weights[first + PER_BODY * b :], layout[UNKNOWN + b]
         logistic(duals[TRIANGLE * b : TRIANGLE * (b + 1)], work, x)
-        congruent(w[:16], x, other, p)
+        congruent(w[:16], 4, 1, x, other, p)
         start = BASE + BODY * i
         add_body(p, w[KNOWN:BODY_RATE], own.weights[start : start + BODY])
     for k in range(layout[NUMBERS]):
@@ -153,7 +153,7 @@ def move_duals(z2: Vec, period: float, unknown: Packed, own: Packed, signals: Si
         w, i = weights[first + PER_BODY * b :], layout[UNKNOWN + b]
         inertia_bars(joint_of(i, own, tree_work), signals.a_r[i], z2[i], bars)
         bar_matrix(bars, power)
-        congruent_back(w[:16], power, other, slope)
+        congruent(w[:16], 1, 4, power, other, slope)
         k = 0
         for r in range(4):
             for c in range(r, 4):

@@ -98,34 +98,17 @@ def logistic(dual: Vec, work: Vec, x: Vec) -> None:
 
 
 @inlined
-def congruent(k: Vec, x: Vec, work: Vec, out: Vec) -> None:
-    """K X Kᵀ → out."""
+def congruent(k: Vec, down: int, across: int, x: Vec, work: Vec, out: Vec) -> None:
+    """K X Kᵀ → out, K_ij = k[down·i + across·j]: 4 and 1 take the matrix k, 1 and 4 its transpose."""
     for i in range(4):
         for j in range(4):
             total = 0.0
             for m in range(4):
-                total += k[4 * i + m] * x[4 * m + j]
+                total += k[down * i + across * m] * x[4 * m + j]
             work[4 * i + j] = total
     for i in range(4):
         for j in range(4):
             total = 0.0
             for m in range(4):
-                total += work[4 * i + m] * k[4 * j + m]
-            out[4 * i + j] = total
-
-
-@inlined
-def congruent_back(k: Vec, x: Vec, work: Vec, out: Vec) -> None:
-    """Kᵀ X K → out."""
-    for i in range(4):
-        for j in range(4):
-            total = 0.0
-            for m in range(4):
-                total += k[4 * m + i] * x[4 * m + j]
-            work[4 * i + j] = total
-    for i in range(4):
-        for j in range(4):
-            total = 0.0
-            for m in range(4):
-                total += work[4 * i + m] * k[4 * m + j]
+                total += work[4 * i + m] * k[down * j + across * m]
             out[4 * i + j] = total
