@@ -1,6 +1,7 @@
 """CSV files: reading and writing tables of numbers, and matching columns to joints."""
 
 import csv
+import gzip
 import io
 import re
 import warnings
@@ -19,7 +20,56 @@ QUANTITIES = ("tau", "q", "v", "a")
 """Per-joint quantities of a log, in columns named `KIND_JOINT` or `KIND1`, `KIND2`, …."""
 ROS_NAMES = {"q": "position", "v": "velocity", "a": "acceleration", "tau": "effort"}
 """What ROS calls the quantities, which is understood as well."""
-_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+_WORDS = {
+    "q": ("q", "position", "pos", "angle"),
+    "v": ("v", "velocity", "vel", "qd", "dq", "speed"),
+    "a": ("a", "acceleration", "acc", "qdd", "ddq"),
+    "tau": ("tau", "effort", "torque", "trq"),
+}
+"""What the quantities are called in the columns of logs, by rank."""
+_TIMES = ("t", "time", "stamp", "timestamp", "__time", "elapsed", "header.stamp", "field.header.stamp")
+_SEPARATORS = (",", ";", "\t", "|")
+
+
+def read_cells(path: Path) -> list[list[str]]:
+    """The cells of a table in a text file, *.csv or *.csv.gz, by rows; empty lines are left out.
+
+    Columns are separated by commas or, where the first line has none, by semicolons, tabs, bars or blanks.
+
+    Raises:
+        FileFormatError: If it is too large or no text.
+    """
+    too_large = FileFormatError(f"{path}: more than {LARGEST // 8} bytes, too large for a CSV; store it as npz.")
+    if path.stat().st_size > LARGEST // 8:
+        raise too_large
+    try:
+        data = path.read_bytes()
+        if path.suffix.lower() == ".gz":
+            with gzip.open(io.BytesIO(data)) as packed:
+                data = packed.read(LARGEST // 8 + 1)
+            if len(data) > LARGEST // 8:
+                raise too_large
+        text = data.decode("utf-8-sig")
+        first = text.partition("\n")[0]
+        mark = next((mark for mark in _SEPARATORS if mark in first), "")
+        if not mark and len(first.split()) > 1:
+            return [line.split() for line in text.splitlines() if line.strip()]
+        lines = [line for line in csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=mark or ",") if line]
+    except (UnicodeDecodeError, csv.Error, EOFError, OSError) as error:
+        if isinstance(error, OSError) and not isinstance(error, gzip.BadGzipFile):
+            raise
+        raise FileFormatError(f"{path}: not a UTF-8 CSV file ({error}); export it again.") from error
+    # where semicolons separate numbers, a comma is the decimal point of another language
+    return [[cell.replace(",", ".") for cell in line] for line in lines] if mark == ";" else lines
+
+
+def header_of(cells: Sequence[str]) -> list[str]:
+    """The names of the columns in the first line; empty if it has numbers, as the table then has no header."""
+    if cells and all(_is_number(cell) for cell in cells if cell.strip()):
+        return []
+    header = [name.strip() for name in cells]
+    header[:1] = [name.lstrip("#% ") for name in header[:1]]
+    return header[:-1] if header[-1:] == [""] else header  # of a comma at the end of the line
 
 
 def read_csv(path: Path, wanted: Sequence[str] = ("t",)) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
@@ -28,23 +78,27 @@ def read_csv(path: Path, wanted: Sequence[str] = ("t",)) -> tuple[list[str], Flo
     Raises:
         FileFormatError: If the file is not such a table; names the column and the row, counted from 1.
     """
-    if path.stat().st_size > LARGEST // 8:
-        raise FileFormatError(f"{path}: more than {LARGEST // 8} bytes, too large for a CSV; store it as npz.")
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [line for line in csv.reader(file, strict=True) if line]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(f"{path}: not a UTF-8 CSV file ({error}); export it again.") from error
-    header = [name.strip() for name in lines[0]] if lines else []
-    header = header[:-1] if header[-1:] == [""] else header  # of a comma at the end of the line
+    lines = read_cells(path)
+    header = header_of(lines[0]) if lines else []
     if not set(wanted) <= set(header) or len(set(header)) != len(header):
-        raise FileFormatError(f"{path}: {_header_fault(header, wanted)}.")
-    if len(lines) < 2:
+        needed = ", ".join(f"'{name}'" for name in wanted)
+        said = ", ".join(header if header or not lines else lines[0])
+        raise FileFormatError(
+            f"{path}: the header is '{said:.300}', expected {needed} and each name once; add or rename."
+        )
+    return header, numbers_in(path, header, lines[1:], range(len(header)))
+
+
+def numbers_in(
+    path: Path, header: Sequence[str], lines: Sequence[list[str]], columns: Sequence[int]
+) -> Float[np.ndarray, "rows columns"]:
+    """The numbers in some columns of a table below its header; raises FileFormatError as `read_csv` does."""
+    if not lines:
         raise FileFormatError(f"{path}: no rows of numbers below the header, expected at least 4; record more.")
-    table = np.empty((len(lines) - 1, len(header)))
-    for row, cells in enumerate(lines[1:]):
-        table[row] = _numbers(path, row + 1, cells, header)
-    return header, table
+    table = np.empty((len(lines), len(columns)))
+    for row, cells in enumerate(lines):
+        table[row] = _numbers(path, row + 1, cells, header, columns)
+    return table
 
 
 def write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> Path:
@@ -57,14 +111,30 @@ def write_csv(path: Path, head: Sequence[str], rows: Sequence[Sequence[Any]]) ->
 def joint_columns(header: Sequence[str], kind: str) -> dict[str, int]:
     """Column indices of a quantity by joint name or number: `q_elbow` or `q2` for the kind `q`.
 
-    The names of ROS (`position_elbow`) are understood where there are no others.
+    Where there are none, the names of ROS and of other programs are understood: position_elbow, elbow_position,
+    /joint_states/elbow/position, position[0], field.position0, actual_q_0. Joints numbered from 0 are numbered from 1.
     """
-    for word in (kind, ROS_NAMES[kind]):
-        found = ((re.fullmatch(rf"{word}(?:_(.+)|(\d+))", name), k) for k, name in enumerate(header))
-        columns = {match[1] or match[2]: k for match, k in found if match}
-        if columns:
-            return columns
+    names = [re.sub(r"\s*[\[(][^\d\])]*[\])]$", "", name) for name in header]  # q1 [rad]
+    for word in _WORDS[kind]:
+        forms = (
+            rf"{word}(?:_(.+)|(\d+))",
+            rf"(?:.*[._/])?{word}[._]?\[?(\d+)\]?",
+            rf"(?:.*/)?(.+?)[._/]{word}",
+            rf".*[._/]{word}_(.+)",
+        )
+        for form in forms:
+            found = [(re.fullmatch(form, name, re.IGNORECASE), k) for k, name in enumerate(names)]
+            named = [(next(part for part in match.groups() if part), k) for match, k in found if match]
+            columns = dict(named)
+            if columns and len(columns) == len(named):
+                return _from_one(columns)
     return {}
+
+
+def time_column(header: Sequence[str]) -> int | None:
+    """The column of time, called t or as in other programs."""
+    names = [re.sub(r"\s*[\[(].*[\])]$", "", name).lower() for name in header]
+    return next((names.index(name) for name in _TIMES if name in names), None)
 
 
 def joint_order(path: Path, found: Sequence[str], joint_names: Sequence[str] | None) -> list[int]:
@@ -95,29 +165,34 @@ def joint_order(path: Path, found: Sequence[str], joint_names: Sequence[str] | N
     return [found.index(name) for name in names]
 
 
-def _header_fault(header: list[str], wanted: Sequence[str]) -> str:
-    """What is wrong with the names of the columns and what to do."""
-    other = [
-        name
-        for mark, name in _SEPARATORS.items()
-        if not set(wanted) <= set(header) and any(mark in cell for cell in header)
-    ]
-    if other:
-        return f"the columns are separated by {other[0]}, expected commas, and points in numbers; export it like that"
-    needed = ", ".join(f"'{name}'" for name in wanted)
-    return f"the header is '{', '.join(header)}', expected {needed} and each name once; add or rename"
+def _from_one(columns: dict[str, int]) -> dict[str, int]:
+    """Joints that are numbered from 0, numbered from 1."""
+    if sorted(columns) != sorted(str(k) for k in range(len(columns))):
+        return columns
+    return {str(int(name) + 1): k for name, k in columns.items()}
 
 
-def _numbers(path: Path, row: int, cells: list[str], header: list[str]) -> list[float]:
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(path: Path, row: int, cells: list[str], header: Sequence[str], columns: Sequence[int]) -> list[float]:
     if len(cells) == len(header) + 1 and not cells[-1].strip():
         cells = cells[:-1]  # a comma at the end of the line
     if len(cells) != len(header):
         raise FileFormatError(f"{path}: row {row} has {len(cells)} values, expected {len(header)}; complete it.")
     numbers = []
-    for name, cell in zip(header, cells, strict=True):
+    for k in columns:
+        cell = cells[k]
         try:
             # float() also accepts '1_0' and non-ASCII digits, which no instrument writes.
             numbers.append(float(cell if cell.isascii() and "_" not in cell else ""))
         except ValueError as error:
-            raise FileFormatError(f"{path}: row {row}, column {name}: '{cell}' is not a number; correct it.") from error
+            raise FileFormatError(
+                f"{path}: row {row}, column {header[k]}: '{cell}' is not a number; correct it."
+            ) from error
     return numbers

@@ -21,6 +21,10 @@ from nbs_pin.base.shown import Shown, joints_told
 DATASET_FORMAT = "nbs_pin dataset 1"
 """Value of the `format` entry of a data file."""
 _STATES = ("q", "v", "a", "tau")
+_GUARD = 0.5
+"""Time between training data and a part of the same recording that is held out [s]."""
+_LONG, _FEW = 5.0, 10
+"""Shortest recording of which a part is held out [s], and fewest rows of a part."""
 _KINDS: dict[tuple[str, ...], type] = {
     (*_STATES, "t"): np.float64,
     ("trajectory", "parents"): np.int64,
@@ -101,21 +105,34 @@ class Dataset(Shown):
         """Number of trajectories."""
         return int(np.unique(self.trajectory).size)
 
+    @property
+    def can_be_split(self) -> bool:
+        """Whether a part can be held out: some of several trajectories, or the end of a long one."""
+        return len(recordings(self)) > 1 or bool(_held_from(self, 0.2))
+
     @checked(share=number(above=0.0, below=1.0), seed=SEED)
     def split(self, share: float = 0.2, seed: int = 0) -> tuple["Dataset", "Dataset"]:
-        """Split by whole trajectories into training data and held-out data, about `share` and at least one; at random.
+        """Split into training data and held-out data, about `share`.
+
+        Whole trajectories are held out, at least one, at random; pieces of one recording (`recordings`) go together.
+        Of a single recording its last part is held out, and half a second before it is in neither.
 
         Raises:
-            ArgumentError: If share is outside (0, 1) or there is only one trajectory.
+            ArgumentError: If share is outside (0, 1), or there is only one trajectory, too short to be parted.
         """
-        ids = np.unique(self.trajectory)
-        if ids.size < 2:
+        groups = recordings(self)
+        if len(groups) > 1:
+            count = int(np.clip(round(share * len(groups)), 1, len(groups) - 1))
+            chosen = np.random.default_rng(seed).permutation(len(groups))[:count]
+            held_out = np.isin(self.trajectory, np.concatenate([groups[k] for k in chosen]))
+            return self.take(~held_out), self.take(held_out)
+        begin = _held_from(self, share)
+        if not begin:
             raise ArgumentError(
                 f"{in_words(self, 'the data')} cannot be split: it has only one trajectory; collect several."
             )
-        count = int(np.clip(round(share * ids.size), 1, ids.size - 1))
-        held_out = np.isin(self.trajectory, np.random.default_rng(seed).permutation(ids)[:count])
-        return self.take(~held_out), self.take(held_out)
+        clock = _clock(self)
+        return self.take(clock < clock[begin] - _GUARD), self.take(slice(begin, None))
 
     def take(self, rows: Any) -> "Dataset":
         """The samples selected by the numpy index `rows` (a slice, a mask, or increasing indices)."""
@@ -188,6 +205,54 @@ def trajectory_slices(trajectory: Int[np.ndarray, " samples"]) -> list[slice]:
     cuts = np.flatnonzero(np.diff(trajectory)) + 1
     bounds = [0, *cuts.tolist(), len(trajectory)]
     return [slice(begin, end) for begin, end in pairwise(bounds) if end > begin]
+
+
+def recordings(data: Dataset) -> list[np.ndarray]:
+    """The numbers of the trajectories of each recording: those that run on where another ends are pieces of one.
+
+    There q and v go on as within a trajectory, and the arm moves.
+    """
+    groups: list[list[int]] = []
+    slices = trajectory_slices(data.trajectory)
+    for k, rows in enumerate(slices):
+        number = int(data.trajectory[rows.start])
+        if k and _runs_on(data, slices[k - 1], rows):
+            groups[-1].append(number)
+        else:
+            groups.append([number])
+    return [np.array(group) for group in groups]
+
+
+def _runs_on(data: Dataset, before: slice, after: slice) -> bool:
+    """Whether a trajectory begins where another ends, at most a guard time later, in motion."""
+    if min(rows.stop - rows.start for rows in (before, after)) < _FEW:
+        return False
+    last, first = before.stop - 1, after.start
+    passed = float(data.t[first] - data.t[last])
+    step = float(data.t[last] - data.t[last - 1])
+    passed = passed if 0.0 < passed <= _GUARD else step  # where every piece has its own time
+    speed, moving = np.abs(data.v[[last, first]]).max(axis=0), 0.05 * data.v.std(axis=0)
+    went = passed * 0.5 * (data.v[last] + data.v[first])
+    miss = np.abs(data.q[first] - data.q[last] - went)
+    turned = np.abs(data.v[first] - data.v[last])
+    ahead = passed * np.abs(data.a[[last, first]]).max(axis=0)
+    fits = (miss <= 0.5 * passed * speed + 1e-6) & (turned <= 2.0 * ahead + moving)
+    return bool((speed > 2.0 * moving).any() and fits.all())
+
+
+def _clock(data: Dataset) -> np.ndarray:
+    """Time since the beginning of the recording [s], where each piece may have its own."""
+    steps = np.diff(data.t, prepend=data.t[:1])
+    usual = float(np.median(steps[1:])) if len(steps) > 1 else 1.0
+    return np.cumsum(np.where((steps > 0.0) & (steps <= _GUARD), steps, usual))
+
+
+def _held_from(data: Dataset, share: float) -> int:
+    """The first row of the last `share` of one recording, 0 if it is too short to be parted."""
+    clock = _clock(data)
+    begin = int(np.searchsorted(clock, clock[-1] - share * clock[-1]))
+    before = int(np.count_nonzero(clock < clock[min(begin, len(clock) - 1)] - _GUARD))
+    return begin if clock[-1] > _LONG and before >= _FEW and len(clock) - begin >= _FEW else 0
 
 
 def _fault(data: Dataset) -> str:

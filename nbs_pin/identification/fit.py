@@ -107,7 +107,7 @@ def split_data(data: Dataset, held_out: Dataset | float | None = None, seed: int
         if fault:
             raise ArgumentError(f"{fault}.")
         return data, held_out
-    share = (HELD_OUT if data.trajectories > 1 else 0.0) if held_out is None else held_out
+    share = (HELD_OUT if data.can_be_split else 0.0) if held_out is None else held_out
     return (data, None) if share == 0.0 else data.split(share, seed)
 
 

@@ -1,77 +1,124 @@
-"""Logs of other systems as datasets, with units and derivatives checked for consistency."""
+"""Logs of other systems as datasets: read as they are, put right where that is safe, questioned where it is not."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
+from scipy.interpolate import PchipInterpolator
 
-from nbs_pin.base.arguments import MOST_JOINTS, checked, flag, many, maybe, number, readable, text
-from nbs_pin.base.doors import BLANK, option
+from nbs_pin.base.arguments import (
+    MOST_JOINTS,
+    checked,
+    count,
+    either,
+    flag,
+    joints as per_joint,
+    many,
+    mapping,
+    maybe,
+    number,
+    readable,
+    text,
+)
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz
 from nbs_pin.identification.compatibility import arm_fault
 from nbs_pin.identification.datasets import DATASET_FORMAT, Dataset, load_dataset, trajectory_slices
-from nbs_pin.identification.log_files import Columns, columns_of_arrays, columns_of_csv
-from nbs_pin.identification.measurement import ORDER, derivative
-from nbs_pin.identification.resampling import resampled
+from nbs_pin.identification.log_derivatives import check_derivatives, derived
+from nbs_pin.identification.log_files import (
+    CHOSEN,
+    Columns,
+    arrays_of_matlab,
+    columns_of_arrays,
+    columns_of_table,
+    is_table,
+)
+from nbs_pin.identification.repairs import repaired
+from nbs_pin.identification.resampling import evenly, parted_at_gaps
 from nbs_pin.motions.recordings import Joints, degrees_fault, in_radians, seam_fault, seconds_in, time_fault, unwrapped
 from nbs_pin.robots.robot import ARM, Robot
 
-_SPAN = 0.05  # [s]; interval over which derivatives are integrated for comparison, to average sensor noise
-_DISAGREES = 0.3  # largest RMS error of a logged derivative, as a share of the RMS change
-_STILL = 1e-3  # [rad, rad/s]; joints that change less are not checked
-_WINDOW = 0.1  # [s]; usual width of the differentiation window
-_EVEN = 1e-3  # tolerance of even spacing, as a share of the step
-
 
 @checked(
-    path=readable,
+    path=either(many(readable, 1, 10_000, "files"), readable),
     robot=maybe(ARM),
+    columns=maybe(mapping),
+    rate=maybe(number(above=0.0, most=1e6, unit="Hz")),
+    trajectories=maybe(many(count(), 1, 1_000_000, "numbers")),
     degrees=maybe(flag),
     time_unit=maybe(text),
+    torque_gain=maybe(per_joint(unit="N·m per unit of tau")),
+    gear=maybe(per_joint(unit="turns of the motor per turn of the joint")),
+    delay=number(least=-10.0, most=10.0, unit="s"),
     resample=maybe(number(above=0.0, most=1000.0, unit="s")),
+    lowpass=maybe(number(least=0.0, most=1e6, unit="Hz")),
     window=maybe(number(least=1e-6, most=1000.0, unit="s")),
     prismatic=maybe(many(flag, 1, MOST_JOINTS, "joints")),
 )
 def load_log(
-    path: str | Path,
+    path: str | Path | Sequence[str | Path],
     *,
     robot: Robot | None = None,
+    columns: Mapping[str, str] | None = None,
+    rate: float | None = None,
+    trajectories: Sequence[int] | None = None,
     degrees: bool | None = None,
     time_unit: str | None = None,
+    torque_gain: float | Sequence[float] | None = None,
+    gear: float | Sequence[float] | None = None,
+    delay: float = 0.0,
     resample: float | None = None,
+    lowpass: float | None = None,
     window: float | None = None,
     prismatic: Sequence[bool] | None = None,
 ) -> Dataset:
-    """Load the measurements in a CSV or NPZ file, joints in the order of the arm.
+    """Load the measurements in a file or several, joints in the order of the arm.
 
-    CSV: a header with `t` [s], per joint `q_NAME` [rad], `tau_NAME` [N·m] and, if logged, `v_NAME` [rad/s] and
-    `a_NAME` [rad/s²] (NAME a joint's name; or q1 … qn, tau1 … taun in the arm's order), and `trajectory`, a whole
-    number, if there are several. The names of ROS, position_NAME, velocity_NAME and effort_NAME, are understood too.
-    NPZ: arrays `t` (rows,), `q`, `tau`, `v`, `a` (rows, n), `trajectory` (rows,) and `joint_names` (n,) likewise; a
-    recorded run and a dataset are such files.
+    Tables (*.csv, *.txt, also *.csv.gz): a header with `t` [s], per joint `q_NAME` [rad], `tau_NAME` [N·m] and, if
+    logged, `v_NAME` [rad/s] and `a_NAME` [rad/s²] (NAME a joint's name; or q1 … qn, tau1 … taun in the arm's order),
+    and `trajectory`, a whole number, if there are several. Other usual names are understood too, such as those of ROS.
+    Arrays (*.npz, *.mat): `t` (rows,), `q`, `tau`, `v`, `a` (rows, n), `trajectory` (rows,) and `joint_names` (n,)
+    likewise; a recorded run and a dataset are such files. Bags of ROS (*.bag, *.mcap, a folder of ROS 2, with the extra
+    `logs`): messages of type JointState. Each of several files is a trajectory of its own.
 
-    Quantities not logged are computed by differentiation (Savitzky–Golay); samples must then be evenly spaced, and half
-    a window is dropped at both ends of each trajectory. Joints that turn without limit are unwrapped where they jump by
-    a turn. Warns of that, of a log with only one trajectory, and of one without torque, from which no model can be
-    identified (docs/theory.md §6). A saved dataset is returned as it is, and takes no further argument than `robot`.
+    What is wrong in single rows is put right with a warning that names the first (`repairs.py`): repeated rows, spikes,
+    angles that stood still, velocities that are zero throughout. Long gaps begin another trajectory. What is not logged
+    is differentiated (Savitzky–Golay), on an even grid if stamps jitter; where the torque is noisy, all signals are
+    low-passed alike before, and rows that say nothing new are left out (`resampling.py`). Some rows are dropped at both
+    ends of each trajectory. Joints that turn without limit are unwrapped where they jump by a turn. Warns of a log that
+    is too short to hold out a part, and of one without torque, from which no model can be identified (docs/theory.md
+    §6). `about["notes"]` has all that was said. A saved dataset is returned as it is, and takes no further argument
+    than `robot`.
 
     Args:
-        path: The file, *.csv or *.npz.
+        path: The file, or several of one arm.
         robot: Gives names, tree and ranges of the joints. None assumes a serial arm.
+        columns: What the file calls t, q, v, a, tau and trajectory, where it has other names or none: {"q": "pos_*"},
+            with * for the name of a joint, {"q": "2-7"} by number from 1, {"q": "a+b"} one by one; the name of an array
+            or, as "topic", of a topic in a bag.
+        rate: Rows per second, for a log without times [Hz].
+        trajectories: Numbers of the trajectories to read. None reads all.
         degrees: True converts angles, False takes them as radians, None refuses values that look like degrees.
         time_unit: The unit of t: "s", "ms", "us" or "ns". None takes seconds and refuses times that look otherwise.
-        resample: Interpolate to this step [s] (`resampling.py`), for rows that are not evenly spaced.
-        window: Width of the differentiation window [s]. None takes 0.1.
+        torque_gain: What tau is multiplied by, for all joints or each: the gain of motor currents [N·m/A], a gear ratio
+            where torques are those of the motors, −1 for a sign.
+        gear: Turns of the motors per turn of the joints, where angles and torques are those of the motors.
+        delay: How late tau is written, in comparison with q [s].
+        resample: Interpolate to this step [s]. None keeps even rows, and takes the usual step of uneven ones.
+        lowpass: Cut-off frequency of a filter for q, v, a and tau [Hz], 0 for none. None takes 12 times the bandwidth
+            of the motion where the torque is noisy and something must be differentiated.
+        window: Width of the differentiation window [s]. None takes 0.1, or the least where a filter took the noise.
         prismatic: Which joints of a serial arm are prismatic. None takes all as revolute.
 
     Raises:
         FileNotFoundError: If the file does not exist.
         FileFormatError: If a column is missing, an entry is not a number, time does not increase, v is not dq/dt, a is
             not dv/dt, angles look like degrees, or a dataset is of another arm than `robot`.
+        MissingExtra: If a bag is to be read without the extra `logs`.
 
     Example:
         >>> import tempfile
@@ -84,28 +131,125 @@ def load_log(
         ...     nbs.load_log(f"{folder}/log.csv")
         Dataset(180 samples, 2 trajectories, 1 joint)
     """
-    path, seconds = Path(path), seconds_in(time_unit)
-    names = None if robot is None else robot.joint_names
-    if path.suffix.lower() == ".npz":
-        stored = read_npz(path)
-        if str(stored.get("format", "")) == DATASET_FORMAT:
-            given = {"degrees": degrees or None, "time_unit": time_unit if seconds != 1.0 else None, "window": window}
-            _refuse_settings(path, given | {"resample": resample, "prismatic": prismatic})
-            return _of_arm(path, load_dataset(path), robot)
-        columns = columns_of_arrays(path, stored, names)
-    elif path.suffix.lower() == ".csv":
-        columns = columns_of_csv(path, names)
-    else:
-        raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv or .npz; convert it.")
-    tree = _serial(columns.q.shape[1], prismatic) if robot is None else (robot.parents, robot.prismatic)
-    columns = _in_units(path, columns, _joints(columns, tree[1], robot), degrees, time_unit, robot)
-    name = "" if robot is None else robot.name
-    _dataset(path, columns._replace(v=columns.q, a=columns.q), tree, 1.0, name)  # refuses what is no table of numbers
-    columns = _even(path, columns, _joints(columns, tree[1], robot), degrees, resample)
-    data = _dataset(path, columns, tree, _WINDOW if window is None else window, name)
-    _check_derivatives(path, data)
+    given = [Path(file) for file in ([path] if isinstance(path, str | Path) else path)]
+    path, seconds, chosen = given[0], seconds_in(time_unit), _chosen(columns)
+    stored = read_npz(path) if path.suffix.lower() == ".npz" else {}
+    if str(stored.get("format", "")) == DATASET_FORMAT and len(given) == 1:
+        said: dict[str, Any] = {
+            "columns": columns,
+            "degrees": degrees or None,
+            "time_unit": time_unit if seconds != 1.0 else None,
+        }
+        said |= {"rate": rate, "trajectories": trajectories, "torque_gain": torque_gain, "gear": gear, "window": window}
+        said |= {"delay": delay or None, "resample": resample, "lowpass": lowpass or None, "prismatic": prismatic}
+        _refuse_settings(path, said)
+        return _of_arm(path, load_dataset(path), robot)
+    read, notes = _joined([_read(file, robot, chosen, rate) for file in given], given)
+    if trajectories is not None:
+        read = _only(path, read, trajectories)
+        notes.append("rows are counted in the trajectories that are read")
+    tree = _serial(read.q.shape[1], prismatic) if robot is None else (robot.parents, robot.prismatic)
+    joints, name = _joints(read, tree[1], robot), "" if robot is None else robot.name
+    read = _scaled(read, joints, torque_gain, gear)
+    read = _in_units(path, read, joints, degrees, time_unit, robot)
+    _dataset(path, read._replace(v=read.q, a=read.q), tree, name, {})  # refuses what is no table of numbers
+    read, more = _put_right(path, read, joints, degrees)
+    if delay:
+        read = _advanced(read, delay)
+    even = evenly(path, read, resample, lowpass) if window is None or lowpass else evenly(path, read, resample, 0.0)
+    whole = derived(path, even, window)
+    notes = [*notes, *more, *even.notes]
+    about = {"log": str(path), "notes": notes, "lowpass_Hz": even.lowpass, "step_s": even.step * even.every}
+    about["differentiated"] = [kind for kind in "va" if getattr(even.columns, kind) is None]
+    data = _dataset(path, whole.columns, tree, name, about)
+    check_derivatives(path, data)
+    for note in notes:
+        warnings.warn(f"{path}: {note}.", stacklevel=2)
     _warn(path, data)
-    return data
+    return data.take(whole.kept) if len(whole.kept) < len(data) else data
+
+
+def _read(
+    path: Path, robot: Robot | None, chosen: Mapping[str, str], rate: float | None
+) -> tuple[Columns, tuple[str, ...]]:
+    """The columns of one file, and notes on them."""
+    names, ending = None if robot is None else robot.joint_names, path.suffix.lower()
+    if is_table(path):
+        return columns_of_table(path, names, chosen, rate)
+    if ending not in (".npz", ".mat"):
+        raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv, .csv.gz, .npz or .mat; convert it.")
+    arrays = read_npz(path) if ending == ".npz" else arrays_of_matlab(path)
+    return columns_of_arrays(path, arrays, names, chosen, rate)
+
+
+def _chosen(columns: Mapping[str, str] | None) -> dict[str, str]:
+    """The names of columns as texts; raises ArgumentError for a quantity that there is not."""
+    chosen = {kind: str(name) for kind, name in (columns or {}).items()}
+    unknown = [kind for kind in chosen if kind not in CHOSEN]
+    if unknown:
+        raise ArgumentError(f"columns has '{unknown[0]}'; give names for some of {', '.join(CHOSEN)}.")
+    return chosen
+
+
+def _joined(parts: Sequence[tuple[Columns, tuple[str, ...]]], files: Sequence[Path]) -> tuple[Columns, list[str]]:
+    """The columns of several files, whose trajectories are numbered on; each note once."""
+    first, number, found = parts[0][0], 0, []
+    for (columns, _), file in zip(parts, files, strict=True):
+        alike = columns.q.shape[1] == first.q.shape[1]
+        if not alike or [x is None for x in columns] != [x is None for x in first]:
+            raise FileFormatError(f"{file}: has other joints or quantities than {files[0]}; give logs of one kind.")
+        own = columns.trajectory if len(parts) == 1 else np.unique(columns.trajectory, return_inverse=True)[1] + number
+        number = int(own.max(initial=-1)) + 1
+        found.append(columns._replace(trajectory=own))
+    joined: Any = [None if x[0] is None else np.concatenate(x) for x in zip(*found, strict=True)]
+    return Columns(*joined), list(dict.fromkeys(note for _, notes in parts for note in notes))
+
+
+def _only(path: Path, columns: Columns, trajectories: Sequence[int]) -> Columns:
+    """The rows of those trajectories."""
+    absent = [number for number in trajectories if number not in columns.trajectory]
+    if absent:
+        known = ", ".join(map(str, np.unique(columns.trajectory)))
+        raise ArgumentError(f"trajectories has {absent[0]}, and {path} {known:.200}; give some of these.")
+    return columns.take(np.isin(columns.trajectory, trajectories))
+
+
+def _scaled(columns: Columns, joints: Joints, torque_gain: Any, gear: Any) -> Columns:
+    """The columns with torques in N·m and angles of the joints; raises ArgumentError for another number of joints."""
+    for name, value in (("torque_gain", torque_gain), ("gear", gear)):
+        if value is not None and np.ndim(value) and len(value) != len(joints.names):
+            raise ArgumentError(f"{name} has {len(value)} numbers and the log {len(joints.names)} joints; match them.")
+    if torque_gain is not None:
+        columns = columns._replace(tau=columns.tau * np.asarray(torque_gain))
+    if gear is None:
+        return columns
+    if not np.all(np.asarray(gear)):
+        raise ArgumentError(f"gear is {gear}; give ratios that are not 0.")
+    v, a = (x if x is None else x / gear for x in (columns.v, columns.a))
+    return columns._replace(q=columns.q / gear, v=v, a=a, tau=columns.tau * gear)
+
+
+def _put_right(path: Path, columns: Columns, joints: Joints, degrees: bool | None) -> tuple[Columns, list[str]]:
+    """The columns without wraps and without what is wrong in single rows, and notes on it."""
+    found = repaired(columns, joints)
+    columns, stretches = found.columns, trajectory_slices(found.columns.trajectory)
+    turned, parted = unwrapped(columns.q, joints, stretches, degrees), parted_at_gaps(columns)
+    columns = columns._replace(q=turned.q)
+    fault = turned.fault or seam_fault(columns.t, columns.q, joints, stretches)
+    if fault:
+        raise FileFormatError(f"{path}: {fault}.")
+    columns = columns._replace(trajectory=parted.numbers).take(found.fresh & parted.kept)
+    return columns, [*found.notes, *turned.notes, *([parted.note] if parted.note else [])]
+
+
+def _advanced(columns: Columns, delay: float) -> Columns:
+    """The columns with the torque that was written `delay` later, without the rows for which there is none."""
+    tau, known = columns.tau.copy(), np.zeros(len(columns.t), dtype=bool)
+    for rows in trajectory_slices(columns.trajectory):
+        t, late = columns.t[rows], columns.t[rows] + delay
+        tau[rows] = PchipInterpolator(t, columns.tau[rows])(np.clip(late, t[0], t[-1]))
+        known[rows] = (late >= t[0]) & (late <= t[-1])
+    return columns._replace(tau=tau).take(known)
 
 
 def _refuse_settings(path: Path, given: dict[str, Any]) -> None:
@@ -158,119 +302,23 @@ def _in_units(
     return columns if time_unit is None else columns._replace(t=columns.t * seconds_in(time_unit))
 
 
-def _even(path: Path, columns: Columns, joints: Joints, degrees: bool | None, resample: float | None) -> Columns:
-    """The columns without wraps, and with rows `resample` [s] apart unless it is None."""
-    stretches = trajectory_slices(columns.trajectory)
-    found = unwrapped(columns.q, joints, stretches, degrees)
-    fault = found.fault or seam_fault(columns.t, found.q, joints, stretches)
-    if fault:
-        raise FileFormatError(f"{path}: {fault}.")
-    for note in found.notes:
-        warnings.warn(f"{path}: {note}.", stacklevel=3)
-    columns = columns._replace(q=found.q)
-    return columns if resample is None else resampled(path, columns, resample)
-
-
-def _dataset(path: Path, columns: Columns, tree: tuple[np.ndarray, np.ndarray], window: float, robot: str) -> Dataset:
-    """The samples, with v and a differentiated if they are not logged."""
-    derived = [name for name in "va" if getattr(columns, name) is None]
-    blank = np.zeros_like(columns.q)
-    v, a = (blank if x is None else x for x in (columns.v, columns.a))
-    about = {"log": str(path), "differentiated": derived}
+def _dataset(
+    path: Path, columns: Columns, tree: tuple[np.ndarray, np.ndarray], robot: str, about: dict[str, Any]
+) -> Dataset:
+    """The samples; raises FileFormatError for what is none."""
+    v: Any = columns.v
+    a: Any = columns.a
     try:
-        logged = Dataset(columns.q, v, a, columns.tau, columns.t, columns.trajectory, *tree, robot, about)
+        return Dataset(columns.q, v, a, columns.tau, columns.t, columns.trajectory, *tree, robot, about)
     except ArgumentError as error:
         raise FileFormatError(f"{path}: {error}") from error
-    if not derived:
-        return logged
-    stretches = [_Stretch.of(path, columns, rows, window) for rows in trajectory_slices(columns.trajectory)]
-    v, a = (np.concatenate([getattr(stretch, name) for stretch in stretches]) for name in "va")
-    whole = Dataset(columns.q, v, a, columns.tau, columns.t, columns.trajectory, *tree, robot, about)
-    return whole.take(np.concatenate([stretch.kept for stretch in stretches]))
-
-
-class _Stretch(NamedTuple):
-    """One trajectory with both derivatives, and the rows at least half a window away from its ends."""
-
-    v: np.ndarray
-    a: np.ndarray
-    kept: np.ndarray
-
-    @classmethod
-    def of(cls, path: Path, columns: Columns, rows: slice, window: float) -> "_Stretch":
-        at, steps = f"{path}: from row {rows.start + 1}", np.diff(columns.t[rows])
-        step = float(np.median(steps)) if steps.size else 1.0
-        if np.abs(steps - step).max(initial=0.0) > _EVEN * step:
-            raise FileFormatError(
-                f"{at}, samples to differentiate are not evenly spaced ({steps.min():.4g} to {steps.max():.4g} s); "
-                f"give {option('resample', float(f'{step:.3g}'))}, or log v and a."
-            )
-        half = max(round(0.5 * window / step), ORDER // 2 + 1)
-        length = 2 * half + 1
-        if rows.stop - rows.start < length:
-            raise FileFormatError(
-                f"{at}, a trajectory of {rows.stop - rows.start} samples is too short to be differentiated over "
-                f"{length}; give a shorter {option('window', BLANK)}, or longer trajectories."
-            )
-        if columns.v is None:
-            v, a = (derivative(columns.q[rows], step, length, order) for order in (1, 2))
-        else:
-            v, a = columns.v[rows], derivative(columns.v[rows], step, length)
-        a = a if columns.a is None else columns.a[rows]
-        return cls(v, a, np.arange(rows.start + half, rows.stop - half))
-
-
-def _check_derivatives(path: Path, data: Dataset) -> None:
-    """Raise FileFormatError if v is not dq/dt or a is not dv/dt."""
-    for name, of in (("v", "q"), ("a", "v")):
-        change, stated = _changes(data, getattr(data, of), getattr(data, name))
-        size = _rms(np.vstack((change, stated)))
-        missed = np.where(size > _STILL, _rms(change - stated) / np.maximum(size, _STILL), 0.0)
-        if missed.max() > _DISAGREES:
-            joint = int(np.argmax(missed))
-            at = f"{path}: {name} of joint {joint + 1}"
-            if name in data.about["differentiated"]:
-                raise FileFormatError(
-                    f"{at} cannot be found from {of}, whose noise or jumps are as large as its motion; give a longer "
-                    f"{option('window', BLANK)}, or log {name}."
-                )
-            said = stated[:, joint]
-            if not said.any():
-                raise FileFormatError(f"{at} is 0 in every row while {of} changes; log it, or leave {name} out.")
-            ratio = float(change[:, joint] @ said / (said @ said))
-            raise FileFormatError(
-                f"{at} is not the derivative of {of}, which changes {ratio:.3g} times as much as {name} states; "
-                f"{_remedy(ratio, name, of)}."
-            )
-
-
-def _changes(
-    data: Dataset, x: Float[np.ndarray, "samples n"], rate: Float[np.ndarray, "samples n"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Changes of x over `_SPAN`, and integrals of its stated rate (trapezoidal rule), of all trajectories."""
-    changes, integrals = [np.zeros((1, data.nv))], [np.zeros((1, data.nv))]
-    for rows in trajectory_slices(data.trajectory):
-        t, y, dy = data.t[rows], x[rows], rate[rows]
-        if len(t) > 1:
-            lag = min(max(1, round(_SPAN / float(np.median(np.diff(t))))), len(t) - 1)
-            areas = 0.5 * (dy[1:] + dy[:-1]) * np.diff(t)[:, None]
-            total = np.vstack((np.zeros(data.nv), np.cumsum(areas, axis=0)))
-            changes.append(y[lag:] - y[:-lag])
-            integrals.append(total[lag:] - total[:-lag])
-    return np.concatenate(changes), np.concatenate(integrals)
-
-
-def _remedy(ratio: float, name: str, of: str) -> str:
-    known = {np.pi / 180.0: f"convert {name} from degrees", 180.0 / np.pi: f"convert {of} from degrees"}
-    known[-1.0] = f"one of their signs is wrong, so correct {name}"
-    near = [remedy for factor, remedy in known.items() if abs(ratio / factor - 1.0) < 0.1]
-    return near[0] if near else f"correct its unit or the order of the columns, or leave {name} out"
 
 
 def _warn(path: Path, data: Dataset) -> None:
-    if data.trajectories == 1:
+    if data.trajectories == 1 and not data.can_be_split:
         warnings.warn(
-            f"{path} has only one trajectory, so none can be held out; log several, numbered in a column 'trajectory'.",
+            f"{path} has only one trajectory, too short to hold out a part of it; log several, numbered in a column "
+            "'trajectory'.",
             stacklevel=3,
         )
     if not data.tau.any():
@@ -278,7 +326,3 @@ def _warn(path: Path, data: Dataset) -> None:
             f"{path} has only zero torque, which leaves the scale of a model undetermined; log motions with motors on.",
             stacklevel=3,
         )
-
-
-def _rms(x: np.ndarray) -> np.ndarray:
-    return np.sqrt((x**2).mean(axis=0))

@@ -1,50 +1,144 @@
-"""Logs whose rows are not evenly spaced, as times of a computer's clock are, moved to an even grid."""
+"""Logs on an even grid: gaps split trajectories, jittered stamps are interpolated, one filter takes noise from all.
 
+A log is differentiated on an even grid. Where its torque is noisy, q, v, a and tau go through the same low-pass filter,
+forwards and backwards, so that they keep their relation at every instant (Gautier 1997), and rows that then say nothing
+new are left out.
+"""
+
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Int
 from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.signal import butter, periodogram, sosfiltfilt
 
-from nbs_pin.base.checks import positive
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.identification.datasets import trajectory_slices
 from nbs_pin.identification.log_files import Columns
+from nbs_pin.identification.measurement import ORDER, derivative
 
+EVEN = 1e-3
+"""Tolerance of even spacing, as a share of the step."""
+WINDOW = 0.1
+"""Usual width of the window of differentiation [s]."""
 _FEWEST = 4
 """Fewest rows of a trajectory that are interpolated."""
-_GAP = 12.0
-"""Longest gap between rows, in median steps, that is bridged."""
+_GAP, _SHORT_GAP = 12.0, 0.03
+"""Longest gap between rows that is bridged: in median steps; and that is bridged at any rate [s]."""
+_PIECE = 20
+"""Fewest rows of a piece between gaps that is kept."""
 _MOST_ROWS = 10_000_000
+_NOISY = 2e-3
+"""Noise of the torque, as a share of its deviation, from which on it is filtered."""
+_MOTION = 0.99
+"""Share of the power of the velocities that lies below the bandwidth of the motion."""
+_WIDE = 12.0
+"""Cut-off frequency over the bandwidth of the motion."""
+_LOWEST = 2.0
+"""Lowest cut-off frequency that is chosen [Hz]."""
+_RATE = 6.0
+"""Rows that are kept per period of the cut-off frequency."""
+_FINE = 5.0
+"""Fewest rows per period of a cut-off frequency that is chosen."""
+_LONG = 6.0
+"""Shortest trajectory that is filtered unasked, in periods of the cut-off frequency."""
+_STAGES = 4
+"""Order of the filter, which acts twice."""
 
 
-def resampled(path: Path, columns: Columns, step: float) -> Columns:
-    """The columns at times `step` [s] apart in each trajectory, from its first row on.
+class Even(NamedTuple):
+    """Columns on an even grid in each trajectory, and how they came there."""
+
+    columns: Columns
+    step: float
+    """Time between rows [s]."""
+    lowpass: float
+    """Cut-off frequency of the filter to go through [Hz], 0 for none."""
+    every: int
+    """Of how many rows one is to be kept."""
+    notes: tuple[str, ...]
+    """What was done."""
+
+
+class Parted(NamedTuple):
+    """The numbers of the trajectories where every long gap begins another, and the rows of pieces that are kept."""
+
+    numbers: Int[np.ndarray, " rows"]
+    kept: Bool[np.ndarray, " rows"]
+    note: str
+
+
+def parted_at_gaps(columns: Columns) -> Parted:
+    """Another trajectory after every long gap; short pieces are not kept."""
+    numbers, kept = columns.trajectory.copy(), np.ones(len(columns.t), dtype=bool)
+    gaps: list[tuple[float, int]] = []
+    for rows in trajectory_slices(columns.trajectory):
+        steps = np.diff(columns.t[rows])
+        if not len(steps):
+            continue
+        at = np.flatnonzero(steps > max(_GAP * float(np.median(steps)), _SHORT_GAP)) + 1
+        for begin, end in pairwise([0, *at.tolist(), rows.stop - rows.start]) if at.size else ():
+            piece = slice(rows.start + begin, rows.start + end)
+            numbers[piece] = numbers.max() + 1 if begin else numbers[rows.start]
+            kept[piece] = end - begin >= _PIECE
+        gaps += [(float(steps[k - 1]), rows.start + int(k)) for k in at]
+    if not gaps or not kept.any():
+        return Parted(columns.trajectory, np.ones(len(columns.t), dtype=bool), "")
+    longest, row = max(gaps, key=lambda gap: gap[0])
+    left = int(np.count_nonzero(~kept))
+    return Parted(
+        numbers,
+        kept,
+        f"{longest:.4g} s are missing between rows {row} and {row + 1}"
+        + (f", and less in {len(gaps) - 1} more gaps" if len(gaps) > 1 else "")
+        + ": another trajectory begins there"
+        + (f" ({left} rows in pieces of fewer than {_PIECE} are left out)" if left else ""),
+    )
+
+
+def evenly(path: Path, columns: Columns, resample: float | None, lowpass: float | None) -> Even:
+    """The columns at even times, with the filter that they need if it is not given.
 
     Positions, velocities and accelerations follow cubic splines, torques the monotone cubics of Fritsch and Carlson
     (PCHIP), which do not overshoot where a torque jumps.
 
     Raises:
-        ArgumentError: If the step is not > 0, or finer than a log can be stored.
-        FileFormatError: If a trajectory has a long gap or too few rows; names the rows.
+        ArgumentError: If the step is finer than a log can be stored.
+        FileFormatError: If a trajectory has too few rows; names the rows.
     """
-    positive("resample", step, "s")
-    parts = [_stretch(path, columns, rows, step) for rows in trajectory_slices(columns.trajectory)]
-    joined: Any = [None if x[0] is None else np.concatenate(x) for x in zip(*parts, strict=True)]
-    return Columns(*joined)
+    stretches = trajectory_slices(columns.trajectory)
+    steps = np.concatenate([np.diff(columns.t[rows]) for rows in stretches])
+    step = float(np.median(steps)) if steps.size else 1.0
+    uneven = bool((np.abs(steps - step) > EVEN * step).any())
+    derived, notes = columns.v is None or columns.a is None, []
+    every = 1 if resample is None else max(1, int(np.ceil(resample / step - 0.1)))
+    fine = resample / every if resample is not None else float(f"{step:.3g}") if uneven else step
+    if resample is None and uneven:
+        if not (derived or lowpass):
+            return Even(columns, step, 0.0, 1, ())
+        apart = f"{steps.min():.3g} to {steps.max():.3g} s"
+        notes.append(f"rows are {apart} apart, so they were interpolated to one every {fine:g} s")
+    if resample is not None or uneven:
+        parts = [_interpolated(path, columns, rows, fine) for rows in stretches]
+        joined: Any = [None if x[0] is None else np.concatenate(x) for x in zip(*parts, strict=True)]
+        columns = Columns(*joined)
+    if lowpass is None:
+        lowpass = _cutoff(columns, fine) if derived else 0.0
+        if lowpass:
+            notes.append(f"the torque is noisy, so q, v, a and tau were low-passed alike at {lowpass:g} Hz, undelayed")
+    if lowpass and resample is None:
+        every = max(1, int(1.0 / (_RATE * lowpass * fine)))
+        notes += [f"one row of {every} was kept, since others say nothing new"] if every > 1 else []
+    return Even(columns, fine, lowpass, every, tuple(notes))
 
 
-def _stretch(path: Path, columns: Columns, rows: slice, step: float) -> Columns:
+def _interpolated(path: Path, columns: Columns, rows: slice, step: float) -> Columns:
     t, first = columns.t[rows] - columns.t[rows.start], rows.start + 1
     if len(t) < _FEWEST:
         raise FileFormatError(f"{path}: from row {first}, {len(t)} rows are too few to resample; leave them out.")
-    gaps = np.diff(t)
-    k = int(np.argmax(gaps))
-    if gaps[k] > _GAP * float(np.median(gaps)):
-        raise FileFormatError(
-            f"{path}: {gaps[k]:.4g} s are missing between rows {first + k} and {first + k + 1}, too long to "
-            "interpolate; let another 'trajectory' begin there."
-        )
     if t[-1] / step > _MOST_ROWS:
         raise ArgumentError(f"resample is {step:g} s, which makes more than {_MOST_ROWS:,} rows; give a longer step.")
     even = step * np.arange(int(t[-1] / step + 1e-9) + 1)
@@ -53,4 +147,47 @@ def _stretch(path: Path, columns: Columns, rows: slice, step: float) -> Columns:
     q = CubicSpline(t, columns.q[rows])(inside)
     tau = PchipInterpolator(t, columns.tau[rows])(inside)
     number = np.full(len(even), columns.trajectory[rows.start])
-    return Columns(t=even, q=q, tau=tau, v=v, a=a, trajectory=number)
+    return Columns(t=columns.t[rows.start] + even, q=q, tau=tau, v=v, a=a, trajectory=number)
+
+
+def lowpassed(columns: Columns, step: float, cutoff: float) -> Columns:
+    """The columns through one Butterworth filter, forwards and backwards, which delays nothing."""
+    stages = butter(_STAGES, 2.0 * step * cutoff, output="sos")
+    found: dict[str, Any] = {}
+    for name in ("q", "v", "a", "tau"):
+        x = getattr(columns, name)
+        if x is not None:
+            parts = []
+            for rows in trajectory_slices(columns.trajectory):
+                pad = min(round(1.0 / (cutoff * step)), rows.stop - rows.start - 1)
+                parts.append(sosfiltfilt(stages, x[rows], axis=0, padlen=pad))
+            found[name] = np.concatenate(parts)
+    return columns._replace(**found)
+
+
+def torque_noise(columns: Columns) -> JointArray:
+    """Standard deviation of white noise in the torque [N·m]: the median third difference, which jumps do not move."""
+    thirds = [np.diff(columns.tau[rows], n=3, axis=0) for rows in trajectory_slices(columns.trajectory)]
+    return np.median(np.abs(np.concatenate(thirds)), axis=0) / (0.6745 * np.sqrt(20.0))
+
+
+def _cutoff(columns: Columns, step: float) -> float:
+    """A cut-off frequency [Hz] that lets the motion pass, 0 where no filter is needed or the rows are too few."""
+    stretches = trajectory_slices(columns.trajectory)
+    if min(rows.stop - rows.start for rows in stretches) < 2 * ORDER:
+        return 0.0
+    if not (torque_noise(columns) > _NOISY * np.maximum(columns.tau.std(axis=0), 1e-12)).any():
+        return 0.0
+    widest = 0.0
+    for rows in stretches:
+        length = 2 * max(round(0.5 * WINDOW / step), ORDER // 2 + 1) + 1
+        if rows.stop - rows.start < 2 * length:
+            continue
+        v = derivative(columns.q[rows], step, length)
+        v = v[:, v.std(axis=0) > 0.1 * v.std(axis=0).max()]
+        frequency, power = periodogram(v, 1.0 / step, window="hann", axis=0)
+        shares = np.cumsum(power, axis=0) / power.sum(axis=0)
+        widest = max(widest, float(frequency[np.argmax(shares > _MOTION, axis=0)].max()))
+    cutoff = float(f"{max(_WIDE * widest, _LOWEST):.2g}")
+    shortest = min(rows.stop - rows.start for rows in stretches) * step
+    return cutoff if widest and cutoff * step * _FINE < 1.0 and shortest * cutoff > _LONG else 0.0

@@ -21,7 +21,7 @@ _CALLED = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _LONG_STEP = 0.5  # [s]; recordings have shorter steps
 _CRAWL = 0.03  # [rad/s, m/s]; no joint faster than this at such steps is no motion of an arm
 _LIKE_A_RATIO = 0.2  # relative tolerance of a ratio of units
-_TURN = 2.0 * np.pi
+TURN = 2.0 * np.pi
 _BEYOND_A_TURN = 1.02  # share of a turn that wrapped angles span at most
 _NEAR_A_TURN = 0.1  # [rad]; least tolerance of a jump by a turn
 _WINDOW = 7  # rows of the median that tells what is usual
@@ -161,11 +161,11 @@ def unwrapped(
             fault = fault or _outlier_fault(x, rows.start, name)
             if joints.prismatic[i]:
                 continue
-            turns = _wraps(x, _TURN)
+            turns = wraps(x, TURN)
             at = np.flatnonzero(turns)
             found += (rows.start + at).tolist()
             if at.size and joints.continuous[i]:
-                x[1:] -= _TURN * np.cumsum(turns)  # a view of q
+                x[1:] -= TURN * np.cumsum(turns)  # a view of q
             fault = fault or ("" if degrees is not None else _degree_wrap_fault(x, rows.start, name))
         if found and joints.continuous[i]:
             often = "once," if len(found) == 1 else f"{len(found)} times, first"
@@ -182,7 +182,7 @@ def unwrapped(
     return Unwrapped(q, tuple(notes), fault)
 
 
-def _wraps(x: Float[np.ndarray, " rows"], turn: float) -> Float[np.ndarray, " steps"]:
+def wraps(x: Float[np.ndarray, " rows"], turn: float) -> Float[np.ndarray, " steps"]:
     """By how many turns x jumps from each row to the next; all 0 where x spans more than one turn."""
     steps = np.diff(x)
     turns = np.round(steps / turn)
@@ -190,12 +190,12 @@ def _wraps(x: Float[np.ndarray, " rows"], turn: float) -> Float[np.ndarray, " st
         return np.zeros(len(steps))
     rest = steps - turn * turns
     usual = median_filter(rest, _WINDOW, mode="nearest")
-    near = np.abs(rest - usual) <= np.maximum(_NEAR_A_TURN / _TURN * turn, np.abs(usual))
+    near = np.abs(rest - usual) <= np.maximum(_NEAR_A_TURN / TURN * turn, np.abs(usual))
     return np.where(near & (np.abs(usual) < 0.25 * turn), turns, 0.0)
 
 
 def _degree_wrap_fault(x: Float[np.ndarray, " rows"], start: int, name: str) -> str:
-    at = np.flatnonzero(_wraps(x, 360.0))
+    at = np.flatnonzero(wraps(x, 360.0))
     if not at.size:
         return ""
     k = int(at[0])
@@ -227,7 +227,7 @@ def seam_fault(
 def _outlier_fault(x: Float[np.ndarray, " rows"], start: int, name: str) -> str:
     """A single row that departs from both of its neighbours by ten times the usual step."""
     steps = np.diff(x)
-    if len(steps) < _WINDOW or not np.isfinite(x).all() or _wraps(x, _TURN).any():
+    if len(steps) < _WINDOW or not np.isfinite(x).all() or wraps(x, TURN).any():
         return ""
     there, back = steps[:-1], steps[1:]
     size = np.minimum(np.abs(there), np.abs(back))
