@@ -7,14 +7,14 @@ from typing import Annotated, Literal
 import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
-from nbs_pin.cli.file_units import FileUnits
+from nbs_pin.cli.log_options import LogOptions, whole_numbers
 from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.values import Verbose, choice, default, integer, number
 from nbs_pin.identification.registry import MODELS
 
 
 @dataclass(frozen=True)
-class Learn(FileUnits, Reported):
+class Learn(LogOptions, Reported):
     """Learn a model of an arm from data, and write model.nbs, summary.json and learning.png.
 
     Ctrl-C ends the fit of a network early and keeps the best iteration. Compare the result with Pinocchio's model:
@@ -23,8 +23,8 @@ class Learn(FileUnits, Reported):
     Example: nbs-pin learn out/collect-panda/data.npz --model chain --friction
     """
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """Data of nbs-pin collect, or a CSV or NPZ log with t, q, tau and optionally v and a."""
+    data: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """Data of nbs-pin collect, or logs with t, q, tau and optionally v and a; see nbs-pin log."""
     model: Annotated[str, choice("--model", MODELS)] = "chain"
     """chain: a rigid tree, from the order of the joints alone. cholesky: M = LLᵀ + εI by a network.
     homogenised: a convex network made quadratic. picnn: the paper's convex network.
@@ -32,14 +32,14 @@ class Learn(FileUnits, Reported):
     identified: inertias by least squares, in the geometry of the URDF."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the one named in the data")] = None
     """The arm by name or a path to a .urdf, .xacro or MJCF file; a log does not name it."""
-    window: Annotated[float | None, number("--window", above=0.0, most=100.0, unit="s"), default("0.1")] = None
-    """Width of the window in which a log without v and a is differentiated [s]."""
-    resample: Annotated[float | None, number("--resample", least=1e-6, most=10.0, unit="s"), default("off")] = None
-    """Interpolate a log whose rows are not evenly spaced to this step [s]."""
     friction: bool = False
     """Also learn viscous and Coulomb friction of every joint."""
     held_out: Annotated[float, number("--held-out", least=0.0, most=0.9, unit="")] = 0.2
-    """Share of the trajectories to hold out; they select the iteration of a network."""
+    """Share of the trajectories, or of one long recording, to hold out; it selects the iteration of a network."""
+    held_out_trajectories: Annotated[
+        str | None, whole_numbers("--held-out-trajectories"), default("some of that share")
+    ] = None
+    """Numbers of the trajectories to hold out."""
     loss: Literal["torque", "acceleration"] = "torque"
     """Quantity whose error a network minimises."""
     optimiser: Annotated[Literal["lm", "adam", "lbfgs"] | None, default("lm, lbfgs for more than 3500 parameters")] = (

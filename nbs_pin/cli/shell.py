@@ -28,6 +28,7 @@ from nbs_pin.cli.exit_codes import BAD_INPUT, NO_PROMISE, SIGNALLED
 from nbs_pin.cli.export import Export
 from nbs_pin.cli.faults import Faults
 from nbs_pin.cli.learn import Learn
+from nbs_pin.cli.log import Log
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.report import Report
 from nbs_pin.cli.reproduce import Reproduce
@@ -43,6 +44,7 @@ COMMANDS: dict[str, type] = {
     "track": Track,
     "train": Train,
     "collect": Collect,
+    "log": Log,
     "learn": Learn,
     "compare": Compare,
     "certify": Certify,

@@ -1,7 +1,7 @@
 """`nbs-pin learn`: a model of an arm from data, and its error on held-out motions."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from nbs_pin.base.plain import plain
 from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, column, several, units
 from nbs_pin.cli.learn import Learn
+from nbs_pin.cli.log_options import numbers_of
+from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.results import Results, drawing, sha256_of, table, tell
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -37,19 +39,22 @@ _ENDED = {"held out": "no further progress on held-out data", "iterations": "all
 
 def run(options: Learn, console: Console, notes: Console) -> None:
     """Learn, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
-    with notes.status(f"loading {options.data}"):
+    if not options.data:
+        raise OptionError("no DATA; give the path of a log, or of data of nbs-pin collect.")
+    with notes.status(f"loading {options.data[0]}"):
         if options.robot is None:
             options.arm.refuse_without_arm("give the arm with --robot")
-        read = options.units() | {"resample": options.resample, "window": options.window}
-        data, robot = data_and_arm(options.data, options.robot, read, options.arm.given())
-    name = options.data.stem if robot is None else robot.name
+        data, robot = data_and_arm(options.data, options.robot, options.read(), options.arm.given())
+    name = options.data[0].stem if robot is None else robot.name
     # Data are identified by their fingerprint, not by their path.
-    results = Results.of(options, name, robot, data=None, data_sha256=sha256_of(options.data))
+    prints = [sha256_of(file) for file in options.data]
+    results = Results.of(options, name, robot, data=None, data_sha256=prints[0] if len(prints) == 1 else prints)
     results = results.check(FILES, options.force, whole={"interrupted": False}, whose="another model")
     given = {name: getattr(options, name) for name in ("optimiser", "iterations")}
     given["loss"] = None if options.loss == "torque" else options.loss  # which every model minimises
     given = {name: value for name, value in given.items() if value is not None}
-    common = {"held_out": options.held_out, "friction": options.friction, "progress": True}
+    data, held_out = _held_out(data, options)
+    common = {"held_out": held_out, "friction": options.friction, "progress": True}
     with results.made() as folder:
         result = learn(data, options.model, robot, options.seed, **common, **given)
         interrupted = result.report.stopped == "interrupted"
@@ -100,8 +105,21 @@ def arm_of(data: Dataset) -> Robot | None:
     return robot
 
 
+def _held_out(data: Dataset, options: Learn) -> tuple[Dataset, Dataset | float]:
+    """The data without the trajectories to hold out, and these, or the share to hold out of all."""
+    if options.held_out_trajectories is None:
+        return data, options.held_out if data.can_be_split else 0.0
+    numbers = numbers_of(options.held_out_trajectories)
+    absent = [k for k in numbers if k not in data.trajectory]
+    out = np.isin(data.trajectory, numbers)
+    if absent or out.all():
+        known = ", ".join(map(str, np.unique(data.trajectory)))
+        raise OptionError(f"--held-out-trajectories has {(absent or numbers)[0]}; give some of {known:.200}, not all.")
+    return data.take(~out), data.take(out)
+
+
 def data_and_arm(
-    path: str | Path, arm: str | None, read: Mapping[str, Any], load: Mapping[str, Any] | None = None
+    path: str | Path | Sequence[Path], arm: str | None, read: Mapping[str, Any], load: Mapping[str, Any] | None = None
 ) -> tuple[Dataset, Robot | None]:
     """The data in a file and the arm of that name or path, or else the one that the data name.
 

@@ -27,7 +27,10 @@ def doubts(
 ) -> tuple[str, ...]:
     """Clauses that name what is doubtful and what to do."""
     some = data.take(np.sort(np.random.default_rng(0).permutation(len(data))[:_SOME]))
-    found = ("" if robot is None else _unit(some, robot), "" if friction is not None else _friction(model, some))
+    found = (
+        "" if robot is None or data.about.get("doubts") else _unit(some, robot),
+        "" if friction is not None else _friction(model, some),
+    )
     return tuple(text for text in found if text)
 
 

@@ -135,8 +135,8 @@ def _swapped(found: _Explained, names: Sequence[str]) -> str:
     costs = np.log(found.left)
     rows, places = linear_sum_assignment(costs)
     gain = np.diag(costs) - costs[rows, places]
-    moved = np.flatnonzero(places != rows)
-    if not len(moved) or gain.sum() < _GAIN or (found.left[moved, places[moved]] > _WELL).any():
+    moved = [int(i) for i in np.flatnonzero(places != rows)]
+    if not moved or gain.sum() < _GAIN or (found.left[moved, places[moved]] > _WELL).any():
         return ""
     fits = ", ".join(f"what is called tau of {names[i]} fits {names[places[i]]}" for i in moved)
     return f"columns of torque seem swapped: {fits}; correct their order or their names"
@@ -155,8 +155,8 @@ def _zero(arm: PinocchioDynamics, data: Dataset, found: _Explained, names: Seque
             there = _explained(data, _stated(arm, data, q))
             if np.median(there.own) < _WELL:
                 said = (
-                    f"the zero of {name} seems to be elsewhere than in the URDF: the torques fit q {turn:+d}°; add "
-                    f"{np.radians(turn):.6g} to that column"
+                    f"the zero of {name} seems to be elsewhere than in the URDF: the torques fit q {turn:+d}°; give "
+                    f"{option('zero', [round(np.radians(turn), 6) if k == i else 0 for k in range(len(names))])}"
                 )
                 trials.append((float(np.log(there.own).sum()), said))
     best = min(trials, default=(before, ""))
@@ -174,14 +174,14 @@ def _scale(found: _Explained, names: Sequence[str]) -> Iterator[str]:
         if 300.0 < ratio < 3000.0:
             yield f"{say}: are they in N·mm (mN·m)? give {option('torque_gain', 0.001)}"
         elif ratio > 1.0:
-            yield f"{say}: are they in N·cm or another unit than N·m? give {option('torque_gain', BLANK)} to convert them"
+            yield f"{say}: are they in N·cm or another unit than N·m? convert them with {option('torque_gain', BLANK)}"
         else:
             yield (
-                f"{say}: are they motor currents (A), torques on the motors' side of the gears, or in another unit than "
-                f"N·m? give {option('torque_gain', BLANK)} with the gains or gear ratios, about "
+                f"{say}: are they motor currents (A), torques on the motors' side of the gears, or not in N·m? give "
+                f"{option('torque_gain', BLANK)} with the gains or gear ratios, about "
                 f"{float(f'{1.0 / ratio:.2g}'):g} by the masses"
             )
-    for i in np.flatnonzero(known):
+    for i in map(int, np.flatnonzero(known)):
         own = abs(float(found.slope[i])) / ratio
         if not 1.0 / _MASSES < own < _MASSES and known.sum() > 2 and abs(found.alike[i]) > 0.95:
             yield (
@@ -200,7 +200,7 @@ def _signs(found: _Explained, names: Sequence[str]) -> Iterator[str]:
     if turned.all():
         yield f"the torques have the other sign than q; give {option('torque_gain', -1)}"
         return
-    which = ", ".join(names[i] for i in np.flatnonzero(turned))
+    which = ", ".join(names[i] for i in map(int, np.flatnonzero(turned)))
     gains = [-1 if x else 1 for x in turned]
     yield f"tau of {which} has the other sign than q; give {option('torque_gain', gains)}"
 
@@ -209,8 +209,8 @@ def _constants(data: Dataset, found: _Explained, names: Sequence[str]) -> Iterat
     """Constant torques."""
     deviation = data.tau.std(axis=0)
     size = np.maximum(_CONSTANT * deviation, _OF_LARGEST * deviation.max())
-    large = np.flatnonzero((np.abs(found.constant) > size) & (found.own < _WELL))
-    if len(large):
+    large = [int(i) for i in np.flatnonzero((np.abs(found.constant) > size) & (found.own < _WELL))]
+    if large:
         unit = units("torque", data.prismatic)
         told = ", ".join(f"{found.constant[i]:+.3g} {unit[i]} at {names[i]}" for i in large)
         yield f"the torques have constant parts that no motion explains: {told}; are the sensors' zeros right?"
@@ -233,9 +233,9 @@ def _delay(data: Dataset, some: Dataset, robot: Robot) -> float:
     if basis.shape[1] > 0.5 * basis.shape[0]:
         return float("nan")
     left = np.empty((len(delays), n))
-    for k, delay in enumerate(delays):
-        target = (_later(data, rows, float(delay)) / deviation).ravel()
-        rest = (target - basis @ (basis.T @ target)).reshape(-1, n)
+    for k, target in enumerate(_later(data, rows, delays)):
+        rest = (target / deviation).ravel()
+        rest = (rest - basis @ (basis.T @ rest)).reshape(-1, n)
         left[k] = np.square(rest).mean(axis=0)
     if np.median(left.min(axis=0)) > _WELL:
         return float("nan")
@@ -259,11 +259,11 @@ def _between(data: Dataset, some: Dataset) -> np.ndarray | None:
     return inside if inside.any() else None
 
 
-def _later(data: Dataset, rows: Dataset, delay: float) -> np.ndarray:
-    """The torque that was written `delay` later."""
-    tau = np.empty_like(rows.tau)
+def _later(data: Dataset, rows: Dataset, delays: np.ndarray) -> np.ndarray:
+    """The torques that were written later, by each of the delays."""
+    tau = np.empty((len(delays), *rows.tau.shape))
     for s in trajectory_slices(data.trajectory):
         mine = rows.trajectory == data.trajectory[s.start]
         if mine.any():
-            tau[mine] = PchipInterpolator(data.t[s], data.tau[s])(rows.t[mine] + delay)
+            tau[:, mine] = PchipInterpolator(data.t[s], data.tau[s])(rows.t[mine] + delays[:, None])
     return tau

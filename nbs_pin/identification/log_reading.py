@@ -1,0 +1,217 @@
+"""How the files of a log become samples: read, converted, put right, filtered and differentiated."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from scipy.interpolate import PchipInterpolator
+
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
+from nbs_pin.base.npz import read_npz
+from nbs_pin.identification.datasets import Dataset, trajectory_slices
+from nbs_pin.identification.log_derivatives import check_derivatives, derived
+from nbs_pin.identification.log_files import (
+    CHOSEN,
+    Columns,
+    arrays_of_matlab,
+    columns_of_arrays,
+    columns_of_table,
+    is_table,
+)
+from nbs_pin.identification.repairs import repaired
+from nbs_pin.identification.resampling import evenly, parted_at_gaps
+from nbs_pin.motions.recordings import Joints, degrees_fault, in_radians, seam_fault, seconds_in, time_fault, unwrapped
+from nbs_pin.robots.robot import Robot
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """How a log is read; the arguments of `load_log` of these names."""
+
+    columns: Mapping[str, str] | None
+    rate: float | None
+    trajectories: Sequence[int] | None
+    degrees: bool | None
+    time_unit: str | None
+    torque_gain: Any
+    gear: Any
+    zero: Any
+    delay: float
+    resample: float | None
+    lowpass: float | None
+    window: float | None
+    prismatic: Sequence[bool] | None
+
+    def given(self) -> dict[str, Any]:
+        """Those that ask for anything but seconds and radians."""
+        plain = {"degrees": False, "delay": 0.0, "lowpass": 0.0, "time_unit": "s"}
+        return {name: x for name, x in vars(self).items() if x is not None and plain.get(name) != x}
+
+
+def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings) -> Dataset:
+    """The samples in the files; `about["notes"]` says what was put right. Errors are those of `load_log`."""
+    path, chosen = files[0], _chosen(settings.columns)
+    read, notes = _joined([_read(file, robot, chosen, settings.rate) for file in files], files)
+    if settings.trajectories is not None:
+        read = _only(path, read, settings.trajectories)
+        notes.append("rows are counted in the trajectories that are read")
+    tree = _serial(read.q.shape[1], settings.prismatic) if robot is None else (robot.parents, robot.prismatic)
+    joints, name = _joints(read, tree[1], robot), "" if robot is None else robot.name
+    read = _in_units(path, _scaled(read, settings), joints, settings.degrees, settings.time_unit, robot)
+    if settings.zero is not None:
+        read = read._replace(q=read.q + settings.zero)
+    _dataset(path, read._replace(v=read.q, a=read.q), tree, name, {})  # refuses what is no table of numbers
+    spacing = _spacing(read)
+    read, more = _put_right(path, read, joints, settings.degrees)
+    read = _advanced(read, settings.delay) if settings.delay else read
+    lowpass = 0.0 if settings.lowpass is None and settings.window is not None else settings.lowpass
+    even = evenly(path, read, settings.resample, lowpass)
+    whole = derived(path, even, settings.window)
+    about = {
+        "log": str(path),
+        "read": spacing,
+        "notes": [*notes, *more, *even.notes],
+        "lowpass_Hz": even.lowpass,
+        "differentiated": [kind for kind in "va" if getattr(even.columns, kind) is None],
+    }
+    data = _dataset(path, whole.columns, tree, name, about)
+    check_derivatives(path, data)
+    return data.take(whole.kept) if len(whole.kept) < len(data) else data
+
+
+def _read(
+    path: Path, robot: Robot | None, chosen: Mapping[str, str], rate: float | None
+) -> tuple[Columns, tuple[str, ...]]:
+    """The columns of one file, and notes on them."""
+    names, ending = None if robot is None else robot.joint_names, path.suffix.lower()
+    if is_table(path):
+        return columns_of_table(path, names, chosen, rate)
+    if ending not in (".npz", ".mat"):
+        raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv, .csv.gz, .npz or .mat; convert it.")
+    arrays = read_npz(path) if ending == ".npz" else arrays_of_matlab(path)
+    return columns_of_arrays(path, arrays, names, chosen, rate)
+
+
+def _chosen(columns: Mapping[str, str] | None) -> dict[str, str]:
+    """The names of columns as texts; raises ArgumentError for a quantity that there is not."""
+    chosen = {kind: str(name) for kind, name in (columns or {}).items()}
+    unknown = [kind for kind in chosen if kind not in CHOSEN]
+    if unknown:
+        raise ArgumentError(f"columns has '{unknown[0]}'; give names for some of {', '.join(CHOSEN)}.")
+    return chosen
+
+
+def _joined(parts: Sequence[tuple[Columns, tuple[str, ...]]], files: Sequence[Path]) -> tuple[Columns, list[str]]:
+    """The columns of several files, whose trajectories are numbered on; each note once."""
+    first, number, found = parts[0][0], 0, []
+    for (columns, _), file in zip(parts, files, strict=True):
+        alike = columns.q.shape[1] == first.q.shape[1]
+        if not alike or [x is None for x in columns] != [x is None for x in first]:
+            raise FileFormatError(f"{file}: has other joints or quantities than {files[0]}; give logs of one kind.")
+        own = columns.trajectory if len(parts) == 1 else np.unique(columns.trajectory, return_inverse=True)[1] + number
+        number = int(own.max(initial=-1)) + 1
+        found.append(columns._replace(trajectory=own))
+    joined: Any = [None if x[0] is None else np.concatenate(x) for x in zip(*found, strict=True)]
+    return Columns(*joined), list(dict.fromkeys(note for _, notes in parts for note in notes))
+
+
+def _only(path: Path, columns: Columns, trajectories: Sequence[int]) -> Columns:
+    """The rows of those trajectories."""
+    absent = [number for number in trajectories if number not in columns.trajectory]
+    if absent:
+        known = ", ".join(map(str, np.unique(columns.trajectory)))
+        raise ArgumentError(f"trajectories has {absent[0]}, and {path} {known:.200}; give some of these.")
+    return columns.take(np.isin(columns.trajectory, trajectories))
+
+
+def _scaled(columns: Columns, settings: LogSettings) -> Columns:
+    """The columns with torques in N·m and angles of the joints; raises ArgumentError for another number of joints."""
+    n, gear = columns.q.shape[1], settings.gear
+    for name in ("torque_gain", "gear", "zero"):
+        value = getattr(settings, name)
+        if value is not None and np.ndim(value) and np.size(value) != n:
+            raise ArgumentError(f"{name} has {np.size(value)} numbers and the log {n} joints; give one for each.")
+    if settings.torque_gain is not None:
+        columns = columns._replace(tau=columns.tau * settings.torque_gain)
+    if gear is None:
+        return columns
+    if not np.all(gear):
+        raise ArgumentError(f"gear is {gear}; give ratios that are not 0.")
+    v, a = (x if x is None else x / gear for x in (columns.v, columns.a))
+    return columns._replace(q=columns.q / gear, v=v, a=a, tau=columns.tau * gear)
+
+
+def _spacing(columns: Columns) -> dict[str, Any]:
+    """The number of rows as they were, and the least, usual and largest time between them [s]."""
+    steps = [np.diff(columns.t[rows]) for rows in trajectory_slices(columns.trajectory)]
+    known = np.concatenate([*steps, [] if any(map(len, steps)) else [1.0]])
+    return {"rows": len(columns.t), "steps_s": [float(f(known)) for f in (np.min, np.median, np.max)]}
+
+
+def _put_right(path: Path, columns: Columns, joints: Joints, degrees: bool | None) -> tuple[Columns, list[str]]:
+    """The columns without wraps and without what is wrong in single rows, and notes on it."""
+    found = repaired(columns, joints)
+    columns, stretches = found.columns, trajectory_slices(found.columns.trajectory)
+    turned, parted = unwrapped(columns.q, joints, stretches, degrees), parted_at_gaps(columns)
+    columns = columns._replace(q=turned.q)
+    fault = turned.fault or seam_fault(columns.t, columns.q, joints, stretches)
+    if fault:
+        raise FileFormatError(f"{path}: {fault}.")
+    columns = columns._replace(trajectory=parted.numbers).take(found.fresh & parted.kept)
+    return columns, [*found.notes, *turned.notes, *([parted.note] if parted.note else [])]
+
+
+def _advanced(columns: Columns, delay: float) -> Columns:
+    """The columns with the torque that was written `delay` later, without the rows for which there is none."""
+    tau, known = columns.tau.copy(), np.zeros(len(columns.t), dtype=bool)
+    for rows in trajectory_slices(columns.trajectory):
+        t, late = columns.t[rows], columns.t[rows] + delay
+        tau[rows] = PchipInterpolator(t, columns.tau[rows])(np.clip(late, t[0], t[-1]))
+        known[rows] = (late >= t[0]) & (late <= t[-1])
+    return columns._replace(tau=tau).take(known)
+
+
+def _serial(n: int, prismatic: Sequence[bool] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Parents and kinds of the joints of a serial arm."""
+    slides = np.zeros(n, dtype=bool) if prismatic is None else np.array(list(prismatic), dtype=bool)
+    if slides.shape != (n,):
+        raise ArgumentError(f"prismatic has {slides.size} entries and the log {n} joints; give one for each.")
+    return np.arange(n, dtype=np.int64), slides
+
+
+def _joints(columns: Columns, prismatic: Bool[np.ndarray, " n"], robot: Robot | None) -> Joints:
+    """What is known of the joints; those of an unknown arm are numbered and turn within limits."""
+    if robot is not None:
+        return Joints.of(robot)
+    names = [f"joint {i + 1}" for i in range(columns.q.shape[1])]
+    return Joints(names, np.zeros(len(names), dtype=bool), prismatic)
+
+
+def _in_units(
+    path: Path, columns: Columns, joints: Joints, degrees: bool | None, time_unit: str | None, robot: Robot | None
+) -> Columns:
+    """The columns with every angle in radians and time in seconds from the first row of its trajectory."""
+    fault = degrees_fault(columns.q, joints, robot, turning=False) if degrees is None else ""
+    if degrees:
+        v, a = (x if x is None else in_radians(x, joints.prismatic) for x in (columns.v, columns.a))
+        columns = columns._replace(q=in_radians(columns.q, joints.prismatic), v=v, a=a)
+    if not fault and time_unit is None:
+        fault = time_fault(columns.t, columns.q, columns.v, trajectory_slices(columns.trajectory), joints.prismatic)
+    if fault:
+        raise FileFormatError(f"{path}: {fault}.")
+    return columns if time_unit is None else columns._replace(t=columns.t * seconds_in(time_unit))
+
+
+def _dataset(
+    path: Path, columns: Columns, tree: tuple[np.ndarray, np.ndarray], robot: str, about: dict[str, Any]
+) -> Dataset:
+    """The samples; raises FileFormatError for what is none."""
+    v: Any = columns.v
+    a: Any = columns.a
+    try:
+        return Dataset(columns.q, v, a, columns.tau, columns.t, columns.trajectory, *tree, robot, about)
+    except ArgumentError as error:
+        raise FileFormatError(f"{path}: {error}") from error
