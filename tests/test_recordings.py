@@ -47,6 +47,12 @@ def turning(tmp_path_factory):
     return robot
 
 
+def torque(q, t=T):
+    """What moves two_link so."""
+    v = np.gradient(q, t, axis=0)
+    return nbs.inverse_dynamics(nbs.PinocchioDynamics(TWO), q, v, np.gradient(v, t, axis=0))
+
+
 @contextmanager
 def noted():
     """The warnings of the block, as a list of texts that is filled at its end."""
@@ -63,8 +69,8 @@ def reference_file(folder, t, q, v=None):
 
 
 def log_file(folder, t, q, v=None, **more):
-    """A log of two trajectories of the same motion, with a torque that does not matter here."""
-    arrays = {"q": q, "tau": np.cos(3.0 * q) + 2.0} | ({} if v is None else {"v": v}) | more
+    """A log of two trajectories of the same motion."""
+    arrays = {"q": q, "tau": torque(q, T if len(q) == len(T) else t)} | ({} if v is None else {"v": v}) | more
     twice = {name: np.concatenate([x, x]) for name, x in arrays.items()}
     stamps = np.concatenate([t, t])
     np.savez(folder / "log.npz", t=stamps, trajectory=np.arange(len(stamps)) // len(t), **twice)
@@ -160,8 +166,8 @@ def test_joints_without_limits_are_unwrapped_in_references_and_logs(tmp_path, tu
     assert_allclose(motion(T).q, q, atol=1e-9)
     for v in (None, np.gradient(q, T, axis=0)):
         with noted() as notes:
-            data = load_log(log_file(tmp_path, T, wrapped, v, tau=np.cos(q)), robot=turning)
-        whole = load_log(log_file(tmp_path, T, q, v, tau=np.cos(q)), robot=turning)
+            data = load_log(log_file(tmp_path, T, wrapped, v, tau=torque(q)), robot=turning)
+        whole = load_log(log_file(tmp_path, T, q, v), robot=turning)
         assert len(notes) == 2
         assert_allclose(data.v, whole.v, atol=1e-9)
         assert_allclose(data.a, whole.a, atol=1e-7)
@@ -192,7 +198,7 @@ def test_a_single_outlier_is_named_as_such(tmp_path, row, size, stated):
         load_reference(reference_file(tmp_path, T, spoilt, v), robot=TWO, degrees=False)
     whole = load_log(log_file(tmp_path, T, q, v), robot=TWO)
     with pytest.warns(UserWarning, match=rf"q of joint1 .* row {row + 1}, where .*: an outlier\? interpolated"):
-        data = load_log(log_file(tmp_path, T, spoilt, v, tau=np.cos(3.0 * q) + 2.0), robot=TWO, degrees=False)
+        data = load_log(log_file(tmp_path, T, spoilt, v, tau=torque(q)), robot=TWO, degrees=False)
     assert_allclose(data.q, whole.q, atol=2e-4)
 
 
@@ -232,10 +238,11 @@ def test_uneven_rows_are_resampled(tmp_path, fault):
     rng, step = np.random.default_rng(0), T[1]
     t = T + 0.01 * step * rng.uniform(-1.0, 1.0, len(T)) if fault == "jitter" else T[rng.random(len(T)) > 0.03]
     t[0] = 0.0
-    path = log_file(tmp_path, t, smooth(np.append(t, 4.0))[:-1])
+    q = smooth(np.append(t, 4.0))[:-1]
+    path = log_file(tmp_path, t, q, tau=np.cos(3.0 * q) + 2.0)
     with pytest.warns(UserWarning, match=r"s apart, so they were interpolated to one every 0\.01 s"):
-        data = load_log(path, robot=TWO)
-    asked = load_log(path, robot=TWO, resample=step)
+        data = load_log(path)
+    asked = load_log(path, resample=step)
     for name in ("t", "q", "v", "a", "tau"):
         assert_array_equal(getattr(asked, name), getattr(data, name))
     rows = trajectory_slices(data.trajectory)[0]
@@ -264,7 +271,7 @@ def test_long_gaps_are_not_bridged(tmp_path):
 
 def table(names="t,q_joint1,q_joint2,v_joint1,v_joint2,tau_joint1,tau_joint2"):
     q = smooth(T)
-    return names.split(","), np.column_stack((T, q, np.gradient(q, T, axis=0), np.cos(q)))
+    return names.split(","), np.column_stack((T, q, np.gradient(q, T, axis=0), torque(q)))
 
 
 @pytest.fixture

@@ -41,10 +41,11 @@ def run(options: Learn, console: Console, notes: Console) -> None:
     """Learn, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     if not options.data:
         raise OptionError("no DATA; give the path of a log, or of data of nbs-pin collect.")
+    files = options.data[0] if len(options.data) == 1 else options.data
     with notes.status(f"loading {options.data[0]}"):
         if options.robot is None:
             options.arm.refuse_without_arm("give the arm with --robot")
-        data, robot = data_and_arm(options.data, options.robot, options.read(), options.arm.given())
+        data, robot = data_and_arm(files, options.robot, options.read(), options.arm.given())
     name = options.data[0].stem if robot is None else robot.name
     # Data are identified by their fingerprint, not by their path.
     prints = [sha256_of(file) for file in options.data]

@@ -6,6 +6,7 @@ suspected instead explains the torques well. How late the torques are is where t
 geometry leave least.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -34,10 +35,13 @@ _DRIVES = -0.3
 """Share of the torque that acts like friction, below which its sign is doubted."""
 _GAIN, _WELL = 3.0, 0.3
 """Fall of the sum of ln(unexplained share) that makes a suspicion; largest share that is then unexplained."""
-_CONSTANT, _OF_LARGEST = 0.12, 0.02
-"""A constant torque worth a word, in deviations of the joint's torque, and in the largest deviation of all joints."""
+_CONSTANT, _OF_LARGEST, _CLEAR = 0.12, 0.02, 0.1
+"""A constant torque worth a word, in deviations of the joint's torque, and in the largest deviation of all joints; and
+the largest share of the joint's torque that is then unexplained."""
 _LATEST, _STEP, _LATE = 0.2, 0.004, 0.01
 """Longest delay that is tried, resolution, and shortest delay that is told [s]."""
+_INDEPENDENT = 1e-10
+"""Share of the largest eigenvalue above which a direction of the bodies' parameters counts."""
 _LESS = 0.9
 """Unexplained torque without the delay, as a share, for a delay to be told."""
 
@@ -156,7 +160,7 @@ def _zero(arm: PinocchioDynamics, data: Dataset, found: _Explained, names: Seque
             if np.median(there.own) < _WELL:
                 said = (
                     f"the zero of {name} seems to be elsewhere than in the URDF: the torques fit q {turn:+d}°; give "
-                    f"{option('zero', [round(np.radians(turn), 6) if k == i else 0 for k in range(len(names))])}"
+                    f"{option('zero', [round(math.radians(turn), 6) if k == i else 0 for k in range(len(names))])}"
                 )
                 trials.append((float(np.log(there.own).sum()), said))
     best = min(trials, default=(before, ""))
@@ -193,7 +197,7 @@ def _scale(found: _Explained, names: Sequence[str]) -> Iterator[str]:
 def _signs(found: _Explained, names: Sequence[str]) -> Iterator[str]:
     """Torques that are turned round: against the masses, or in the direction of friction."""
     turned = ((found.alike < -_ALIKE) & (found.friction < -_DRIVES)) | (
-        (found.friction < _DRIVES) & (found.alike < _ALIKE)
+        (found.friction < _DRIVES) & (found.alike < _ALIKE) & (found.own < _CLEAR)
     )
     if not turned.any():
         return
@@ -209,7 +213,7 @@ def _constants(data: Dataset, found: _Explained, names: Sequence[str]) -> Iterat
     """Constant torques."""
     deviation = data.tau.std(axis=0)
     size = np.maximum(_CONSTANT * deviation, _OF_LARGEST * deviation.max())
-    large = [int(i) for i in np.flatnonzero((np.abs(found.constant) > size) & (found.own < _WELL))]
+    large = [int(i) for i in np.flatnonzero((np.abs(found.constant) > size) & (found.own < _CLEAR))]
     if large:
         unit = units("torque", data.prismatic)
         told = ", ".join(f"{found.constant[i]:+.3g} {unit[i]} at {names[i]}" for i in large)
@@ -219,7 +223,7 @@ def _constants(data: Dataset, found: _Explained, names: Sequence[str]) -> Iterat
 def _delay(data: Dataset, some: Dataset, robot: Robot) -> float:
     """How late the torques are [s], NaN if no rigid arm of that geometry explains them well."""
     inside, delays = _between(data, some), np.arange(-_LATEST, _LATEST + 0.5 * _STEP, _STEP)
-    if inside is None or int(inside.sum()) * data.nv < 40 * data.nv:
+    if inside is None or int(inside.sum()) < _FEW:
         return float("nan")
     rows, n = some.take(inside), data.nv
     own = np.array([rows.v, np.tanh(rows.v / _TRANSITION), rows.a, np.ones_like(rows.v)])
@@ -228,15 +232,14 @@ def _delay(data: Dataset, some: Dataset, robot: Robot) -> float:
     design /= np.maximum(np.linalg.norm(design, axis=(0, 1)), 1e-12)
     deviation = np.maximum(rows.tau.std(axis=0), 1e-6 * rows.tau.std(axis=0).max())
     weighted = (design / deviation[:, None]).reshape(-1, design.shape[-1])
-    basis, values, _ = np.linalg.svd(weighted, full_matrices=False)
-    basis = basis[:, values > 1e-7 * values[0]]
-    if basis.shape[1] > 0.5 * basis.shape[0]:
+    size, directions = np.linalg.eigh(weighted.T @ weighted)
+    known = size > _INDEPENDENT * size[-1]
+    if known.sum() > 0.5 * len(weighted):
         return float("nan")
-    left = np.empty((len(delays), n))
-    for k, target in enumerate(_later(data, rows, delays)):
-        rest = (target / deviation).ravel()
-        rest = (rest - basis @ (basis.T @ rest)).reshape(-1, n)
-        left[k] = np.square(rest).mean(axis=0)
+    basis = weighted @ directions[:, known] / np.sqrt(size[known])
+    targets = (_later(data, rows, delays) / deviation).reshape(len(delays), -1)
+    rest = targets - (targets @ basis) @ basis.T
+    left = np.square(rest).reshape(len(delays), -1, n).mean(axis=1)
     if np.median(left.min(axis=0)) > _WELL:
         return float("nan")
     costs = np.log(np.maximum(left, 1e-10)).mean(axis=1)

@@ -10,7 +10,6 @@ from nbs_pin.base.arguments import (
     MOST_JOINTS,
     checked,
     count,
-    either,
     flag,
     joints as per_joint,
     many,
@@ -31,8 +30,15 @@ from nbs_pin.motions.recordings import seconds_in
 from nbs_pin.robots.robot import ARM, Robot
 
 
+def _files(name: str, value: Any) -> tuple[Any, ...]:
+    """One file or a list of files."""
+    return (
+        many(readable, 1, 10_000, "files")(name, value) if isinstance(value, list | tuple) else (readable(name, value),)
+    )
+
+
 @checked(
-    path=either(many(readable, 1, 10_000, "files"), readable),
+    path=_files,
     robot=maybe(ARM),
     columns=maybe(mapping),
     rate=maybe(number(above=0.0, most=1e6, unit="Hz")),
