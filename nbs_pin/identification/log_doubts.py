@@ -81,9 +81,10 @@ def log_doubts(data: Dataset, robot: Robot) -> LogDoubts:
     ]  # which make the others meaningless
     delay = float("nan")
     if not doubts:
-        doubts = [*_scale(found, names), *_signs(found, names), *_constants(some, found, names)]
-        delay = _delay(data, some, robot)
-        if abs(delay) >= _LATE:
+        doubts, delay = [*_scale(found, names), *_signs(found, names)], _delay(data, some, robot)
+        if not abs(delay) >= _LATE:
+            doubts += _constants(some, found, names)
+        else:
             late = "late" if delay > 0.0 else "early"
             doubts.append(
                 f"the torques are about {1e3 * abs(delay):.0f} ms {late} in comparison with the motion; give "

@@ -1,0 +1,363 @@
+"""Logs of real arms, made here from a simulated one: what is put right, what is doubted, what they may look like."""
+
+import functools
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.io
+from numpy.testing import assert_allclose, assert_array_equal
+
+import nbs_pin as nbs
+from nbs_pin import cli
+from nbs_pin.base.csv_files import joint_columns
+from nbs_pin.base.exceptions import ArgumentError, FileFormatError
+from nbs_pin.identification.datasets import recordings
+from nbs_pin.identification.log_files import Columns
+from nbs_pin.identification.resampling import lowpassed
+from tests.commands import refusal
+
+ARM = nbs.load_robot("ur5")
+STEP, SECONDS = 0.004, 24.0
+
+
+@functools.cache
+def motion():
+    """t, q, v, a and tau of ur5 in harmonics of 0.1 Hz, with friction."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, SECONDS, STEP)
+    w = 0.2 * np.pi * np.arange(1, 5)
+    size, phase = rng.uniform(-0.5, 0.5, (4, 6)) / w[:, None] ** 0.5, rng.uniform(0.0, 6.0, (4, 6))
+    angle = w * t[:, None, None] + phase.T
+    q = (size.T * np.sin(angle)).sum(axis=-1) + np.array([0.0, -1.2, 1.0, -0.5, 0.7, 0.2])
+    v = (w * size.T * np.cos(angle)).sum(axis=-1)
+    a = -(w**2 * size.T * np.sin(angle)).sum(axis=-1)
+    friction = 2.0 * v + 3.0 * np.tanh(v / 0.01)
+    return t, q, v, a, nbs.inverse_dynamics(nbs.PinocchioDynamics(ARM), q, v, a) + friction
+
+
+@functools.cache
+def measured():
+    """Columns of a log without a: t, q with noise of an encoder, v, and tau with noise."""
+    t, q, v, _, tau = motion()
+    rng = np.random.default_rng(1)
+    return {
+        "t": t,
+        "q": q + 1e-5 * rng.standard_normal(q.shape),
+        "v": v + 2e-3 * rng.standard_normal(v.shape),
+        "tau": tau + 0.02 * tau.std(axis=0) * rng.standard_normal(tau.shape),
+    }
+
+
+def read(folder, arrays, **settings):
+    """The data in a log with these columns, and what was said, without the usual notes on noise."""
+    np.savez(folder / "log.npz", **arrays)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        data = nbs.load_log(folder / "log.npz", **{"robot": ARM} | settings)
+    texts = [str(warning.message) for warning in said]
+    return data, [text for text in texts if "low-passed" not in text and "was kept" not in text]
+
+
+def nmse(data, reference):
+    """Of the best rigid bodies with friction, trained on these data, on the last fifth of the others."""
+    model = nbs.identify(data.split()[0], ARM, friction=True)
+    test = reference.split()[1]
+    torque = nbs.inverse_dynamics(model, test.q, test.v, test.a) + model.friction.torque(test.v)
+    return (np.square(torque - test.tau).mean(axis=0) / test.tau.var(axis=0)).mean()
+
+
+# What is put right.
+
+
+def test_a_noisy_log_is_low_passed_alike_and_thinned_and_then_fits_better(tmp_path):
+    data, said = read(tmp_path, measured())
+    raw, _ = read(tmp_path, measured(), lowpass=0)
+    assert said == []
+    assert data.about["doubts"] == []
+    assert data.about["lowpass_Hz"] == pytest.approx(12 * 0.4, rel=0.3)
+    assert len(data) < 0.2 * len(raw)
+    t, q, v, a, tau = motion()
+    rows = np.searchsorted(t, data.t - 1e-9)
+    for name, truth in (("q", q), ("v", v), ("a", a)):
+        assert_allclose(getattr(data, name), truth[rows], atol=0.02 * np.abs(truth).max())
+    noise, left = (np.square(x.tau - tau[np.searchsorted(t, x.t - 1e-9)]).mean() for x in (raw, data))
+    assert left < noise
+    assert nmse(data, data) < 0.5 * nmse(raw, raw)
+
+
+def test_the_filter_delays_nothing_and_treats_all_signals_alike():
+    t = np.arange(0.0, 10.0, 0.01)
+    slow, fast = np.sin(2.0 * t)[:, None], np.sin(300.0 * t)[:, None]
+    found = lowpassed(Columns(t, slow + fast, 3.0 * (slow + fast), slow, None, np.zeros(len(t), dtype=int)), 0.01, 5.0)
+    inside = slice(100, -100)
+    assert_allclose(found.q[inside], slow[inside], atol=1e-3)
+    assert_allclose(found.tau, 3.0 * found.q, atol=1e-12)
+    assert found.a is None
+
+
+def test_jitter_repeats_spikes_and_gaps_are_put_right(tmp_path):
+    """As of a controller that is asked at uneven times, often before it knows more."""
+    clean, _ = read(tmp_path, measured())
+    rng, columns = np.random.default_rng(2), {name: x.copy() for name, x in measured().items()}
+    rows = len(columns["t"])
+    columns["t"] += 0.2 * STEP * rng.uniform(-1.0, 1.0, rows)
+    for k in rng.choice(np.arange(5, rows - 5), 40, replace=False):
+        for name in ("q", "v", "tau"):
+            columns[name][k] = columns[name][k - 1]
+    hit = np.sort(rng.choice(np.arange(100, rows - 100), 24, replace=False))
+    columns["tau"][hit, 1] += 500.0 * rng.choice([-1.0, 1.0], len(hit))
+    columns["q"][3000, 2] += 0.3
+    data, said = read(tmp_path, columns)
+    assert len(said) == 4
+    words = "|".join(said)
+    assert "rows that repeat the one before were left out" in words
+    assert f"N·m in row {hit[0] + 1}, where about" in words
+    assert f"the first of {len(hit)} spikes" in words
+    assert "rad in row 3001, where about" in words
+    assert "s apart, so they were interpolated to one every 0.004 s" in words
+    assert nmse(data, clean) < 1.1 * nmse(clean, clean)
+    gone = np.r_[0:2000, 2400:rows]
+    parted, said = read(tmp_path, {name: x[gone] for name, x in measured().items()})
+    assert len(said) == 1
+    assert "1.604 s are missing between rows 2000 and 2001: another trajectory begins there" in said[0]
+    assert parted.trajectories == 2
+
+
+def test_an_angle_that_stands_still_and_a_limit_of_torque_are_named(tmp_path):
+    t, q, v, a, tau = motion()
+    fast = int(np.argmax(np.abs(v[1000:2000, 3]))) + 1000
+    frozen = q.copy()
+    frozen[fast : fast + 3, 3] = frozen[fast - 1, 3]
+    data, said = read(tmp_path, {"t": t, "q": frozen, "v": v, "a": a, "tau": tau})
+    assert len(said) == 1
+    assert f"q of wrist_1_joint stood still in motion, in 3 rows, first row {fast + 1}" in said[0]
+    assert_allclose(data.q, q, atol=1e-3)
+    limit = 0.6 * np.abs(tau[:, 1]).max()
+    _, said = read(tmp_path, {"t": t, "q": q, "v": v, "a": a, "tau": np.clip(tau, -limit, limit)})
+    words = f"tau of shoulder_lift_joint is -{limit:.6g} N·m in "
+    assert any(words in text and "and never beyond" in text for text in said)
+
+
+# What is doubted.
+
+TURNED = np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+SWAPPED = [0, 2, 1, 3, 4, 5]
+DOUBTED = {
+    "amperes": (
+        lambda c: {"tau": c["tau"] / [14.0, 13.0, 11.0, 11.0, 11.0, 11.0]},
+        r"motor currents .*give torque_gain",
+    ),
+    "motor side": (lambda c: {"tau": c["tau"] / 100.0}, r"0\.01 times .*motors' side .*, about 100 by the masses"),
+    "N·mm": (lambda c: {"tau": 1e3 * c["tau"]}, r"in N·mm \(mN·m\)\? give torque_gain=0\.001"),
+    "one sign": (
+        lambda c: {"tau": TURNED * c["tau"]},
+        r"tau of shoulder_lift_joint has the other sign than q; give torque",
+    ),
+    "all signs": (lambda c: {"tau": -c["tau"]}, r"the torques have the other sign than q; give torque_gain=-1"),
+    "swapped": (lambda c: {"tau": c["tau"][:, SWAPPED]}, r"swapped: .*shoulder_lift_joint fits elbow_joint"),
+    "zero": (
+        lambda c: {"q": c["q"] + np.pi / 2 * (np.arange(6) == 1)},
+        r"zero of shoulder_lift_joint .* fit q -90°; give zero=\[0, -1\.570796, 0, 0, 0, 0\]",
+    ),
+    "offset": (
+        lambda c: {"tau": c["tau"] + [5.0, 20.0, 10.0, 2.0, 2.0, 2.0]},
+        r"constant parts .*\+20\S* N·m at shoulder_lift",
+    ),
+    "late by 30 ms": (lambda c: {"tau": shifted(c, 0.03)}, r"about (29|30|31) ms late .*give delay=0\.0(29|3|31)"),
+    "late by 100 ms": (lambda c: {"tau": shifted(c, 0.1)}, r"about (99|100|101) ms late"),
+}
+
+
+def shifted(columns, delay):
+    """The torques written `delay` later."""
+    t = columns["t"]
+    return np.column_stack([np.interp(t - delay, t, x) for x in columns["tau"].T])
+
+
+@pytest.mark.parametrize("fault", DOUBTED)
+def test_the_masses_of_the_arm_doubt_units_signs_order_zeros_and_delays(tmp_path, fault):
+    change, words = DOUBTED[fault]
+    data, said = read(tmp_path, measured() | change(measured()))
+    (doubt,) = data.about["doubts"]
+    with pytest.warns(UserWarning, match=words):
+        warnings.warn(doubt, stacklevel=1)
+    assert any(doubt in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("fault", "settings"),
+    [
+        ("motor side", {"torque_gain": 100.0}),
+        ("one sign", {"torque_gain": TURNED.tolist()}),
+        ("zero", {"zero": [0.0, -np.pi / 2, 0.0, 0.0, 0.0, 0.0]}),
+        ("late by 30 ms", {"delay": 0.03}),
+    ],
+)
+def test_what_is_doubted_is_put_right_by_what_is_told_to_give(tmp_path, fault, settings):
+    clean, _ = read(tmp_path, measured())
+    data, said = read(tmp_path, measured() | DOUBTED[fault][0](measured()), **settings)
+    assert said == []
+    inside = np.isin(data.t.round(6), clean.t.round(6))
+    if inside.all() and len(data) == len(clean):
+        assert_allclose(data.tau, clean.tau, atol=0.02 * np.abs(clean.tau).max())
+        assert_allclose(data.q, clean.q, atol=1e-9)
+    assert nmse(data, clean) < 1.2 * nmse(clean, clean)
+
+
+def test_motors_with_gears_are_told_by_one_number(tmp_path):
+    c = measured()
+    plain, _ = read(tmp_path, c)
+    motor = {"q": 50.0 * c["q"], "v": 50.0 * c["v"], "tau": c["tau"] / 50.0}
+    geared, _ = read(tmp_path, c | motor, gear=50.0)
+    for name in ("q", "v", "a", "tau"):
+        assert_allclose(getattr(geared, name), getattr(plain, name), rtol=1e-9, atol=1e-9)
+    with pytest.raises(ArgumentError, match="torque_gain has 2 numbers and the log 6 joints"):
+        read(tmp_path, c, torque_gain=[1.0, 2.0])
+
+
+# One long log.
+
+
+def test_of_one_long_log_the_end_is_held_out_after_a_pause(tmp_path):
+    data, _ = read(tmp_path, measured())
+    train, test = data.split(0.2)
+    assert test.t[-1] == data.t[-1]
+    assert test.t[0] - train.t[-1] >= 0.5
+    assert np.ptp(test.t) == pytest.approx(0.2 * np.ptp(data.t), rel=0.02)
+    assert nbs.fit(data, "identified", robot=ARM, friction=True).report.test_nmse < 0.01
+
+
+@pytest.mark.parametrize("own_time", [False, True])
+def test_pieces_of_one_recording_are_held_out_together(tmp_path, own_time):
+    """Random pieces would have their neighbours in the training data."""
+    whole, _ = read(tmp_path, measured())
+    pieces = np.arange(len(whole)) * 5 // len(whole)
+    starts = whole.t[np.searchsorted(pieces, np.arange(5))]
+    data = replace(whole, trajectory=pieces, t=whole.t - starts[pieces] if own_time else whole.t)
+    assert [group.tolist() for group in recordings(data)] == [[0, 1, 2, 3, 4]]
+    train, test = data.split(0.2, seed=1)
+    assert_array_equal(test.q, whole.split(0.2)[1].q)
+    assert_array_equal(train.q, whole.split(0.2)[0].q)
+    apart = replace(data, q=data.q + 0.5 * (pieces == 2)[:, None], trajectory=pieces)
+    assert [group.tolist() for group in recordings(apart)] == [[0, 1], [2], [3, 4]]
+
+
+# What files look like.
+
+
+def test_the_columns_of_other_programs_are_found():
+    for header, kind, expected in (
+        (["time", "shoulder_position", "elbow_position"], "q", {"shoulder": 1, "elbow": 2}),
+        (["/joint_states/a/velocity", "/joint_states/b/velocity"], "v", {"a": 0, "b": 1}),
+        (["field.effort0", "field.effort1"], "tau", {"1": 0, "2": 1}),
+        (["position[0]", "position[1]"], "q", {"1": 0, "2": 1}),
+        (["timestamp", "actual_q_0", "actual_q_1", "actual_qd_0", "actual_qd_1"], "v", {"1": 3, "2": 4}),
+        (["q1 [rad]", "q2 [rad]"], "q", {"1": 0, "2": 1}),
+        (["actual_q_0", "target_q_0"], "q", {}),
+    ):
+        assert joint_columns(header, kind) == expected
+
+
+@pytest.mark.parametrize("form", ["numbers", "names", "matlab", "matrix", "rate"])
+def test_columns_are_taken_by_number_or_name(tmp_path, form):
+    c = measured()
+    plain, _ = read(tmp_path, c, lowpass=0)
+    matrix = np.column_stack([c["t"], c["tau"], c["q"], c["v"]])
+    path, chosen, more = tmp_path / "log.csv", {"t": "1", "tau": "2-7", "q": "8-13", "v": "14-19"}, {}
+    if form == "numbers":
+        np.savetxt(path, matrix, delimiter=",")
+    elif form == "names":
+        names = [f"{kind}.{joint}" for kind in ("load", "angle", "rate") for joint in ARM.joint_names]
+        np.savetxt(path, matrix, delimiter=";", header=";".join(["clock", *names]))
+        chosen = {"t": "clock", "tau": "load.*", "q": "angle.*", "v": "rate.*"}
+    elif form == "rate":
+        np.savetxt(path, matrix[:, 1:], delimiter="\t")
+        chosen, more = {"tau": "1-6", "q": "7-12", "v": "13-18"}, {"rate": 1.0 / STEP}
+    elif form == "matrix":
+        path = tmp_path / "log.mat"
+        scipy.io.savemat(path, {"data": matrix.T})
+    else:
+        path = tmp_path / "log.mat"
+        scipy.io.savemat(path, {"log": {"time": c["t"], "angles": c["q"].T, "v": c["v"], "tau": c["tau"]}})
+        chosen = {"q": "angles"}
+    data = nbs.load_log(path, robot=ARM, columns=chosen, lowpass=0, **more)
+    for name in ("q", "v", "tau", "a"):
+        assert_allclose(getattr(data, name), getattr(plain, name), rtol=1e-9, atol=1e-9)
+
+
+def test_several_files_are_as_many_recordings(tmp_path):
+    c = measured()
+    for k, rows in enumerate((slice(0, 3000), slice(3000, None))):
+        np.savez(tmp_path / f"{k}.npz", **{name: x[rows] for name, x in c.items()})
+    files = [tmp_path / "0.npz", tmp_path / "1.npz"]
+    data = nbs.load_log(files, robot=ARM, window=0.06)
+    assert data.trajectories == 2
+    one = nbs.load_log(files[1], robot=ARM, window=0.06)
+    assert_array_equal(data.take(data.trajectory == 1).a, one.a)
+    only, _ = read(tmp_path, c | {"trajectory": np.arange(len(c["t"])) // 3000}, trajectories=[1], window=0.06)
+    assert_array_equal(only.a, one.a)
+    with pytest.raises(ArgumentError, match=r"trajectories has 7, and .* 0, 1; give some of these"):
+        read(tmp_path, c | {"trajectory": np.arange(len(c["t"])) // 3000}, trajectories=[7])
+
+
+# In the shell.
+
+
+@pytest.fixture
+def shell(capsys):
+    """Runs a command with its warnings, and returns what it printed."""
+
+    def run(*words):
+        with warnings.catch_warnings():
+            warnings.simplefilter("default")
+            assert cli.main([str(word) for word in words]) == 0
+        return capsys.readouterr()
+
+    return run
+
+
+def test_a_log_is_shown_and_written_as_data(tmp_path, shell, capsys):
+    c = measured()
+    np.savez(tmp_path / "log.npz", **c | {"tau": c["tau"] / 100.0})
+    out = tmp_path / "clean.npz"
+    shown = shell("log", tmp_path / "log.npz", "--robot", "ur5", "-v").out
+    assert "log.npz: 23.6" in shown
+    assert "1 doubt" in shown
+    assert "give --torque-gain … with the gains or gear ratios, about 100 by the masses" in shown
+    assert "6000 rows, usually 250 Hz" in shown
+    shown = shell("log", tmp_path / "log.npz", "--robot", "ur5", "--torque-gain", "100", "--out", out).out
+    assert "no doubts" in shown
+    assert f"next: nbs-pin learn {out} --robot ur5" in " ".join(shown.split("\n"))
+    assert len(nbs.load_log(out, robot=ARM)) > 500
+    again = ["log", str(tmp_path / "log.npz"), "--out", str(out)]
+    assert "exists; give --force to replace it" in refusal(cli.main(again), capsys)
+
+
+def test_the_shell_learns_from_a_log_with_every_option_of_python(tmp_path, shell, capsys):
+    c = measured()
+    columns = [c["t"], np.arange(len(c["t"])) // 2000, np.degrees(c["q"]), np.degrees(c["v"]), -c["tau"]]
+    np.savetxt(tmp_path / "log.csv", np.column_stack(columns), delimiter=",")
+    options = ["--columns", "t=1,trajectory=2,q=3-8,v=9-14,tau=15-20", "--torque-gain=-1", "--degrees"]
+    learn = ["learn", tmp_path / "log.csv", "--robot", "ur5", "--model", "identified", "--friction", *options]
+    shell(*learn, "--held-out-trajectories", "2", "--lowpass", "5", "--out", tmp_path / "out")
+    assert nbs.load(tmp_path / "out" / "model.nbs").nv == 6
+    wrong = [str(word) for word in [*learn, "--held-out-trajectories", "7", "--out", tmp_path / "other"]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert "has 7; give some of 0, 1, 2, not all" in refusal(cli.main(wrong), capsys)
+    wrong = ["log", str(tmp_path / "log.csv"), "--columns", "q"]
+    assert "--columns t=1,q=2-7,tau=8-13" in refusal(cli.main(wrong), capsys)
+
+
+def test_what_no_log_is_is_refused_with_a_remedy(tmp_path):
+    (tmp_path / "log.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    with pytest.raises(FileFormatError, match=r"log\.mat"):
+        nbs.load_log(tmp_path / "log.mat")
+    with pytest.raises(ArgumentError, match=r"columns has 'x'; give names for some of t, trajectory, tau, q, v, a"):
+        read(tmp_path, measured(), columns={"x": "y"})
+    with pytest.raises(ArgumentError, match=r"columns has q=angles, and .* correct the name"):
+        read(tmp_path, measured(), columns={"q": "angles"})
+    np.savetxt(tmp_path / "log.csv", np.ones((9, 13)), delimiter=",", header=",".join(["x", *"abcdefghijkl"]))
+    with pytest.raises(FileFormatError, match=r"no column 'tau_1'.* name them with columns=\{'tau': 'NAME_\*'\}"):
+        nbs.load_log(tmp_path / "log.csv")
