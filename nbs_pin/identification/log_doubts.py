@@ -76,12 +76,12 @@ def log_doubts(data: Dataset, robot: Robot) -> LogDoubts:
         return LogDoubts(nothing, nothing, nothing, nothing, float("nan"), ())
     found = _explained(some, stated)
     names = robot.joint_names
-    doubts = [
-        text for text in (_swapped(found, names), _zero(arm, some, found, names)) if text
-    ]  # which make the others meaningless
-    delay = float("nan")
-    if not doubts:
-        doubts, delay = [*_scale(found, names), *_signs(found, names)], _delay(data, some, robot)
+    doubts, delay = [], float("nan")
+    if not found.all_turned:  # by which gravity seems to come from the other side
+        doubts = [text for text in (_swapped(found, names), _zero(arm, some, found, names)) if text]
+    if not doubts:  # which would make the others meaningless
+        signs = list(_signs(found, names))
+        doubts, delay = [*_scale(found, names), *signs], float("nan") if signs else _delay(data, some, robot)
         if not abs(delay) >= _LATE:
             doubts += _constants(some, found, names)
         else:
@@ -103,6 +103,13 @@ class _Explained:
     constant: JointArray
     left: Float[np.ndarray, "n n"]
     """Unexplained share of the torque of joint i if it is explained as that of joint j, with a slope ≥ 0."""
+
+    @property
+    def all_turned(self) -> bool:
+        """Whether the torques of all joints have the other sign: against the masses, and not against the motion."""
+        known = np.abs(self.alike) > _ALIKE
+        drags = self.friction[np.abs(self.friction) > _CLEAR]
+        return bool(known.sum() > 1 and (self.alike[known] < 0.0).all() and (drags < 0.0).all())
 
     @property
     def own(self) -> JointArray:
@@ -200,10 +207,9 @@ def _signs(found: _Explained, names: Sequence[str]) -> Iterator[str]:
     turned = ((found.alike < -_ALIKE) & (found.friction < -_DRIVES)) | (
         (found.friction < _DRIVES) & (found.alike < _ALIKE) & (found.own < _CLEAR)
     )
-    if not turned.any():
-        return
-    if turned.all():
+    if found.all_turned:
         yield f"the torques have the other sign than q; give {option('torque_gain', -1)}"
+    if found.all_turned or not turned.any():
         return
     which = ", ".join(names[i] for i in map(int, np.flatnonzero(turned)))
     gains = [-1 if x else 1 for x in turned]

@@ -37,9 +37,9 @@ _MOTION = 0.99
 """Share of the power of the velocities that lies below the bandwidth of the motion."""
 _WIDE = 12.0
 """Cut-off frequency over the bandwidth of the motion."""
-_LOWEST = 2.0
-"""Lowest cut-off frequency that is chosen [Hz]."""
-_RATE = 6.0
+_LOWEST = 8.0
+"""Lowest cut-off frequency that is chosen [Hz]: slower filters round off Coulomb friction where a joint turns back."""
+_RATE = 5.0
 """Rows that are kept per period of the cut-off frequency."""
 _FINE = 5.0
 """Fewest rows per period of a cut-off frequency that is chosen."""
@@ -188,6 +188,6 @@ def _cutoff(columns: Columns, step: float) -> float:
         frequency, power = periodogram(v, 1.0 / step, window="hann", axis=0)
         shares = np.cumsum(power, axis=0) / power.sum(axis=0)
         widest = max(widest, float(frequency[np.argmax(shares > _MOTION, axis=0)].max()))
-    cutoff = float(f"{max(_WIDE * widest, _LOWEST):.2g}")
+    cutoff = float(f"{max(_WIDE * widest, min(_LOWEST, 0.9 / (_FINE * step))):.2g}")
     shortest = min(rows.stop - rows.start for rows in stretches) * step
     return cutoff if widest and cutoff * step * _FINE < 1.0 and shortest * cutoff > _LONG else 0.0
