@@ -114,6 +114,7 @@ def test_the_python_of_the_readme_and_the_first_page_runs(tmp_path, monkeypatch)
 
 
 @pytest.mark.pages
+@pytest.mark.filterwarnings("ignore:log.csv. the torque is noisy")
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_what_a_page_says_can_be_typed_in_order(page, tmp_path):
     run_page(page, tmp_path)

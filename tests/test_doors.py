@@ -95,7 +95,7 @@ def test_a_run_in_a_folder_is_named_by_the_option_of_the_folder(capsys, tmp_path
     assert f"error: RUN: no such file '{tmp_path}/run.npz'" in told(capsys, "replay", tmp_path)
 
 
-@pytest.mark.filterwarnings("ignore:.* has only zero torque")
+@pytest.mark.filterwarnings("ignore:.*only zero torque")
 @pytest.mark.parametrize(
     ("command", "words"),
     [
