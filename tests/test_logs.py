@@ -55,7 +55,7 @@ def read(folder, arrays, **settings):
         warnings.simplefilter("always")
         data = nbs.load_log(folder / "log.npz", **{"robot": ARM} | settings)
     texts = [str(warning.message) for warning in said]
-    return data, [text for text in texts if "low-passed" not in text and "was kept" not in text]
+    return data, [text for text in texts if "low-pass" not in text]
 
 
 def nmse(data, reference):

@@ -125,13 +125,16 @@ def evenly(path: Path, columns: Columns, resample: float | None, lowpass: float 
         parts = [_interpolated(path, columns, rows, fine) for rows in stretches]
         joined: Any = [None if x[0] is None else np.concatenate(x) for x in zip(*parts, strict=True)]
         columns = Columns(*joined)
-    if lowpass is None:
-        lowpass = _cutoff(columns, fine) if derived else 0.0
-        if lowpass:
-            notes.append(f"the torque is noisy, so q, v, a and tau were low-passed alike at {lowpass:g} Hz, undelayed")
+    chosen = _cutoff(columns, fine) if lowpass is None and derived else 0.0
+    lowpass = chosen if lowpass is None else lowpass
     if lowpass and resample is None:
         every = max(1, int(1.0 / (_RATE * lowpass * fine)))
-        notes += [f"one row of {every} was kept, since others say nothing new"] if every > 1 else []
+    thinned = f"one row of {every} was kept" if every > 1 and lowpass and resample is None else ""
+    if chosen:
+        alike = f"the torque is noisy, so q, v, a and tau were low-passed alike at {chosen:g} Hz, undelayed"
+        notes.append(f"{alike}, and {thinned}" if thinned else alike)
+    elif thinned:
+        notes.append(f"{thinned}, since after the low-pass filter others say nothing new")
     return Even(columns, fine, lowpass, every, tuple(notes))
 
 
