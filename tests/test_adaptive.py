@@ -11,8 +11,10 @@ import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.controllers.adapting_model import Duals
+from nbs_pin.controllers.bearable import Bearable
+from nbs_pin.controllers.gains import effective_inertia, sample_configurations
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
-from nbs_pin.controllers.unknowns import ADAPTS, model_body
+from nbs_pin.controllers.unknowns import ADAPTS, Carrier, model_body
 from nbs_pin.dynamics.body_fields import body_fields
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
@@ -237,6 +239,76 @@ def test_an_unknown_load_is_found(name):
         errors.append(np.abs(run.q - run.q_ref)[run.t > 9.0].max())
     assert errors[1] < 0.05 * errors[0] or errors[1] < 3e-3
     assert float(law.estimate(run.estimates[-1]).load_mass) == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["panda", "xarm7"])
+def test_no_largest_estimate_is_more_than_the_sampled_law_bears(name):
+    """h g λ_max(M⁻¹ΔM) ≤ ½ with the largest load and with each largest rotor, M of Pinocchio; g = 2ω and ψ''."""
+    robot = nbs.load_robot(name)
+    law, q = nbs.AdaptiveLaw.for_robot(robot), sample_configurations(robot, 200)
+    mass, radii = 2.0 * law.load_mass, np.array([law.load_across, law.load_across, law.load_radius])
+    second = mass * np.diag(radii**2)  # of KKᵀ less the link, in the frame of the tool, whose z is the last axis
+    heaviest = robot.with_payload(tool_frame(robot), mass, inertia=np.trace(second) * np.eye(3) - second)
+    own, loaded = (nbs.PinocchioDynamics(arm).mass_matrix(q) for arm in (robot, heaviest))
+    heavier = np.linalg.eigvals(np.linalg.solve(own, loaded)).real.max() - 1.0
+    bears = Bearable(law.law, pack_model(robot.model), 0.001)
+    carrier = Carrier.of(robot, None)
+    of_load = bears.heavier(carrier.joint, carrier.largest(law.load_mass, law.load_radius, law.load_across))
+    assert of_load == pytest.approx(heavier, rel=1e-9)
+    assert 16.0 <= 0.5 / (0.001 * bears.limit) <= 20.0
+    assert of_load == pytest.approx(bears.limit) if name == "xarm7" else of_load <= bears.limit
+    assert (law.load_across < 0.02) == (name == "xarm7")
+    assert (law.largest_rotor <= bears.limit * effective_inertia(robot, law.law.dynamics) * (1.0 + 1e-9)).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_loads_in_their_ellipsoid_are_below_the_largest_body(seed):
+    rng, carrier = np.random.default_rng(seed), Carrier.of(nbs.load_robot("panda"), "panda_link7")
+    x = rng.normal(size=(5, 3))
+    axis = carrier.place[2, :3]  # of the joint, in the frame of the load
+    along = x @ axis[:, None] * axis
+    size = np.linalg.norm(along / 0.1 + (x - along) / 0.02, axis=1)
+    w = np.hstack([x * (rng.uniform(size=5) / size)[:, None], np.ones((5, 1))]) @ carrier.place.T
+    load = w.T * (3.0 * rng.dirichlet(np.ones(5))) @ w
+    assert np.linalg.eigvalsh(carrier.largest(3.0, 0.1, 0.02) - load)[0] >= -1e-12
+
+
+def test_a_light_wrist_is_not_driven_into_its_torque_limits():
+    """5 N·m on every joint of an arm whose last inertia is 1.3e-4 kg·m²: no torque is cut off for long."""
+    robot = nbs.load_robot("xarm7")
+    fixed, law = nbs.NeuralBackstepping.for_robot(robot), nbs.AdaptiveLaw.for_robot(robot)
+    rates, errors = np.linspace(0.5, 2.5, 7), []
+    for one in (fixed, law):
+        run = nbs.simulate(
+            nbs.MujocoPlant(robot), one, nbs.Sinusoid.for_robot(robot), 8.0, 0.001, check=False,
+            disturbance=lambda t, q, v: 5.0 * np.where(np.sin(rates * t) >= 0.0, 1.0, -1.0),
+        )  # fmt: skip
+        errors.append(np.sqrt(np.square(run.q - run.q_ref)[run.t > 4.0].mean(axis=0)).max())
+    assert errors[1] <= 1.1 * errors[0]
+    assert (np.abs(run.tau_command) > run.effort_limit).any(axis=1).mean() < 0.01
+
+
+def test_loads_and_rotors_that_the_sampled_law_may_not_bear_warn():
+    inner = nbs.NeuralBackstepping.for_robot(nbs.load_robot("xarm7"))
+    with pytest.warns(UserWarning, match=r"a load of 2 kg within 0\.1 m, 0\.1 m across, may be taken for .* armature="):
+        law = nbs.AdaptiveLaw(inner, load_mass=2.0, load_across=0.1)
+    assert (law.load_mass, law.load_radius, law.load_across) == (2.0, 0.1, 0.1)
+    with pytest.warns(UserWarning, match=r"a rotor of 0\.1 kg·m² at 'joint7' is .* armature="):
+        nbs.AdaptiveLaw(inner, ["rotors"], largest_rotor=0.1)
+
+
+UNUSED = {"frame": "panda_link7", "load_mass": 1.0, "load_radius": 0.1, "load_across": 0.1, "largest_rotor": 0.1,
+          "links": ["panda_joint7"]}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNUSED)
+def test_bounds_of_what_does_not_adapt_are_refused(name):
+    inner = nbs.NeuralBackstepping.for_robot(nbs.load_robot("panda"))
+    with pytest.raises(ArgumentError, match=f"{name} was given with adapts=.*leave {name} out"):
+        nbs.AdaptiveLaw(inner, ["friction"], **{name: UNUSED[name]})
+    with pytest.raises(ArgumentError, match="largest_rotor has 3 numbers, expected one or 7"):
+        nbs.AdaptiveLaw(inner, ["rotors"], largest_rotor=[0.1, 0.1, 0.1])
 
 
 def test_estimates_make_a_model_whose_torque_is_that_of_the_law(robot):

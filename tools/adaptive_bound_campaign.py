@@ -110,7 +110,7 @@ def outcome(seed: int, period: float = PERIOD) -> Outcome:
     name, ample = str(rng.choice(ARMS)), seed % 2 == 1
     law = law_of(name, ample, float(rng.choice((4.0, 8.0))), int(rng.integers(3)))
     robot, inner = law.robot, law.law
-    radius = float(rng.choice((0.0, 0.03, 0.1)))
+    radius = float(rng.choice((0.0, 0.3, 1.0))) * min(law.load_radius or 0.0, law.load_across or 0.0)
     mass = LOADS[name] * float(rng.choice((0.25, 0.5, 1.0)))
     load, duration = load_in(rng, mass, radius), float(rng.integers(3, 6))
     frame = law.unknowns.bodies[0].name.removeprefix("load at ")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from torch import nn
 
-from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, maybe, number, numbers, text, texts
+from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, joints, maybe, number, numbers, text, texts
 from nbs_pin.base.arrays import (
     Array,
     Vectors,
@@ -18,13 +18,14 @@ from nbs_pin.base.arrays import (
     is_torch_array,
     matvec,
 )
-from nbs_pin.base.checks import told
+from nbs_pin.base.checks import PerJoint, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import joints_told
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.adapting_model import AdaptingModel
+from nbs_pin.controllers.bearable import Bearable, rotors_of
 from nbs_pin.controllers.compiled_adaptive import (
     MEMORY,
     AdaptiveMemory,
@@ -39,7 +40,17 @@ from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
 from nbs_pin.controllers.passive_outputs import output_of, signals_of
-from nbs_pin.controllers.unknowns import ADAPTS, Unknowns, unknown_links, unknown_load, unknown_numbers
+from nbs_pin.controllers.unknowns import (
+    ADAPTS,
+    Carrier,
+    UnknownBody,
+    UnknownNumber,
+    Unknowns,
+    unknown_links,
+    unknown_load,
+    unknown_numbers,
+    unknown_rotors,
+)
 from nbs_pin.controllers.update_rates import update_rates
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio_tree import pack_model
@@ -49,13 +60,16 @@ from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import BASE, BODY, MASS
 from nbs_pin.robots.robot import ARM, Robot
 
-_LOAD = 0.25  # largest load as a share of the arm's mass
+_LOAD, _RADIUS = 0.25, 0.1  # largest load as a share of the arm's mass; where it lies [m]
 _TRANSITION = 0.01  # speed scale of Coulomb friction where the law feeds none forward [rad/s]
 
 
 @known_code
 @storable(
-    ("adapts", "frame", "links", "load_mass", "load_radius", "gain", "leak", "period", "rates", "output_rate"),
+    (
+        *("adapts", "frame", "links", "load_mass", "load_radius", "load_across", "largest_rotor"),
+        *("gain", "leak", "period", "rates", "output_rate"),
+    ),
     parts=("law",),
 )
 class AdaptiveLaw(Controller, nn.Module):
@@ -75,7 +89,12 @@ class AdaptiveLaw(Controller, nn.Module):
         frame: Link that carries the load; None takes the arm's end.
         links: Joints whose bodies adapt with "links"; none takes all.
         load_mass: Largest load [kg]; None takes a quarter of the arm's mass.
-        load_radius: The load lies within this distance of the frame's origin [m].
+        load_radius: The load lies within this distance of the frame's origin [m]; None takes 0.1 m.
+        load_across: Across the axis of the joint that carries it, the load lies within this distance of the frame's
+            origin [m], in the ellipsoid of both. None takes `load_radius`.
+        largest_rotor: Largest rotor inertia of every joint [kg·m², kg]; None takes a quarter of the arm's largest. None
+            of these four takes less where the model's inertia is so small that the sampled law would shake the arm
+            with estimates of that size (docs/theory.md §10); what is given and too large for it warns.
         gain: Speed of adaptation, the share of the damping's work that a sampled step costs at most in usual motions;
             with `rates` it says nothing.
         leak: σ [1/s], at which estimates return to the first ones; 0 for none.
@@ -84,14 +103,15 @@ class AdaptiveLaw(Controller, nn.Module):
         output_rate: ε or λ [1/s] of PD and ComputedTorque (`passive_outputs.py`), (n,); None takes it from their gains.
 
     Raises:
-        ArgumentError: For a law without an arm or a passive output, an unknown name, or a number out of range.
+        ArgumentError: For a law without an arm or a passive output, an unknown name, bounds of what does not adapt, or
+            a number out of range.
 
     Example:
         >>> import nbs_pin as nbs
         >>> robot = nbs.load_robot("panda")
         >>> law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), ["load", "friction"], load_mass=4.0)
         >>> memory = law.initial_memory([0.0] * 7)
-        >>> float(law.estimate(memory).load_mass.round(6))
+        >>> round(abs(float(law.estimate(memory).load_mass)), 6)
         0.0
     """
 
@@ -101,7 +121,9 @@ class AdaptiveLaw(Controller, nn.Module):
         frame=maybe(text),
         links=texts,
         load_mass=maybe(number(above=0.0, unit="kg")),
-        load_radius=number(above=0.0, most=100.0, unit="m"),
+        load_radius=maybe(number(above=0.0, most=100.0, unit="m")),
+        load_across=maybe(number(above=0.0, most=100.0, unit="m")),
+        largest_rotor=maybe(joints(least=0.0, unit="kg·m²")),
         gain=number(above=0.0, below=1.0),
         leak=number(least=0.0, unit="1/s"),
         period=PERIOD,
@@ -114,8 +136,10 @@ class AdaptiveLaw(Controller, nn.Module):
         frame: str | None = None,
         links: Sequence[str] = (),
         load_mass: float | None = None,
-        load_radius: float = 0.1,
-        gain: float = 0.75,
+        load_radius: float | None = None,
+        load_across: float | None = None,
+        largest_rotor: PerJoint | None = None,
+        gain: float = 0.6,
         leak: float = 0.0,
         period: float = 0.001,
         rates: Any = None,
@@ -133,11 +157,15 @@ class AdaptiveLaw(Controller, nn.Module):
                 f"AdaptiveLaw: a {type(law).__name__} was given adapts={told(list(adapts))}, expected ['offsets'] for a"
                 " law without a Lyapunov function; give that, or NeuralBackstepping."
             )
+        self._refuse_unused(adapts, frame=frame, load_mass=load_mass, load_radius=load_radius, load_across=load_across)
+        self._refuse_unused(adapts, links=links or None, largest_rotor=largest_rotor)
         self.law, self.robot = law, robot
         self.adapts, self.frame, self.links = tuple(map(str, adapts)), frame, tuple(map(str, links))
-        mass = sum(body.mass for body in list(robot.model.inertias)[1:])
-        self.load_mass = _LOAD * mass if load_mass is None else load_mass
-        self.load_radius, self.gain, self.leak, self.period = load_radius, gain, leak, period
+        self.gain, self.leak, self.period = gain, leak, period
+        self.load_mass, self.load_radius, self.load_across = load_mass, load_radius, load_across
+        self.largest_rotor = None if largest_rotor is None else rotors_of(robot, largest_rotor)
+        if isinstance(law, LyapunovLaw):
+            self._complete(Bearable(law, self._believed, period))
         self.output = output_of(law, output_rate)
         self.output_rate, self.rates = self.output.rate, self._rates(rates)
 
@@ -160,6 +188,33 @@ class AdaptiveLaw(Controller, nn.Module):
         )
         return cls(law, adapts, period=period)
 
+    @staticmethod
+    def _refuse_unused(adapts: Sequence[str], **given: Any) -> None:
+        """Raises ArgumentError for a bound of what does not adapt."""
+        for name, value in given.items():
+            of = "links" if name == "links" else "rotors" if name == "largest_rotor" else "load"
+            if value is not None and of not in adapts:
+                raise ArgumentError(
+                    f'AdaptiveLaw: {name} was given with adapts={told(list(adapts))}, expected "{of}" among these; add'
+                    f" it, or leave {name} out."
+                )
+
+    def _complete(self, bears: Bearable) -> None:
+        """Set the largest load and rotors that were not given; warns of those given that the law may not bear."""
+        if "load" in self.adapts:
+            carrier = Carrier.of(self.robot, self.frame)
+            if self.load_mass is None:
+                mass = sum(body.mass for body in list(self.robot.model.inertias)[1:])
+                self.load_mass = bears.mass(carrier, _LOAD * mass)
+            if self.load_radius is None:
+                self.load_radius = bears.radius(carrier, self.load_mass, _RADIUS)
+            if self.load_across is None:
+                self.load_across = bears.across(carrier, self.load_mass, self.load_radius)
+            bears.warn_of_load(carrier, self.load_mass, self.load_radius, self.load_across)
+        if "rotors" in self.adapts:
+            self.largest_rotor = bears.rotors() if self.largest_rotor is None else self.largest_rotor
+            bears.warn_of_rotors(self.largest_rotor)
+
     @property
     def nv(self) -> int:
         """Number of joints."""
@@ -172,15 +227,20 @@ class AdaptiveLaw(Controller, nn.Module):
     def unknowns(self) -> Unknowns:
         """What adapts, with the bounds and the first estimates of it."""
         robot, tree, friction = self.robot, self._believed, self.law.friction
-        bodies, own = [], []
-        if "load" in self.adapts:
-            bodies.append(unknown_load(robot, tree, self.frame, self.load_mass, self.load_radius))
+        bodies: list[UnknownBody] = []
+        own: list[UnknownNumber] = []
+        if self.load_mass is not None and self.load_radius is not None and self.load_across is not None:
+            carrier = Carrier.of(robot, self.frame)
+            largest = carrier.largest(self.load_mass, self.load_radius, self.load_across)
+            bodies.append(unknown_load(tree, carrier, largest))
         if "links" in self.adapts:
             carrying = [body.joint for body in bodies]  # its own body adapts with the load
             bodies += [body for body in unknown_links(robot, tree, self.links) if body.joint not in carrying]
         for kind in self.adapts:
-            if kind not in ("load", "links"):
-                own += unknown_numbers(robot, friction, tree, kind, self.period, isinstance(self.law, ComputedTorque))
+            if kind == "rotors" and self.largest_rotor is not None:
+                own += unknown_rotors(self.law, tree, self.largest_rotor)
+            elif kind in ("friction", "offsets"):
+                own += unknown_numbers(self.law, kind, self.period)
         return Unknowns(tuple(bodies), tuple(own), _TRANSITION if friction is None else friction.transition)
 
     @cached_property

@@ -11,10 +11,11 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.controllers.gains import effective_inertia, gains_for_robot, largest_inertia
-from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.controllers.computed_torque import ComputedTorque
+from nbs_pin.controllers.gains import effective_inertia, gains_for_robot
+from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.pinocchio_tree import tree_frames
 from nbs_pin.kernels.adaptation import PER_BODY, PER_NUMBER
 from nbs_pin.kernels.layout import NumberCode, Packed
@@ -31,9 +32,9 @@ _UPPER = np.triu_indices(4)
 _LEAST_SHARE = 1e-4  # what every direction of a body begins with, where the model has less, as a share of the largest
 _REACH = 2.0  # a link's largest body, as a multiple of the one that the model has
 _LENGTH, _SPREAD = 0.05, 0.02  # what a link's largest body has besides, so that a point mass is within it [m, share]
-_FRICTION = 0.1  # largest Coulomb friction as a share of the effort limit
+_FRICTION = 0.1  # largest friction, at the velocity limit if viscous, as a share of the effort limit
 _BEND = 1e-5  # friction may seem to be below zero by what bends a joint by this much [rad, m]
-_ROTOR, _LIGHTER = 0.25, 0.2  # largest rotor, of the arm's largest inertia; how much lighter the joints may seem
+_LIGHTER = 0.2  # how much lighter all joints together may seem
 _ANY = 1e-3  # a bandwidth [rad/s], on which the stiffness does not depend
 _UNLIMITED = 100.0  # effort [N·m] of a joint that states none
 _FAST = np.pi  # velocity [rad/s] of a joint that states none
@@ -100,17 +101,36 @@ class Unknowns(NamedTuple):
         return Packed(np.array(layout, dtype=np.int64), np.concatenate(weights))
 
 
-def unknown_load(robot: Robot, tree: Packed, frame: str | None, mass: float, radius: float) -> UnknownBody:
-    """The body of a link with a load of at most `mass` [kg] within `radius` [m] of its origin; None: the arm's end.
+class Carrier(NamedTuple):
+    """Where a load is carried."""
 
-    A point w = (x, 1) with ‖x‖ ≤ r has wᵀ diag(2r², 2r², 2r², 2)⁻¹ w ≤ 1, so a load has P ⪯ m̄ diag(2r², 2r², 2r², 2).
-    """
-    joint, _ = place_of(robot, frame)
-    name = tool_frame(robot) if frame is None else frame
-    placement = next(f.placement for f in robot.model.frames if f.name == name and f.type == pin.FrameType.BODY)
-    carried = into_tree(robot)[joint - 1] @ placement.homogeneous
-    known, root = model_body(tree, joint - 1), carried * np.sqrt(2.0 * mass) @ np.diag([radius] * 3 + [1.0])
-    return _between(LOAD_AT + name, joint - 1, known, known + root @ root.T, carried, True)
+    name: str
+    """The link."""
+    joint: int
+    place: Float[np.ndarray, "4 4"]
+    """Placement of the link in the frame of the joint's body in the tree, whose z is the axis of the joint."""
+
+    @classmethod
+    def of(cls, robot: Robot, frame: str | None) -> "Carrier":
+        """The link of this name; None: the arm's end."""
+        joint, _ = place_of(robot, frame)
+        name = tool_frame(robot) if frame is None else frame
+        placement = next(f.placement for f in robot.model.frames if f.name == name and f.type == pin.FrameType.BODY)
+        return cls(name, joint - 1, into_tree(robot)[joint - 1] @ placement.homogeneous)
+
+    def largest(self, mass: float, radius: float, across: float) -> Float[np.ndarray, "4 4"]:
+        """P̄ ⪰ P for loads of at most this mass [kg] in an ellipsoid at the link's origin, by the axis and across [m].
+
+        A point w = (x, 1) with xᵀR⁻¹x ≤ 1 has wᵀ diag(2R, 2)⁻¹ w ≤ 1, so a load there has P ⪯ m̄ diag(2R, 2).
+        """
+        origin = self.place[:, 3]
+        return 2.0 * mass * (np.diag([across**2, across**2, radius**2, 0.0]) + origin[:, None] * origin)
+
+
+def unknown_load(tree: Packed, carrier: Carrier, largest: Float[np.ndarray, "4 4"]) -> UnknownBody:
+    """The body of a link with a load up to this pseudo-inertia."""
+    known = model_body(tree, carrier.joint)
+    return _between(LOAD_AT + carrier.name, carrier.joint, known, known + largest, carrier.place, True)
 
 
 def unknown_links(robot: Robot, tree: Packed, names: Sequence[str]) -> list[UnknownBody]:
@@ -148,29 +168,33 @@ def _between(
     return UnknownBody(name, joint, factor, start, known, place, is_load)
 
 
-def unknown_numbers(
-    robot: Robot, friction: JointFriction | None, tree: Packed, kind: str, period: float, accelerates: bool
-) -> list[UnknownNumber]:
-    """Friction, rotor inertia or offset of every joint, which begin as what the law has.
-
-    accelerates: whether offsets are accelerations, as of computed torque.
-    """
+def unknown_numbers(law: ModelLaw, kind: str, period: float) -> list[UnknownNumber]:
+    """Friction or offset of every joint, which begin as what the law has; offsets of computed torque accelerate."""
+    robot, friction, dynamics = law.dynamics.robot, law.friction, law.dynamics
+    assert robot is not None
     effort = np.where(np.isfinite(robot.effort_limit), robot.effort_limit, _UNLIMITED)
     speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, _FAST)
-    n, zero, largest, dynamics = robot.nv, np.zeros(robot.nv), _FRICTION * effort, PinocchioDynamics(robot)
+    n, zero, largest = robot.nv, np.zeros(robot.nv), _FRICTION * effort
     if kind == "offsets":
+        accelerates = isinstance(law, ComputedTorque)
         code = NumberCode.ACCELERATION if accelerates else NumberCode.OFFSET
         most = effort / effective_inertia(robot, dynamics) if accelerates else effort
         return [UnknownNumber(code, i, -x, 2.0 * x, 0.0, 0.0) for i, x in enumerate(most)]
-    if kind == "friction":
-        own = (zero, zero) if friction is None else (friction.viscous, friction.coulomb)
-        below = _BEND * gains_for_robot(robot, dynamics, bandwidth=_ANY, period=period).stiffness
-        kinds = (NumberCode.VISCOUS, largest / speed, own[0]), (NumberCode.COULOMB, largest, own[1])
-        return [_number(code, i, x[i], known[i], below[i]) for code, x, known in kinds for i in range(n)]
-    below = _LIGHTER / n * effective_inertia(robot, dynamics)
-    most = _ROTOR * largest_inertia(robot, dynamics).max()
-    rotors = [tree.weights[BASE + BODY * i + ARMATURE] for i in range(n)]
-    return [_number(NumberCode.ROTOR, i, most, rotors[i], below[i]) for i in range(n)]
+    own = (zero, zero) if friction is None else (friction.viscous, friction.coulomb)
+    below = _BEND * gains_for_robot(robot, dynamics, bandwidth=_ANY, period=period).stiffness
+    kinds = (NumberCode.VISCOUS, 1.0 / speed, own[0]), (NumberCode.COULOMB, np.ones(n), own[1])
+    return [
+        _number(code, i, x[i] * largest[i], known[i], x[i] * below[i]) for code, x, known in kinds for i in range(n)
+    ]
+
+
+def unknown_rotors(law: ModelLaw, tree: Packed, most: JointArray) -> list[UnknownNumber]:
+    """Rotor inertia of every joint, which begins as what the model has, up to twice that and this [kg·m², kg]."""
+    robot = law.dynamics.robot
+    assert robot is not None
+    below = _LIGHTER / robot.nv * effective_inertia(robot, law.dynamics)
+    rotors = tree.weights[BASE:].reshape(-1, BODY)[:, ARMATURE]
+    return [_number(NumberCode.ROTOR, i, most[i], rotors[i], below[i]) for i in range(robot.nv)]
 
 
 def _number(code: NumberCode, i: int, most: float, known: float, below: float) -> UnknownNumber:

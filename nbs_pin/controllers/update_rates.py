@@ -18,7 +18,7 @@ _DELAY = 2.5  # periods from the output to its effect with the look-ahead of `si
 _SHARES = {
     NumberCode.VISCOUS: 0.03,
     NumberCode.COULOMB: 0.1,
-    NumberCode.ROTOR: 0.1,
+    NumberCode.ROTOR: 0.07,
     NumberCode.OFFSET: 0.1,
     NumberCode.ACCELERATION: 0.1,
 }
