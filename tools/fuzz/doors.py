@@ -164,7 +164,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
     single = nbs.Reference(Q, V, V)
     tensor = torch.zeros(4, 2, dtype=torch.float64)
     return {
-        "AdaptiveLaw": {"law": s.law, "adapts": ["load", "rotors"], "load_mass": 1.0, "load_across": 0.05, "largest_rotor": 0.1, "gain": 0.5},
+        "AdaptiveLaw": {"law": s.law, "adapts": ["load", "rotors"], "load_mass": 1.0, "largest_rotor": 0.1},
         **{
             f"{kind}.{method}": {"memory": s.adaptive.initial_memory(Q), "reference": nbs.Reference(Q, V, V)}
             for kind in ("AdaptiveLaw", "CompiledAdaptiveLaw") for method in ("step", "recorded")
