@@ -38,7 +38,7 @@ _GAIN, _WELL = 3.0, 0.3
 _CONSTANT, _OF_LARGEST, _CLEAR = 0.12, 0.02, 0.1
 """A constant torque worth a word, in deviations of the joint's torque, and in the largest deviation of all joints; and
 the largest share of the joint's torque that is then unexplained."""
-_LATEST, _STEP, _LATE = 0.2, 0.004, 0.01
+_LATEST, _STEP, _LATE = 0.2, 0.004, 0.015
 """Longest delay that is tried, resolution, and shortest delay that is told [s]."""
 _INDEPENDENT = 1e-10
 """Share of the largest eigenvalue above which a direction of the bodies' parameters counts."""

@@ -48,7 +48,7 @@ class LogSettings:
     def given(self) -> dict[str, Any]:
         """Those that ask for anything but seconds and radians."""
         plain = {"degrees": False, "delay": 0.0, "lowpass": 0.0, "time_unit": "s"}
-        return {name: x for name, x in vars(self).items() if x is not None and plain.get(name) != x}
+        return {n: x for n, x in vars(self).items() if x is not None and not (n in plain and plain[n] == x)}
 
 
 def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings) -> Dataset:
