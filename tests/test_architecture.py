@@ -49,6 +49,7 @@ HOMES = {
     "jsonschema": {"verification.document"},
     "threadpoolctl": {"identification.chain_fit"},
     "xacro": {"robots.xacro_source"},
+    "rosbags": {"identification.log_bags"},
     "numba": {"kernels", "benchmarks.bench"},
     "tyro": {"cli"},
     "rich": {"base.progress", "cli", "commands"},

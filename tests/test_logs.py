@@ -298,6 +298,42 @@ def test_several_files_are_as_many_recordings(tmp_path):
         read(tmp_path, c | {"trajectory": np.arange(len(c["t"])) // 3000}, trajectories=[7])
 
 
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+def test_bags_of_ros_are_read_joints_by_name(tmp_path, storage):
+    """As a driver writes them: joints in another order, in between the states of a gripper, stamps of the epoch."""
+    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    State, Header, Time = (
+        store.types[name]
+        for name in ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    c, order = {name: x[:1500] for name, x in measured().items()}, [2, 1, 0, 3, 4, 5]
+    names = [ARM.joint_names[k] for k in order]
+
+    def state(t, names, *values):
+        stamp = 1_700_000_000_000_000_000 + round(1e9 * t)
+        header = Header(Time(stamp // 10**9, stamp % 10**9), "")
+        return stamp, store.serialize_cdr(State(header, names, *values), State.__msgtype__)
+
+    with rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as writer:
+        topic = writer.add_connection("/joint_states", State.__msgtype__, typestore=store)
+        for t, q, v, tau in zip(c["t"], c["q"], c["v"], c["tau"], strict=True):
+            writer.write(topic, *state(t, names, q[order], v[order], tau[order]))
+        writer.write(topic, *state(7.0, ["finger"], *3 * [np.zeros(1)]))
+    (path,) = (file for file in (tmp_path / "bag").iterdir() if file.suffix in (".db3", ".mcap"))
+    plain, _ = read(tmp_path, c, lowpass=0)
+    with pytest.warns(UserWarning, match="messages of other joints are left out, 1 of 1501"):
+        data = nbs.load_log(path, robot=ARM, lowpass=0)
+    for name in ("q", "v", "tau"):
+        assert_allclose(getattr(data, name), getattr(plain, name), rtol=1e-12)
+    assert_allclose(data.a, plain.a, atol=1e-3)
+    with pytest.raises(ArgumentError, match=r"columns has topic=/arm, and .* joint states under /joint_states"):
+        nbs.load_log(path, columns={"topic": "/arm"})
+    (tmp_path / "x.mcap").write_bytes(bytes(99))
+    with pytest.raises(FileFormatError, match="not an intact bag"):
+        nbs.load_log(tmp_path / "x.mcap")
+
+
 # In the shell.
 
 

@@ -64,9 +64,8 @@ def _facts(data: Dataset, found: LogDoubts | None) -> list[str]:
     derived = " and ".join(data.about.get("differentiated", ()))
     facts.append(f"{len(data)} rows to learn from" + (f"; {derived} differentiated" if derived else ""))
     if found is not None and math.isfinite(found.delay):
-        facts.append(
-            f"torques late by {1e3 * found.delay:.0f} ms" if found.delay else "no delay of the torques is seen"
-        )
+        late = f"torques late by {1e3 * found.delay:.0f} ms, which {option('delay', round(found.delay, 3))} undoes"
+        facts.append(late if found.delay else "no delay of the torques is seen")
     return facts
 
 

@@ -23,7 +23,7 @@ from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import LARGEST
 
 _NEEDED = "log t, q and tau (and v and a if known)"
-CHOSEN = ("t", "trajectory", *QUANTITIES)
+CHOSEN = ("t", "trajectory", *QUANTITIES, "topic")
 """What columns can be named for."""
 _KINDS = {".csv", ".txt", ".dat", ".tsv"}
 """Ends of the names of tables in text."""

@@ -12,6 +12,7 @@ from scipy.interpolate import PchipInterpolator
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz
 from nbs_pin.identification.datasets import Dataset, trajectory_slices
+from nbs_pin.identification.log_bags import BAGS, read_bag
 from nbs_pin.identification.log_derivatives import check_derivatives, derived
 from nbs_pin.identification.log_files import (
     CHOSEN,
@@ -89,8 +90,12 @@ def _read(
     names, ending = None if robot is None else robot.joint_names, path.suffix.lower()
     if is_table(path):
         return columns_of_table(path, names, chosen, rate)
+    if ending in BAGS:
+        bag = read_bag(path, chosen.get("topic"))
+        return columns_of_arrays(path, bag.arrays, names, {}, rate)[0], bag.notes
     if ending not in (".npz", ".mat"):
-        raise FileFormatError(f"{path}: a '{path.suffix}' file, expected .csv, .csv.gz, .npz or .mat; convert it.")
+        known = ", ".join((".csv", ".csv.gz", ".txt", ".npz", ".mat", *BAGS))
+        raise FileFormatError(f"{path}: a '{path.suffix}' file, expected one of {known}; convert it.")
     arrays = read_npz(path) if ending == ".npz" else arrays_of_matlab(path)
     return columns_of_arrays(path, arrays, names, chosen, rate)
 

@@ -76,7 +76,8 @@ def load_log(
 
     A log has t [s], per joint q [rad], tau [N·m] and, if known, v and a, and numbers of its trajectories, under these
     or other usual names: a table (*.csv, *.txt, also *.csv.gz) in columns q_NAME or q1 … qn in the arm's order, an
-    *.npz or *.mat file in arrays (rows, n). A recorded run and a dataset are logs; several files, recordings.
+    *.npz or *.mat file in arrays (rows, n), a bag of ROS (*.bag, *.db3, *.mcap) in messages. Recorded runs and datasets
+    are logs too, and several files as many recordings.
 
     Single wrong rows are put right (`repairs.py`), gaps begin another trajectory, jittered stamps are resampled; what
     is not logged is differentiated, all signals low-passed alike where the torque is noisy, wraps of joints without
