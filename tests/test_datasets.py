@@ -562,5 +562,5 @@ def test_arrays_that_are_no_log_are_refused(measured, log, change, words):
 
 def test_other_suffixes_are_refused(tmp_path):
     (tmp_path / "x.pdf").write_text("t")
-    with pytest.raises(FileFormatError, match=r"expected \.csv"):
+    with pytest.raises(FileFormatError, match=r"expected one of \.csv"):
         load_log(tmp_path / "x.pdf")

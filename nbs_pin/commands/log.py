@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nbs_pin.base.doors import option
 from nbs_pin.base.units import column, units
 from nbs_pin.cli.log import Log
 from nbs_pin.cli.values import OptionError
