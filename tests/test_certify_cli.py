@@ -296,6 +296,9 @@ def test_results_of_another_certificate_are_kept(certified, capsys):
         ("no_arm --disturbance 5", "no robot 'no_arm'"),
         ("two_link --disturbance 5 --against panda", "the controller has 2 joints and panda 7"),
         ("two_link --disturbance 5 --monitor none.npz", "none.npz"),
+        ("two_link --disturbance 5 --payload-radius 0.1", "--payload-radius is for a law that adapts"),
+        ("two_link --law adaptive --attack", "--attack is for a law with a fixed model, and two_link has one that"),
+        ("two_link --law adaptive --delay 0.001", "--delay 0.001 is for a law with a fixed model"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_in_one_sentence(words, expected, tmp_path, capsys):
@@ -304,6 +307,32 @@ def test_what_cannot_be_meant_is_refused_in_one_sentence(words, expected, tmp_pa
     assert expected in said
     assert len([line for line in said.splitlines() if "error" in line]) == 1
     assert not (tmp_path / "a").exists()
+
+
+def test_a_law_that_adapts_is_bounded_beside_the_one_that_does_not(tmp_path, capsys):
+    words = ("--law", "adaptive", "--unknown-payload", "0.3", "--payload-radius", "0", "--disturbance", "1", "--report")
+    figures = figures_of(tmp_path, "two_link", *words)
+    said = capsys.readouterr().out
+    robot = nbs.load_robot("two_link")
+    expected = nbs.transient_bound(
+        nbs.AdaptiveLaw.for_robot(robot), 0.3, disturbance=np.ones(2), reference=nbs.Sinusoid.for_robot(robot)
+    )
+    found = figures["transient"]
+    assert found["joint_errors_rad"] == pytest.approx(expected.joint_errors)
+    assert found["joint_errors_always_rad"] == pytest.approx(expected.joint_errors_always)
+    assert expected.error_always == pytest.approx(
+        expected.error * np.sqrt(expected.storage_always / expected.potential)
+    )
+    assert found["fixed_joint_errors_rad"] == pytest.approx(expected.fixed.joint_errors)
+    assert "PROVED: no joint of two_link strays more than" in said
+    assert "whatever it carries up to 0.3 kg at tip" in said
+    assert "with a fixed model the worst of two such loads brings" in said
+    row = next(line for line in said.splitlines() if line.split()[:1] == ["joint1"])
+    assert f"{found['joint_errors_rad'][0]:.3g} rad" in row
+    assert (tmp_path / "certificate.png").read_bytes().startswith(PNG)
+    page = (tmp_path / "report.html").read_text()
+    assert "fixed model, simulated" in page
+    assert "at all times it is below" in page.lower()
 
 
 def test_a_law_without_a_proof_is_refused(tmp_path, capsys):
@@ -324,6 +353,10 @@ def test_a_law_without_a_proof_is_refused(tmp_path, capsys):
         ("two_link --disturbance 5 --law pid", "of which no Lyapunov function is known"),
         ("two_link --disturbance 1 --start-error 3", "these conditions fail: effort limit of"),
         ("kinova --disturbance 5", "of no use: a bound of 1.1 turns"),
+        (
+            "two_link --law adaptive --unknown-payload 9",
+            "loads up to 9 kg within 0.1 m are beyond what the law can learn",
+        ),
     ],
 )
 def test_a_promise_that_is_not_given_has_an_exit_code_of_its_own(words, expected, tmp_path, capsys):

@@ -95,6 +95,21 @@ class TransientBound(Shown):
         return self.start + self.divergence
 
     @property
+    def error_always(self) -> float:
+        """Bound of ‖z1‖ at all times, the residual under the disturbance [rad, m]; inf where nothing is known."""
+        return self.error * self._growth
+
+    @property
+    def joint_errors_always(self) -> JointArray:
+        """Bound of each |z1_i| at all times [rad, m]."""
+        return np.asarray(self.joint_errors * self._growth)
+
+    @property
+    def _growth(self) -> float:
+        """√(bound of Φ at all times / that for the duration), as errors are √Φ times constants."""
+        return 1.0 if math.isinf(self.duration) else up(math.sqrt(self.storage_always / self.potential))
+
+    @property
     def frame(self) -> str:
         """The link that carries the load."""
         return _frame(self.law)
@@ -125,13 +140,14 @@ class TransientBound(Shown):
 
     def summary(self) -> dict[str, Any]:
         """The bounds as JSON can store them."""
-        fixed = self.fixed
+        fixed, certified = self.fixed, self.fixed and self.fixed.certificate
+        torques = units("torque", self.law.robot.prismatic)
         return {
             "frame": self.frame,
             "load_mass_kg": self.load_mass,
             "load_radius_m": self.load_radius,
             "start_J": self.start,
-            "disturbance": self.admissible.told(units("torque", self.law.robot.prismatic)),
+            "disturbance": "none" if self.admissible.is_zero else self.admissible.told(torques),
             "worst_mass_kg": self.worst.mass,
             "worst_centre_m": self.worst.centre.tolist(),
             "divergence_J": self.divergence,
@@ -142,12 +158,15 @@ class TransientBound(Shown):
             "potential_J": self.potential,
             "error_rad": self.error,
             "joint_errors_rad": self.joint_errors.tolist(),
+            "error_always_rad": self.error_always if math.isfinite(self.error_always) else None,
+            "joint_errors_always_rad": self.joint_errors_always.tolist() if math.isfinite(self.error_always) else None,
             "joints": list(self.joint_names),
             "units": list(self.joint_units),
             "label": str(self.label),
             "lines": [line.plain() for line in self.lines],
             "fixed_joint_errors_rad": None if fixed is None else fixed.joint_errors.tolist(),
-            "fixed_error_bound_rad": None if fixed is None or fixed.certificate is None else fixed.certificate.error,
+            "fixed_error_bound_rad": certified and certified.error,
+            "fixed_joint_error_bounds_rad": certified and certified.joint_errors.tolist(),
             "fixed_refused": None if fixed is None else fixed.refused,
         }
 

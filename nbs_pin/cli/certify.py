@@ -74,7 +74,8 @@ class Certify(FileUnits, Reported):
     controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")]
     """A .nbs file with a controller, or an arm by name or path to build --law for."""
     law: Annotated[str, choice("--law", LAWS)] = "nbs"
-    """The law to build for an arm; a .nbs file has its own."""
+    """The law to build for an arm; a .nbs file has its own. The bound of adaptive is for every load that it may learn,
+    beside what the law with a fixed model does."""
     disturbance: Annotated[str | None, torque_bounds(), default("none besides the loads")] = None
     """Largest |τ_d,i| [N·m]: one number for all joints, or one per joint, separated by commas."""
     norm: bool = False
@@ -82,7 +83,12 @@ class Certify(FileUnits, Reported):
     unknown_payload: Annotated[
         float | None, number("--unknown-payload", above=0.0, most=1e4, unit="kg"), default("none")
     ] = None
-    """Mass that the model does not include, unlike --payload [kg], as a disturbance along the reference."""
+    """Mass that the model does not include, unlike --payload [kg], as a disturbance along the reference; of a law that
+    adapts, the largest that it may learn, by default all that it can."""
+    payload_radius: Annotated[
+        float | None, number("--payload-radius", least=0.0, most=100.0, unit="m"), default("all that it can learn")
+    ] = None
+    """For a law that adapts: all of that load lies within this distance of the frame that carries it [m]."""
     link: Annotated[str | None, tyro.conf.arg(metavar="LINK"), default("the arm's end")] = None
     """Link that carries the payload."""
     inertia_within: Annotated[float | None, percentage("--inertia-within", below=100.0), default("the model's own")] = (

@@ -1,5 +1,6 @@
 """A certificate as tables on the console."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -58,7 +59,7 @@ def _print_grounds(console: Console, figures: dict[str, Any]) -> None:
     for name in _ORDER:
         lines = [line for line in certificate["lines"] if line["group"] == name and line not in bounds]
         if lines:
-            console.print(_claims(name, lines))
+            console.print(claims_table(name, lines))
 
 
 def _table(title: str, *headings: str) -> Table:
@@ -70,7 +71,8 @@ def _table(title: str, *headings: str) -> Table:
     return table
 
 
-def _claims(title: str, lines: list[dict[str, Any]]) -> Table:
+def claims_table(title: str, lines: Sequence[Mapping[str, Any]]) -> Table:
+    """Every claim with its value, its label and its reason."""
     table = _table(title, "", "value", "known", "because")
     for line in lines:
         table.add_row(Text(line["name"]), _with_unit(line["value"], line["unit"]), line["label"], Text(line["because"]))

@@ -4,14 +4,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
-from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
+from nbs_pin.base.exceptions import CertificateRefused
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assess import TRAJECTORIES, Certified, Task, arm_of, assess, design
 from nbs_pin.certificates.certificate_file import is_in_its_file, write_certificate
 from nbs_pin.certificates.encoders import Encoders
@@ -23,9 +21,9 @@ from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import print_certificate
+from nbs_pin.commands.certify_adaptive import box_or_ball, certify_adaptive, refuse_radius, stated_friction
 from nbs_pin.commands.results import Results, drawing
 from nbs_pin.controllers.adaptive_law import AdaptiveLaw
-from nbs_pin.controllers.compiled_adaptive import CompiledAdaptiveLaw
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.friction import JointFriction
@@ -49,6 +47,9 @@ def run(options: Certify, console: Console, notes: Console) -> int:
     with notes.status(f"loading {options.controller}"):
         truth = None if options.against is None else load_robot(options.against, **options.arm.given())
         controller = _controller(options, truth)
+        if isinstance(controller, AdaptiveLaw):
+            return certify_adaptive(options, controller, console, notes)
+        refuse_radius(options)
         task = _task(options, controller, truth)
         robot = arm_of(controller, task)
         watched = None if options.monitor is None else Run.load(options.monitor)
@@ -68,7 +69,7 @@ def run(options: Certify, console: Console, notes: Console) -> int:
     return NO_PROMISE if result.certificate.void else 0
 
 
-def _controller(options: Certify, truth: Robot | None) -> LyapunovLaw:
+def _controller(options: Certify, truth: Robot | None) -> LyapunovLaw | AdaptiveLaw:
     """The controller in a .nbs file, or the law built for an arm.
 
     Raises CertificateRefused if it has no Lyapunov function.
@@ -83,19 +84,14 @@ def _controller(options: Certify, truth: Robot | None) -> LyapunovLaw:
         law: Any = load(name) if truth is None else load_with(name, truth)
     else:
         robot = load_robot(name, **options.arm.given())
-        stated = _friction(options.friction, robot) or JointFriction.of(robot)
+        stated = stated_friction(options.friction, robot) or JointFriction.of(robot)
         law = build_law(options.law, robot, friction=stated if options.feed_friction else None, **settings)
-    if not isinstance(law, LyapunovLaw):
+    if not isinstance(law, LyapunovLaw | AdaptiveLaw):
         what = (
             f"{name} holds a controller of class {type(law).__name__}"
             if name.endswith(SAVED)
             else f"--law {options.law}"
         )
-        if isinstance(law, (AdaptiveLaw, CompiledAdaptiveLaw)):
-            raise CertificateRefused(
-                f"{what}, which adapts, and a certificate is of a law that does not; transient_bound in "
-                "Python bounds its error, or give the law that it is about."
-            )
         raise CertificateRefused(
             f"{what}, of which no Lyapunov function is known; give one that has it, such as nbs or slotine-li."
         )
@@ -124,7 +120,7 @@ def _task(options: Certify, controller: LyapunovLaw, truth: Robot | None) -> Tas
         disturbance=None if numbers is None else box_or_ball(numbers, robot.nv, norm=options.norm),
         payload=options.unknown_payload,
         link=options.link,
-        friction=_friction(options.friction, robot),
+        friction=stated_friction(options.friction, robot),
         gravity_error=options.gravity_error,
         margin=MARGIN if options.margin is None else options.margin,
         start_error=options.start_error,
@@ -149,14 +145,6 @@ def _check_options(options: Certify) -> None:
         raise OptionError("--link needs --unknown-payload; give both.")
     if options.margin is not None and all(load is None for load in loads.values()):
         raise OptionError(f"--margin needs one of {', '.join(loads)}; give one too.")
-
-
-def _friction(text: str | None, robot: Robot) -> JointFriction | None:
-    """The joint friction that --friction states, None for the URDF's."""
-    if text is None:
-        return None
-    viscous, coulomb = plain_numbers(text) or [0.0, 0.0]
-    return JointFriction(np.full(robot.nv, viscous), np.full(robot.nv, coulomb))
 
 
 def figures(result: Certified) -> dict[str, Any]:
@@ -249,24 +237,6 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
             plot_monitor(result.watched, path, units=result.certificate.joint_units, title=title, settings=settings)
     written = (FILES[0], FILES[1], MONITOR, DESIGNED, CERTIFICATE, ARM, SUMMARY)
     return found, [name for name in written if (folder / name).exists()]
-
-
-def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
-    """The box |τ_d,i| ≤ numbers, one for all joints or one per joint, or the ball ‖τ_d‖ ≤ number [N·m].
-
-    Raises:
-        ArgumentError: If there are too many or too few numbers.
-    """
-    if norm:
-        if len(numbers) != 1:
-            raise ArgumentError(f"a norm is one number and {len(numbers)} were given; give one, or omit --norm.")
-        return Admissible.of(numbers[0], nv)
-    if len(numbers) not in (1, nv):
-        raise ArgumentError(
-            f"{len(numbers)} torques were given for {nv} joints; give one for all joints, or one per joint "
-            "[N·m, N where it slides]."
-        )
-    return Admissible.of(np.full(nv, numbers, dtype=float), nv)
 
 
 def _no_motion(t: Any) -> Any:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.base.units import measured, several
+from nbs_pin.certificates.adaptive_bound import TransientBound
 from nbs_pin.certificates.attack import Attack
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
@@ -100,6 +101,27 @@ def plot_certificate(
             motion, joints = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
             _draw_attack(motion, certificate, attack)
             _draw_joints(joints, certificate, attack)
+    return Path(path)
+
+
+def plot_transient(
+    bound: TransientBound, path: str | Path, *, settings: Sequence[str] = (), verdict: Verdict | None = None
+) -> Path:
+    """Plot the bounds of a law that adapts and write the picture (`plotting.picture`); returns its path.
+
+    A bar per joint up to its bound, and one inside up to the error of the law with a fixed model, if that is known.
+    """
+    title = f"{bound.law.robot.name}, any load of 0 to {bound.load_mass:.3g} kg at {bound.frame}: {bound.label}"
+    with picture(path, 6.4, 4.6, heading=Heading(title, settings, verdict)) as figure:
+        axes, at = figure.add_subplot(), np.arange(len(bound.joint_errors))
+        axes.barh(at, bound.joint_errors, height=0.7, color=LIMIT, alpha=0.35, label="the law that adapts, at most")
+        if bound.fixed is not None:
+            axes.barh(at, bound.fixed.joint_errors, height=0.38, color=ERROR, label="with a fixed model, simulated")
+        axes.set_yticks(at, [_plain(name) for name in bound.joint_names])
+        axes.invert_yaxis()
+        axes.grid(visible=False, axis="y")
+        axes.set(xlabel=f"error of each joint, |z1| [{several(bound.joint_units)}]")
+        figure.legend(loc="outside lower left", **_LEGEND)
     return Path(path)
 
 

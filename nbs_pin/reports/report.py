@@ -25,6 +25,7 @@ from nbs_pin.reports.report_tables import (
     joints_table,
     numbers_table,
     table,
+    transient_tables,
 )  # fmt: skip
 from nbs_pin.reports.signals import MAX_ROWS
 from nbs_pin.reports.verdicts import Verdict, verdict_of
@@ -166,6 +167,8 @@ def _details(result: _Result, missing: Mapping[str, str]) -> str:
         parts.append(f'<p class="warning">{whose}{why}</p>')
     if "certificate" in figures:
         parts.append(certificate_tables(figures))
+    if "transient" in figures:
+        parts.append(transient_tables(figures))
     for label, of in result.parts.items():
         parts.append(f"<h3>{html.escape(label)}</h3>" if len(result.parts) > 1 else "")
         parts.append(joints_table(of))

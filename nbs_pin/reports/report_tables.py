@@ -24,7 +24,7 @@ _PLAIN = {"s": "s", "us": "µs", "ms": "ms", "m": "m", "per_s": "1/s", "MB": "MB
 _ENDS = sorted([*_UNITS, *_DERIVED, *_PLAIN], key=len, reverse=True)
 _RATES = ("bandwidth_rad_per_s", "frequency_rad_per_s")
 """Figures in rad/s whatever the joints do."""
-_SKIPPED = ("joints", "units", "curves", "certificate", "monitor", "attack", "by_speed", "by_distance")
+_SKIPPED = ("joints", "units", "curves", "certificate", "transient", "monitor", "attack", "by_speed", "by_distance")
 _PER_JOINT = {
     "rms_error_late_rad": (
         "rms_error_rad",
@@ -113,6 +113,27 @@ def certificate_tables(figures: Mapping[str, Any]) -> str:
             folded("every number behind it", table(["quantity", "value", "known", "because"], claims)),
         ]
     )
+
+
+def transient_tables(figures: Mapping[str, Any]) -> str:
+    """The bounds of a law that adapts, beside the law with a fixed model, and every claim, folded."""
+    found = figures["transient"]
+    nothing = [None] * len(found["joints"])
+    columns = {
+        "its error stays below": found["joint_errors_rad"],
+        "at all times below": found["joint_errors_always_rad"] or nothing,
+        "fixed model, certified": found["fixed_joint_error_bounds_rad"] or nothing,
+        "fixed model, simulated": found["fixed_joint_errors_rad"] or nothing,
+    }
+    bounds = [
+        [name, *("none" if value is None else measured(value, unit) for value in values)]
+        for name, unit, *values in zip(found["joints"], found["units"], *columns.values(), strict=True)
+    ]
+    claims = [
+        [line["name"], _told(line["value"], line["unit"]), line["label"], line["because"]] for line in found["lines"]
+    ]
+    shown = table(["quantity", "value", "known", "because"], claims)
+    return table(["joint", *columns], bounds) + folded("every number behind it", shown)
 
 
 def bench_table(rows: Sequence[Mapping[str, Any]]) -> str:

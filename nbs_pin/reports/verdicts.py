@@ -223,6 +223,34 @@ def _certificate(figures: Mapping[str, Any]) -> Verdict:
     return Verdict(WARNING if level == GOOD and useless else level, said, tuple(more))
 
 
+def _transient(figures: Mapping[str, Any]) -> Verdict:
+    """What is promised while a law learns its load, and what the same law with a fixed model does."""
+    found = figures["transient"]
+    units, joints = found["units"], found["joints"]
+
+    def most(errors: Sequence[float | None]) -> str:
+        return " or ".join(measured(error, unit) for error, unit, _ in _worst(errors, units, joints))
+
+    within = f" within {measured(found['load_radius_m'], 'm')}" if found["load_radius_m"] else ""
+    under = "" if found["disturbance"] == "none" else f" under {found['disturbance']}"
+    lasting = "at all times" if found["duration_s"] is None else f"for {found['duration_s']:g} s"
+    said = (
+        f"{found['label']}: no joint of {figures['arm']} strays more than {most(found['joint_errors_rad'])} from its "
+        f"motion{under}, whatever it carries up to {found['load_mass_kg']:.3g} kg{within} at {found['frame']} "
+        f"({figures['law']}, from a start on the motion, {lasting}, in continuous time)"
+    )
+    more = ["held torques, noise and torques that are cut off are not in the bound; simulate"]
+    if found["duration_s"] is not None:
+        always = found["joint_errors_always_rad"]
+        more.append("at all times no bound is known" if always is None else f"at all times it is below {most(always)}")
+    if found["fixed_joint_errors_rad"] is not None:
+        more.append(f"with a fixed model the worst of two such loads brings {most(found['fixed_joint_errors_rad'])}")
+        bounds = found["fixed_joint_error_bounds_rad"]
+        certified = f"it is certified to {most(bounds)}" if bounds else f"no certificate: {found['fixed_refused']}"
+        more[-1] += f"; {certified}".rstrip(".")
+    return Verdict(GOOD if found["label"] == "PROVED" else WARNING, said, tuple(more))
+
+
 def _attacked(attack: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
     """How near the worst motion that was found came to the bound, and why it is beyond it."""
     worst, bound = attack["error_rad"], found["error_rad"]
@@ -299,6 +327,7 @@ _JUDGES: dict[str, Callable[[Mapping[str, Any]], Verdict]] = {
     "laws": _laws,
     "rms_error_late_rad": _tracking,
     "certificate": _certificate,
+    "transient": _transient,
     "relative_error": _compared,
     "rms_test_torque_error_Nm": _learned,
     "held_out_cost_lowered_by": _trained,
