@@ -39,8 +39,8 @@ def certify_adaptive(options: Certify, law: AdaptiveLaw, console: Console, notes
     given = [name for name in _OF_FIXED_LAWS if getattr(options, name) != fields[name].default]
     if given:
         raise OptionError(
-            f"{option(given[0], getattr(options, given[0]))} is for a law with a fixed model, and {options.controller} has one"
-            " that adapts; omit it."
+            f"{option(given[0], getattr(options, given[0]))} is for a law with a fixed model, and {options.controller}"
+            " has one that adapts; omit it."
         )
     if options.norm and options.disturbance is None:
         raise OptionError("--norm needs --disturbance; give both.")
