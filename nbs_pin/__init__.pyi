@@ -51,7 +51,7 @@ from .dynamics.equations import (
     kinetic_energy as kinetic_energy,
     reference_torque as reference_torque,
 )
-from .dynamics.friction import JointFriction as JointFriction
+from .dynamics.friction import DriveFriction as DriveFriction, JointFriction as JointFriction
 from .dynamics.identified import IdentifiedDynamics as IdentifiedDynamics
 from .dynamics.lagrangian import LagrangianDynamics as LagrangianDynamics
 from .dynamics.momentum_observer import (

@@ -47,7 +47,7 @@ HOMES = {
     "clarabel": {"inertia.multipliers"},
     "flint": {"verification.balls"},
     "jsonschema": {"verification.document"},
-    "threadpoolctl": {"identification.chain_fit"},
+    "threadpoolctl": {"identification.chain_fit", "identification.explain"},
     "xacro": {"robots.xacro_source"},
     "rosbags": {"identification.log_bags"},
     "numba": {"kernels", "benchmarks.bench"},

@@ -21,12 +21,13 @@ from nbs_pin.dynamics.pseudo_inertia import coordinates
 from nbs_pin.identification.chain_fit import TreeGeometry, fit_chain
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.drive_terms import DriveTerms
 from nbs_pin.identification.fit import fit
 from nbs_pin.identification.identify import explain, identify
 from nbs_pin.identification.levenberg_marquardt import Normal, levenberg_marquardt
 from nbs_pin.identification.measurement import Noise
 from nbs_pin.identification.physical_tree import FREE, PARALLEL, RIGHT, PhysicalTree
-from nbs_pin.identification.regressor import RobotGeometry, Scalars
+from nbs_pin.identification.regressor import RobotGeometry
 from nbs_pin.identification.tree_search import Measurements, TreeEstimate
 from nbs_pin.identification.unidentifiable import unidentifiable
 from nbs_pin.kernels.layout import Packed
@@ -241,7 +242,8 @@ def guess_and_data(tree=BRANCHED, kinds=2) -> tuple[TreeEstimate, Measurements]:
     network = scrambled(*tree)
     data, rng = dataset(network, 40), np.random.default_rng(5)
     scale = rng.uniform(0.5, 2.0, network.nv)
-    factors = Scalars(kinds > 0, False, 0.3).factors(data.v, data.a)
+    terms = DriveTerms.of(network.nv, *("viscous", "coulomb")[:kinds], transition=0.3)
+    factors = terms.factors(data)
     measured = Measurements(data.q, data.v, data.a, data.tau, scale, factors)
     guess = TreeEstimate.of(random_tree(network.nv, rng), network.packed_tree().layout, kinds)
     return replace(guess, drag=rng.uniform(0.5, 2.0, guess.drag.shape)), measured
@@ -321,12 +323,11 @@ def physical_and_data() -> tuple[PhysicalTree, Measurements]:
     """Bodies as `explain` finds them for the geometry of a guess."""
     network = scrambled(*BRANCHED)
     data = dataset(network, 60, noise=1.0, friction=JointFriction(np.full(4, 0.5), np.full(4, 0.5), 0.3))
-    scalars = Scalars(True, False, 0.3)
-    guess, _ = guess_and_data()
-    bodies = explain(TreeGeometry(guess), data, scalars, 0.3)
-    factors = scalars.factors(data.v, data.a)
-    measured = Measurements(data.q, data.v, data.a, data.tau, bodies.report.noise, factors)
-    return PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.expected, 0.3), measured
+    terms = DriveTerms.of(4, "viscous", "coulomb", "offset", transition=0.3)
+    guess, _ = guess_and_data(kinds=3)
+    bodies = explain(TreeGeometry(guess), data, terms, 0.3)
+    measured = Measurements(data.q, data.v, data.a, data.tau, bodies.report.noise, terms.factors(data))
+    return PhysicalTree(guess, bodies.factors, bodies.scalars, terms.signed, bodies.expected, 0.3), measured
 
 
 def free_tree() -> PhysicalTree:
@@ -378,7 +379,7 @@ def test_a_physical_tree_stays_physical(seed, size):
     step = size * np.random.default_rng(seed).normal(size=parameters(tree.guess))
     moved = tree.moved(step)
     assert (np.linalg.det(moved.factors) != 0.0).all()
-    assert (moved.drag > 0.0).all()
+    assert (moved.drag > 0.0)[~moved.signed].all()
     np.testing.assert_allclose(
         moved.guess.rotations @ moved.guess.rotations.swapaxes(1, 2), np.tile(np.eye(3), (4, 1, 1)), atol=1e-12
     )
@@ -490,7 +491,7 @@ def test_no_unbiased_estimate_is_better_in_noise(tree, seed, samples):
     """White noise σ leaves Σ ‖τ̂ − τ‖² = σ²χ²_p at the samples for p unknowns, the bound of Cramér and Rao."""
     network, noise = scrambled(*tree, seed), 0.2
     clean, noisy = dataset(network, samples, seed), dataset(network, samples, seed, noise)
-    found = fit_chain(noisy, seed)
+    found = fit_chain(noisy, seed, friction=False, offset=False, rotor_inertia=False)
     tau = found.network.compiled()(clean.q, clean.v, clean.v, clean.a)
     p = unknowns(network)
     assert np.square((tau - clean.tau) / noise).sum() < p + 5.0 * np.sqrt(2.0 * p)
@@ -601,7 +602,7 @@ def test_rotors_behind_gears_are_found_with_the_tree():
     expected = PinocchioDynamics(robot).mass_matrix(q) + np.diag(rotors)
     np.testing.assert_allclose(fitted.mass_matrix(q), expected, atol=1e-9)
     np.testing.assert_allclose(fitted.network.rotors[1] ** 2, 0.7, rtol=0.3)  # the first one's share is its body's
-    without = fit(data, "chain", starts=8)
+    without = fit(data, "chain", starts=8, rotor_inertia=False)
     assert without.report.train_nmse > 1e-4  # no tree of bodies has rotors
 
 

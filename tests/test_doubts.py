@@ -14,14 +14,16 @@ from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
 from nbs_pin.identification import fit as fitting
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.doubts import doubts
+from nbs_pin.identification.drive_choice import Wanted
+from nbs_pin.identification.explain import explain
 from nbs_pin.identification.fit_report import torque_errors, torque_nmse, zero_torque_nmse
-from nbs_pin.identification.identify import explain, identify, sign_fault
-from nbs_pin.identification.regressor import RobotGeometry, Scalars
+from nbs_pin.identification.identify import identify, sign_fault
+from nbs_pin.identification.regressor import RobotGeometry
 from nbs_pin.robots.robot import load_robot
 from tests.commands import refusal, summary
 
 ARMS = {name: load_robot(name) for name in ("two_link", "three_link", "ur5", "panda")}
-PLAIN = Scalars(friction=False, rotor_inertia=False, transition=0.01)
+PLAIN = Wanted(False, False, False)
 
 
 @cache
@@ -88,7 +90,8 @@ def test_a_fit_is_called_converged_only_if_it_is_better_than_zero_torque(monkeyp
     data = recorded("two_link")
     assert zero_torque_nmse(data) == pytest.approx(np.mean(np.square(data.tau).mean(axis=0) / data.tau.var(axis=0)))
     with pytest.warns(UserWarning, match="friction"):
-        good = nbs.fit(data, "identified", robot=ARMS["two_link"])
+        nbs.fit(data, "identified", robot=ARMS["two_link"], friction=False)
+    good = nbs.fit(data, "identified", robot=ARMS["two_link"])
     assert good.report.stopped == "converged"
     assert good.report.test_nmse < 0.1 < zero_torque_nmse(data)
     still = replace(data, tau=np.random.default_rng(0).standard_normal(data.tau.shape))
@@ -107,10 +110,10 @@ def test_torques_in_another_unit_are_doubted(name, factor, said):
     data, robot = recorded(name), ARMS[name]
     data = replace(data, tau=factor * data.tau)
     model = identify(data, robot, friction=True)
-    found = doubts(model, data, model.friction, robot)
+    found = doubts(model, data, model.friction, robot, {})
     assert len(found) == said
     assert not said or ("mA, N·mm" in found[0] and "N·m?" in found[0])
-    assert doubts(model, data, model.friction, None) == ()
+    assert doubts(model, data, model.friction, None, {}) == ()
 
 
 @pytest.mark.parametrize("name", ["two_link", "panda"])
@@ -119,9 +122,9 @@ def test_friction_that_was_not_learned_is_missed(name):
     rubbed = replace(data, tau=data.tau + 0.3 * data.tau.std(axis=0) * np.tanh(data.v / 0.01))
     for friction, tau, said in ((False, rubbed, True), (True, rubbed, False), (False, data, False)):
         model = identify(tau, robot, friction=friction)
-        found = doubts(model, tau, model.friction, robot)
+        found = doubts(model, tau, model.friction, robot, {"friction": friction})
         assert len(found) == said
-        assert not said or "most of which friction would explain; give friction=True" in found[0]
+        assert not said or "has Coulomb friction; leave out friction=False to learn it" in found[0]
         if said:
             better = identify(tau, robot, friction=True)
             assert torque_nmse(better, tau, better.friction) < 0.01 * torque_nmse(model, tau)
@@ -135,5 +138,7 @@ def test_the_shell_refuses_a_wrong_sign_and_writes_no_model(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
     recorded("two_link").save(tmp_path / "data.npz")
     assert cli.main(arguments) == 0
-    assert "give --friction to learn it too" in capsys.readouterr().err
+    capsys.readouterr()
+    assert cli.main([*arguments, "--force", "--friction", "off"]) == 0
+    assert "leave out --friction off to learn it" in capsys.readouterr().err
     assert summary(tmp_path / "out")["figures"]["stopped"] == "converged"

@@ -53,8 +53,7 @@ def equations(name, loss="torque", friction=None):
         network = ResidualNetwork(TRUTH, widths=(4,))
     else:
         network = make_network(name, [False, True], 1, widths=(4, 4), epsilon=0.5)
-    given = None if friction is None else torch.tensor(np.stack([friction.viscous, friction.coulomb]))
-    equation = Equation(network, loss, given, 0.1)
+    equation = Equation.fitted(network, friction, loss)
     with torch.no_grad():
         for p in equation.parameters():
             p.add_(0.1 * torch.randn(p.shape, dtype=p.dtype, generator=torch.Generator().manual_seed(p.numel())))
@@ -135,7 +134,7 @@ def test_the_same_seed_gives_the_same_model_and_another_seed_another():
 
 def test_what_is_held_out_chooses_the_iteration():
     data = states(120, noise=8.0)
-    model = fit(data, "cholesky", widths=(16, 16))
+    model = fit(data, "cholesky", widths=(16, 16), friction=False, offset=False)
     report = model.report
     train, test = split_data(data)
     unit = train.tau.std(axis=0)
@@ -153,7 +152,7 @@ def test_first_order_optimisers_lower_the_cost(optimiser):
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_every_family_learns(name):
-    report = fit(states(30), name, widths=(4,), iterations=5).report
+    report = fit(states(30), name, widths=(4,), iterations=5, held_out=0.0).report
     assert report.history[-1] < 0.5 * report.history[0]
 
 
@@ -168,7 +167,7 @@ def test_friction_is_learned_beside_a_nearly_known_arm():
     assert_allclose(model.friction.viscous, FRICTION.viscous, rtol=0.02)
     assert_allclose(model.friction.coulomb, FRICTION.coulomb, rtol=0.02)
     assert max(relative(model)) < 1e-3
-    without = fit(data, "residual", robot=ROBOT, widths=(4,))
+    without = fit(data, "residual", robot=ROBOT, widths=(4,), friction=False)
     assert without.report.test_nmse > 100.0 * model.report.test_nmse
 
 
@@ -225,7 +224,7 @@ def test_a_start_that_leads_nowhere_is_replaced(monkeypatch):
 
 def test_data_at_rest_leave_the_inertia_open_and_data_of_few_poses_the_rest():
     still = states(400, still=True)
-    network = fit(still, "cholesky", widths=(8, 8), iterations=20).network
+    network = fit(still, "cholesky", widths=(8, 8), iterations=20, friction=False, offset=False).network
     told = unidentifiable(network, still, names=ROBOT.joint_names)
     assert {line.split(":")[0] for line in told} == {f"inertia of {joint}" for joint in ROBOT.joint_names}
     moving = states(400)

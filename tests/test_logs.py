@@ -372,7 +372,7 @@ def test_the_shell_learns_from_a_log_with_every_option_of_python(tmp_path, shell
     columns = [c["t"], np.arange(len(c["t"])) // 2000, np.degrees(c["q"]), np.degrees(c["v"]), -c["tau"]]
     np.savetxt(tmp_path / "log.csv", np.column_stack(columns), delimiter=",")
     options = ["--columns", "t=1,trajectory=2,q=3-8,v=9-14,tau=15-20", "--torque-gain=-1", "--degrees"]
-    learn = ["learn", tmp_path / "log.csv", "--robot", "ur5", "--model", "identified", "--friction", *options]
+    learn = ["learn", tmp_path / "log.csv", "--robot", "ur5", "--model", "identified", "--friction", "on", *options]
     shell(*learn, "--held-out-trajectories", "2", "--lowpass", "5", "--out", tmp_path / "out")
     assert nbs.load(tmp_path / "out" / "model.nbs").nv == 6
     wrong = [str(word) for word in [*learn, "--held-out-trajectories", "7", "--out", tmp_path / "other"]]

@@ -24,7 +24,7 @@ RUNS = {
     "certify": "certify panda --disturbance 5",
     "train": "train two_link",
     "collect": "collect three_link --samples 1000 --encoder-bits 16 --torque-noise 0.5",
-    "learn": "learn {collect}/data.npz --friction",
+    "learn": "learn {collect}/data.npz",
     "compare": "compare {learn}/model.nbs",
     "adapt": "track panda --controller nbs,adaptive --payload 2@5 --duration 20",
     "adapt-one": "track panda --controller adaptive --payload 2@5-14 --duration 20",

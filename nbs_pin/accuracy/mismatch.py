@@ -128,7 +128,7 @@ def accelerations(
         raise ArgumentError(f"the run has {run.nv} joints and the truth {truth.nv}; give a run of that arm.")
     net = run.tau[:-1] + run.disturbance[:-1]
     if friction is not None:
-        net = net - friction.torque(run.v[:-1])
+        net = net - friction.torque(run.v[:-1], run.tau[:-1])
     return truth.forward_dynamics(run.q[:-1], run.v[:-1], net)
 
 

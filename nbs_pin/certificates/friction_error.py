@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.claims import Claim, Group, Label
+from nbs_pin.base.claims import Claim, Group, Label, refuse
 from nbs_pin.base.rounding import largest_eigenvalue, up
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.constants import Constants
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import JointFriction, has_viscous_and_coulomb_only
 
 _WORST = 0.2785
 """Above max_x x(1 − tanh x) = 0.27846."""
@@ -56,6 +56,8 @@ class FrictionGap(NamedTuple):
 
         shares: by which the arm's viscous and Coulomb friction may differ from that stated.
         """
+        if not all(has_viscous_and_coulomb_only(f) for f in (friction, fed)):
+            refuse("the friction has more terms than viscous and Coulomb friction", "give it with these two alone")
         none = JointFriction(np.zeros(nv), np.zeros(nv))
         arm, law = friction or none, fed or none
         widest = max(arm.transition, law.transition)

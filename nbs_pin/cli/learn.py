@@ -20,7 +20,7 @@ class Learn(LogOptions, Reported):
     Ctrl-C ends the fit of a network early and keeps the best iteration. Compare the result with Pinocchio's model:
     nbs-pin compare out/learn-panda/model.nbs
 
-    Example: nbs-pin learn out/collect-panda/data.npz --model chain --friction
+    Example: nbs-pin learn out/collect-panda/data.npz --model chain
     """
 
     data: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
@@ -32,8 +32,15 @@ class Learn(LogOptions, Reported):
     identified: inertias by least squares, in the geometry of the URDF."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the one named in the data")] = None
     """The arm by name or a path to a .urdf, .xacro or MJCF file; a log does not name it."""
-    friction: bool = False
-    """Also learn viscous and Coulomb friction of every joint."""
+    friction: Literal["auto", "on", "off"] = "auto"
+    """Friction to learn: auto is what the data show of every joint, from none to Coulomb, viscous, asymmetric, Stribeck
+    and load-dependent friction; on is viscous and Coulomb friction of every joint."""
+    offset: Literal["auto", "on", "off"] = "auto"
+    """Constant torques to learn, as of a sensor that is not zero at rest."""
+    rotors: Literal["auto", "on", "off"] = "auto"
+    """Rotor inertias to learn; networks without a URDF have them in M."""
+    transition: Annotated[float, number("--transition", above=0.0, most=10.0, unit="rad/s")] = 0.01
+    """Speed within which Coulomb friction changes its sign [rad/s]."""
     held_out: Annotated[float, number("--held-out", least=0.0, most=0.9, unit="")] = 0.2
     """Share of the trajectories, or of one long recording, to hold out; it selects the iteration of a network."""
     held_out_trajectories: Annotated[

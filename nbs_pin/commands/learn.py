@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.text import Text
 
 from nbs_pin.base.doors import own_arm
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import by_quantity, column, several, units
+from nbs_pin.base.units import by_quantity, several, units
 from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.log_options import numbers_of
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.results import Results, drawing, sha256_of, table, tell
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.commands.learned_tables import print_learned
+from nbs_pin.commands.results import Results, drawing, sha256_of
+from nbs_pin.dynamics.friction import DriveFriction, JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit import fit, split_data
@@ -34,7 +34,7 @@ from nbs_pin.storage.checkpoints import save
 
 FILES = ("model.nbs", "learning.png", SUMMARY)
 """The files that are written."""
-_ENDED = {"held out": "no further progress on held-out data", "iterations": "all iterations done"}
+_ASKED = {"auto": None, "on": True, "off": False}
 
 
 def run(options: Learn, console: Console, notes: Console) -> None:
@@ -55,7 +55,9 @@ def run(options: Learn, console: Console, notes: Console) -> None:
     given["loss"] = None if options.loss == "torque" else options.loss  # which every model minimises
     given = {name: value for name, value in given.items() if value is not None}
     data, held_out = _held_out(data, options)
-    common = {"held_out": held_out, "friction": options.friction, "progress": True}
+    asked = {"friction": options.friction, "offset": options.offset, "rotor_inertia": options.rotors}
+    drives = {name: _ASKED[choice] for name, choice in asked.items()}
+    common = {"held_out": held_out, "transition": options.transition, "progress": True} | drives
     with results.made() as folder:
         result = learn(data, options.model, robot, options.seed, **common, **given)
         interrupted = result.report.stopped == "interrupted"
@@ -67,7 +69,7 @@ def run(options: Learn, console: Console, notes: Console) -> None:
                 settings = chosen(results.facts["settings"], "loss", "optimiser", "held_out", "seed")
                 verdict = verdict_of(found, interrupted=interrupted)
                 plot_learning(result, path, Heading(f"{name}: {options.model}, learned", settings, verdict))
-    _print(console, f"{name}, {options.model}", found, verbose=options.verbose, interrupted=interrupted)
+    print_learned(console, f"{name}, {options.model}", found, verbose=options.verbose, interrupted=interrupted)
     known = robot is not None and not interrupted
     results.show(console, FILES, *(("compare", results.folder / FILES[0]) if known else ()))
     if interrupted:
@@ -159,9 +161,34 @@ def figures(result: Learned) -> dict[str, Any]:
             "torque_deviation_Nm": result.train.tau.std(axis=0),
             "viscous_friction": None if friction is None else friction.viscous,
             "coulomb_friction_Nm": None if friction is None else friction.coulomb,
+            "rotor_inertia": _rotors(result.model),
+            **_others(friction),
             "curves": curves,
         }
     )
+
+
+def _others(friction: JointFriction | None) -> dict[str, Any]:
+    """Offsets and the terms of friction besides viscous and Coulomb friction, as far as some joint has them."""
+    if not isinstance(friction, DriveFriction):
+        return {}
+    terms = {
+        "offset_Nm": friction.offset,
+        "viscous_asymmetry": friction.asymmetry,
+        "stribeck_friction_Nm": friction.stribeck,
+        "load_friction_share": friction.load,
+    }
+    found = {name: value for name, value in terms.items() if value.any()}
+    return found | ({"stribeck_speed": friction.stribeck_speed} if friction.stribeck.any() else {})
+
+
+def _rotors(model: DynamicsProvider) -> np.ndarray | None:
+    """The rotor inertias that were learned beside bodies, None where they are part of M."""
+    found = getattr(model, "rotor_inertia", None)
+    network = getattr(model, "network", None)
+    if found is None and network is not None and hasattr(network, "rotors"):
+        found = network.rotors.detach().numpy(force=True) ** 2
+    return found if found is not None and np.any(found) else None
 
 
 def plot_learning(result: Learned, path: str | Path, heading: Heading | None = None) -> Path:
@@ -210,39 +237,3 @@ def _draw_errors(axes: Any, result: Learned) -> None:
 
 def _errors(result: Learned, data: Dataset) -> np.ndarray:
     return np.sqrt(np.square(torque_errors(result.model, data, result.friction)).mean(axis=0))
-
-
-def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool, interrupted: bool) -> None:
-    """Print how good the model is, and a row per joint."""
-    test, viscous, of = figures["rms_test_torque_error_Nm"], figures["viscous_friction"], figures["units"]
-    none = ["none"] * len(figures["joints"])
-    coulomb = [f"{x:.3g}" for x in figures["coulomb_friction_Nm"] or ()] or none
-    columns = [
-        column("torque\ndeviation", [f"{x:.4g}" for x in figures["torque_deviation_Nm"]], of["torque"]),
-        column("error", [f"{x:.2e}" for x in figures["rms_torque_error_Nm"]], of["torque"]),
-        column("error, held\nout", none if test is None else [f"{x:.2e}" for x in test], of["torque"]),
-        column("viscous\nfriction", none if viscous is None else [f"{x:.3g}" for x in viscous], of["damping"]),
-        column("Coulomb\nfriction", coulomb, of["torque"]),
-    ]
-    shown = table(title, *(heading for heading, _ in columns))
-    for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
-        shown.add_row(Text(joint), *row)
-    verdict = verdict_of(figures, interrupted=interrupted)
-    tell(console, f"{title}: {verdict.said}", [*verdict.more, *_lines(figures)], [shown], verbose=verbose)
-
-
-def _lines(figures: dict[str, Any]) -> list[str]:
-    train, test = (figures[name] for name in ("train_nmse", "test_nmse"))
-    shown, more = figures["unidentifiable"][:3], len(figures["unidentifiable"]) - 3
-    return [
-        f"mean squared torque error over the variance of the torque: {_short(train)} on {figures['samples']} samples"
-        + ("" if test is None else f", {_short(test)} on {figures['test_samples']} of trajectories held out"),
-        f"{figures['parameters']} numbers learned in {figures['seconds']:.1f} s "
-        f"({_ENDED.get(figures['stopped'], figures['stopped'])})",
-        *(f"the data do not determine: {text}" for text in shown),
-        *([f"… and {more} more in {SUMMARY}"] if more > 0 else []),
-    ]
-
-
-def _short(value: float | None) -> str:
-    return "none" if value is None else f"{value:.2e}"

@@ -89,7 +89,7 @@ class ComputedTorque(ModelLaw):
         kp, kd = self.gains.like(q)
         a = a_ref - kd * (v - v_ref) - kp * self.dynamics.difference(q, q_ref)
         tau = self.dynamics.reference_torque(q, v, v, a)
-        tau = tau if self.friction is None else tau + self.friction.torque(v_ref)
+        tau = tau if self.friction is None else tau + self.friction.feedforward(v_ref, tau)
         return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
 
     def _packed(self, numpy: bool) -> Packed:

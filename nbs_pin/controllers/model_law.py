@@ -11,7 +11,7 @@ from nbs_pin.base.known_code import defines
 from nbs_pin.base.shown import joints_told
 from nbs_pin.controllers.compiled import CompiledController
 from nbs_pin.controllers.controller import Controller, MemorylessController
-from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size, has_viscous_and_coulomb_only
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.kernels.layout import Packed, pack_law
 
@@ -56,7 +56,7 @@ class ModelLaw(MemorylessController, nn.Module):
     def packable(self) -> bool:
         """Whether the kernels implement the law, its error and its friction; False for a subclass."""
         wraps = type(self.dynamics).difference is DynamicsProvider.difference
-        friction = self.friction is None or type(self.friction) is JointFriction
+        friction = has_viscous_and_coulomb_only(self.friction)
         return wraps and friction and defines(self, "_packed") and self._has_kernel
 
     @checked(numpy=flag)

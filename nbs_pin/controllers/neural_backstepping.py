@@ -177,7 +177,7 @@ class NeuralBackstepping(LyapunovLaw):
         e = self._errors(q, v, q_ref, v_ref, a_ref)
         feedforward = self.dynamics.reference_torque(q, v, e.v_r, e.a_r - self.inertial_rate * e.z2)
         tau = feedforward - e.gradient - self.damping.force(e.z2)
-        tau = tau if self.friction is None else tau + self.friction.torque(e.v_r)
+        tau = tau if self.friction is None else tau + self.friction.feedforward(e.v_r, tau)
         return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
 
     def _gains_told(self) -> Iterable[str]:

@@ -18,7 +18,7 @@ from nbs_pin.controllers.damping import DAMPINGS, Damping
 from nbs_pin.controllers.falsification import SAMPLES, falsify_activation, falsify_damping, falsify_potential
 from nbs_pin.controllers.gain import Gain
 from nbs_pin.controllers.potential import POTENTIALS, Potential
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import DriveFriction, JointFriction
 
 DAMPING = "D ⪰ D₀, least eigenvalue"
 """Name of the claim whose value is the largest known d with D ⪰ dI."""
@@ -95,6 +95,9 @@ def friction_claims(friction: JointFriction | None) -> tuple[Claim, ...]:
     """Claim about the friction, if any; raises CertificateRefused for friction that falls with velocity."""
     if friction is None:
         return ()
+    if isinstance(friction, DriveFriction):
+        why = "certificates know viscous and Coulomb friction only"
+        refuse(why, "build the law with JointFriction(friction.viscous, friction.coulomb)")
     constants = np.concatenate([friction.viscous, friction.coulomb, [friction.transition]])
     if not (np.isfinite(constants).all() and (constants >= 0.0).all() and friction.transition > 0.0):
         refuse("the friction fed forward falls with velocity", "its coefficients must be ≥ 0 and its transition > 0")

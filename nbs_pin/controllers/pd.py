@@ -100,7 +100,7 @@ class PD(ModelLaw):
             tau = tau + self.dynamics.gravity(q)
         else:
             tau = tau + self.dynamics.reference_torque(q, v, v_ref, a_ref)
-        tau = tau if self.friction is None else tau + self.friction.torque(v_ref)
+        tau = tau if self.friction is None else tau + self.friction.feedforward(v_ref, tau)
         return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
 
     def _packed(self, numpy: bool) -> Packed:

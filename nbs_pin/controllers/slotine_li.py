@@ -97,7 +97,7 @@ class SlotineLi(LyapunovLaw):
         v_r = v_ref - rate * self.dynamics.difference(q, q_ref)
         a_r = a_ref - rate * (v - v_ref)
         tau = self.dynamics.reference_torque(q, v, v_r, a_r) - gain * (v - v_r)
-        tau = tau if self.friction is None else tau + self.friction.torque(v_r)
+        tau = tau if self.friction is None else tau + self.friction.feedforward(v_r, tau)
         return finite_result("the torque", tau, q, v, q_ref, v_ref, a_ref)
 
     def potential_terms(self, z1: Array, dz: Array) -> tuple[Array, Array, Array]:

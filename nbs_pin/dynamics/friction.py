@@ -54,15 +54,104 @@ class JointFriction:
         """Friction from the URDF of the robot (`<dynamics damping friction>`), zero where it has none."""
         return cls(robot.damping, robot.friction, transition)
 
-    def torque(self, v: Vectors) -> Vectors:
-        """Friction torque [N·m] at the velocity v [rad/s], with the array type of v (numpy or torch)."""
+    def torque(self, v: Vectors, tau: Vectors | None = None) -> Vectors:
+        """Friction torque [N·m] at the velocity v [rad/s], with the array type of v (numpy or torch).
+
+        The motor torque `tau` [N·m] matters to `DriveFriction` alone.
+        """
         (v,) = as_vectors(self.viscous.size, v=v)
         viscous, coulomb = constant_like(v, self.viscous), constant_like(v, self.coulomb)
         return viscous * v + coulomb * array_namespace(v).tanh(v / self.transition)
 
+    def feedforward(self, v: Vectors, needed: Vectors) -> Vectors:
+        """What the motor must give at v beyond the torque `needed` [N·m] by the arm without friction [N·m]."""
+        return self.torque(v)
 
+
+@storable(("viscous", "coulomb", "transition", "offset", "asymmetry", "stribeck", "stribeck_speed", "load"))
+@dataclass(frozen=True, eq=False)
+class DriveFriction(JointFriction):
+    """Friction of a real drive, and the offset of its torque sensor or current.
+
+        f = offset + viscous·v + asymmetry·|v| + (coulomb + stribeck·exp(−(v/v_s)²) + load·|x|)·tanh(v/transition)
+
+    for the torque x = τ − f that is left for the arm and v_s = stribeck_speed. A number stands for every joint; a
+    Coulomb torque that differs between the directions is an offset. Laws feed it forward, as written and not compiled;
+    `certify` and MuJoCo take viscous and Coulomb friction only. Source of the terms: Bona and Indri, "Friction
+    compensation in robotics: an overview", CDC 2005.
+
+    Raises:
+        ArgumentError: If a number is not finite, one that must be ≥ 0 is negative, or lengths differ.
+
+    Example:
+        >>> import numpy as np
+        >>> import nbs_pin as nbs
+        >>> friction = nbs.DriveFriction(viscous=[0.5], coulomb=[1.0], offset=[0.3], load=[0.1])
+        >>> v = np.array([2.0])
+        >>> friction.feedforward(v, np.array([7.0])), friction.torque(v, tau=np.array([10.0]))
+        (array([3.]), array([3.]))
+    """
+
+    offset: JointArray = 0.0  # type: ignore[assignment]  # becomes an array
+    """Torque at rest that no load explains [N·m]."""
+    asymmetry: JointArray = 0.0  # type: ignore[assignment]  # becomes an array
+    """Half the difference of the viscous coefficients of both directions [N·m·s/rad]."""
+    stribeck: JointArray = 0.0  # type: ignore[assignment]  # becomes an array
+    """Coulomb torque beyond `coulomb` at low speed [N·m]."""
+    stribeck_speed: JointArray = 0.1  # type: ignore[assignment]
+    """Speed at which 1/e of that is left [rad/s]."""
+    load: JointArray = 0.0  # type: ignore[assignment]  # becomes an array
+    """Coulomb friction as a share, below 1, of the torque that is left for the arm."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        n = self.viscous.size
+        for name in ("offset", "asymmetry", "stribeck", "stribeck_speed", "load"):
+            given = floats(f"DriveFriction: {name}", getattr(self, name))
+            value = np.full(n, float(given)) if given.ndim == 0 else given
+            least = -np.inf if name in ("offset", "asymmetry") else 0.0
+            if value.shape != (n,) or not (is_usual(value) and (value >= least).all()):
+                kind = "numbers" if least < 0.0 else "numbers ≥ 0"
+                raise ArgumentError(f"{name} of the friction is {told(value)}; give {n} finite {kind}, one per joint.")
+            object.__setattr__(self, name, value)
+        if not self.stribeck_speed.min() > 0.0:
+            raise ArgumentError(f"stribeck_speed is {told(self.stribeck_speed)}; give speeds > 0 [rad/s].")
+        if not self.load.max() < 1.0:
+            raise ArgumentError(f"load is {told(self.load)}; give shares below 1.")
+
+    def torque(self, v: Vectors, tau: Vectors | None = None) -> Vectors:
+        """Friction torque [N·m] at v [rad/s]; without the motor torque `tau` [N·m] it leaves out what depends on loads.
+
+        x = τ − f solves x (1 + load·tanh(v/transition)·sign x) = τ − f₀ for the friction f₀ of no load.
+        """
+        loadless, side = self._loadless(v)
+        if tau is None:
+            return loadless
+        left = tau - loadless
+        return tau - left / (1.0 + constant_like(v, self.load) * side * array_namespace(v).sign(left))
+
+    def feedforward(self, v: Vectors, needed: Vectors) -> Vectors:
+        """What the motor must give at v beyond the torque `needed` [N·m] by the arm without friction [N·m]."""
+        loadless, side = self._loadless(v)
+        return loadless + constant_like(v, self.load) * abs(needed) * side
+
+    def _loadless(self, v: Vectors) -> tuple[Vectors, Vectors]:
+        """The friction of x = 0, and tanh(v/transition)."""
+        (v,) = as_vectors(self.viscous.size, v=v)
+        xp, of = array_namespace(v), {name: constant_like(v, getattr(self, name)) for name in _OF_DRIVE}
+        dry = of["coulomb"] + of["stribeck"] * xp.exp(-((v / of["stribeck_speed"]) ** 2))
+        side = xp.tanh(v / self.transition)
+        return of["offset"] + of["viscous"] * v + of["asymmetry"] * abs(v) + dry * side, side
+
+
+_OF_DRIVE = ("viscous", "coulomb", "offset", "asymmetry", "stribeck", "stribeck_speed")
 FRICTION = a(JointFriction, "a JointFriction, such as JointFriction.of(robot)")
 """The check of an argument that is joint friction."""
+
+
+def has_viscous_and_coulomb_only(friction: JointFriction | None) -> bool:
+    """Whether these two coefficients are all of the friction, as kernels, certificates and MuJoCo take it."""
+    return friction is None or type(friction) is JointFriction
 
 
 def friction_of_size(friction: JointFriction | None, nv: int) -> JointFriction | None:

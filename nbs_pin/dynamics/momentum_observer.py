@@ -16,7 +16,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import RUN, Run
 from nbs_pin.base.shown import Cells, Shown, joints_told, spread
 from nbs_pin.base.units import JointUnits, measured, units_of
-from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.dynamics.friction import JointFriction, friction_of_size, has_viscous_and_coulomb_only
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 from nbs_pin.kernels import momenta as at
@@ -136,7 +136,7 @@ class MomentumObserver(Shown):
     Args:
         dynamics: Model of the arm; rotor inertia is part of its M.
         gain: K_o > 0 [1/s], one number or one per joint.
-        friction: Joint friction, which then counts as known, or None.
+        friction: Joint friction, which then counts as known, but for what depends on the load; or None.
 
     Raises:
         ArgumentError: If gain or friction are for another number of joints.
@@ -166,7 +166,7 @@ class MomentumObserver(Shown):
         tree = dynamics.packed_tree()
         self._tree: tuple[np.ndarray, ...] = () if tree is None else tuple(tree)
         at.compile_momenta()
-        plain = friction is None or type(friction) is JointFriction
+        plain = has_viscous_and_coulomb_only(friction)
         if tree is not None:
             self._scratch = Scratch(tree_workspace(tree))
             self._constants = np.zeros((at.CONSTANTS, n))

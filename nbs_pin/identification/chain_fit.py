@@ -26,15 +26,16 @@ from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.chain import Chain, random_tree
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.identification.datasets import Dataset
-from nbs_pin.identification.identify import Bodies, IdentificationReport, explain
+from nbs_pin.identification.drive_choice import Wanted
+from nbs_pin.identification.drive_terms import DriveTerms
+from nbs_pin.identification.explain import Bodies, IdentificationReport, explain
 from nbs_pin.identification.levenberg_marquardt import Descent, levenberg_marquardt
 from nbs_pin.identification.physical_tree import PhysicalTree
-from nbs_pin.identification.regressor import Scalars
 from nbs_pin.identification.tree_search import Measurements, TreeEstimate
 from nbs_pin.kernels.threads import cores
 
-_FEW = 400
-"""Samples used in the search."""
+_FEW, _MOST = 400, 4_000
+"""Samples used in the search, and after it at most."""
 _EXACT = 1e-16
 """Cost of a descent below which it explains the data to rounding."""
 _USUAL = 8
@@ -63,7 +64,7 @@ class ChainFit:
 
     network: Chain
     friction: JointFriction | None
-    """Viscous and Coulomb friction, None unless it was to be fitted."""
+    """Friction and offsets, None if there are none."""
     history: Float[np.ndarray, " steps"]
     """Torque nMSE at the start and after every step of the search's descent to this tree."""
     evaluations: int
@@ -83,8 +84,9 @@ def fit_chain(
     data: Dataset,
     seed: int = 0,
     *,
-    friction: bool = False,
-    rotor_inertia: bool = False,
+    friction: bool | None = None,
+    offset: bool | None = None,
+    rotor_inertia: bool | None = None,
     transition: float = 0.01,
     regularisation: float = 0.3,
     starts: int = 64,
@@ -97,8 +99,9 @@ def fit_chain(
     Args:
         data: Samples with torque.
         seed: Seed of the random trees.
-        friction: Also find viscous and Coulomb coefficients ≥ 0.
-        rotor_inertia: Also find inertias ≥ 0 of rotors behind gears, which a tree of bodies cannot represent.
+        friction: Terms of friction to find, as in `identify`.
+        offset: Constant torques to find, as in `identify`.
+        rotor_inertia: Inertias of rotors behind gears to find, which a tree of bodies cannot represent; likewise.
         transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
         regularisation: γ, as in `identify`.
         starts: Most random trees; fewer if one explains the data to rounding or enough find the best minimum.
@@ -120,28 +123,29 @@ def fit_chain(
             f"{in_words(data, 'the data')} has no torque: arms of every scale move alike; record one with motors on."
         )
     network = Chain(data.parents.tolist(), data.prismatic.tolist(), epsilon)
-    scalars = Scalars(friction, rotor_inertia, transition)
-    measured, layout = _measured(data, scalars), _layout(data.parents, data.prismatic)
-    scaled, rng = _in_units_of_random_trees(measured, layout), np.random.default_rng(seed)
+    wanted = Wanted(friction, offset, rotor_inertia, transition)
+    data, layout = data.thinned(_MOST), _layout(data.parents, data.prismatic)
+    rng = np.random.default_rng(seed)
     # BLAS threads inside the threads of the search would only compete; the limit applies to the whole process.
     with _ONE_AT_A_TIME, threadpool_limits(1, "blas"):
-        descents, interrupted = _search(scaled, layout, starts, rng, progress)
+        wanted, scaled, descents, interrupted = _searched(data, wanted, layout, starts, rng, progress)
         tries: list[_Try] = []
         for descent in sorted(descents, key=_cost)[:_TRIES]:
             polished = _polished(descent.at, scaled)
-            bodies = explain(TreeGeometry(polished.at), data, scalars, regularisation, others=_AXIS * data.nv)
-            physical = _physical(polished.at, bodies, measured, regularisation, right_angles)
-            cost = physical.whole().cost(measured)
+            bodies = explain(TreeGeometry(polished.at), data, wanted, regularisation, others=_AXIS * data.nv)
+            chosen = _measured(data, bodies.terms, _needed(polished.at, bodies, scaled))
+            physical = _physical(polished.at, bodies, chosen, regularisation, right_angles)
+            cost = physical.whole().cost(chosen)
             tries.append(_Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(scaled) + _EXACT))
             if tries[-1].reached:
                 break
     best = min(tries, key=lambda found: found.cost)
-    _write(best.physical, network, rotor_inertia)
-    costs, drag = np.array([_cost(descent) for descent in descents]), best.physical.drag
+    _write(best.physical, network, best.bodies.terms)
+    costs = np.array([_cost(descent) for descent in descents])
     converged = tries[-1].reached and _settled(costs)
     return ChainFit(
         network=network,
-        friction=JointFriction(drag[0], drag[1], transition) if friction else None,
+        friction=best.bodies.terms.friction(best.physical.drag),
         history=np.array(best.descent.history),
         evaluations=sum(len(descent.history) for descent in descents),
         costs=costs,
@@ -185,11 +189,18 @@ class TreeGeometry:
         return self.guess.regressor(q, v, a)
 
 
-def _measured(data: Dataset, scalars: Scalars) -> Measurements:
+def _needed(guess: TreeEstimate, bodies: Bodies, data: Measurements) -> Float[np.ndarray, "samples n"]:
+    """The torque of the bodies alone [N·m], at these states."""
+    factors, none = bodies.factors, np.zeros((len(data.kinds), data.q.shape[1]))
+    still = replace(data, tau=np.zeros_like(data.tau))
+    return -replace(guess, bodies=factors @ factors.swapaxes(1, 2), drag=none).residual(still)
+
+
+def _measured(data: Dataset, terms: DriveTerms, needed: np.ndarray | None = None) -> Measurements:
     """The data, every joint scaled by its torque's standard deviation, at least 1e-3 of the largest RMS torque."""
     least = 1e-3 * np.sqrt(np.square(data.tau).mean(axis=0).max())
     scale = np.maximum(data.tau.std(axis=0), least)
-    kinds = scalars.factors(data.v, data.a)
+    kinds = terms.factors(data, needed)
     q, v, a, tau = (np.ascontiguousarray(x) for x in (data.q, data.v, data.a, data.tau))
     return Measurements(q, v, a, tau, scale, kinds)
 
@@ -213,6 +224,33 @@ def _layout(parents: Int[np.ndarray, " n"], prismatic: Bool[np.ndarray, " n"]) -
 
 def _cost(descent: Descent[TreeEstimate]) -> float:
     return descent.cost if np.isfinite(descent.cost) else np.inf
+
+
+def _searched(
+    data: Dataset, wanted: Wanted, layout: np.ndarray, starts: int, rng: np.random.Generator, progress: bool
+) -> tuple[Wanted, Measurements, list[Descent[TreeEstimate]], bool]:
+    """The terms still wanted after the search, the data in its units, its descents, and whether Ctrl-C ended it.
+
+    Where it is left to the data whether there are drives, trees without them are tried first, as drives are known by
+    what a tree leaves.
+    """
+
+    def scaled(terms: DriveTerms) -> Measurements:
+        return _in_units_of_random_trees(_measured(data, terms), layout)
+
+    if not wanted.is_settled:
+        bare = wanted.settled()
+        alone = scaled(bare.first(data.nv))
+        descents, interrupted = _search(alone, layout, min(starts, _WAVE), rng.spawn(1)[0], progress)
+        if interrupted or min(_cost(descent) for descent in descents) < _EXACT:
+            return bare, alone, descents, interrupted
+    searched = scaled(wanted.of_search(data.nv))
+    try:
+        return wanted, searched, *_search(searched, layout, starts, rng, progress)
+    except KeyboardInterrupt:
+        if wanted.is_settled:
+            raise
+        return bare, alone, descents, True
 
 
 def _search(
@@ -278,7 +316,8 @@ def _physical(
             start, lambda x: x.normal(fair), lambda x: x.cost(fair), PhysicalTree.moved, iterations=300, stall=1e-4
         )
 
-    free = descend(PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.expected, strength))
+    guess = replace(guess, drag=bodies.scalars)
+    free = descend(PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.terms.signed, bodies.expected, strength))
     if not right_angles:
         return free.at
     for errors in _ERRORS:
@@ -289,13 +328,14 @@ def _physical(
     return free.at
 
 
-def _write(tree: PhysicalTree, network: Chain, rotor_inertia: bool) -> None:
+def _write(tree: PhysicalTree, network: Chain, terms: DriveTerms) -> None:
     """Copy the tree into the parameters of the network."""
     with torch.no_grad():
         for name, value in tree.guess.tree(_triangular(tree.factors))._asdict().items():
             getattr(network, name).copy_(torch.from_numpy(value))
-        if rotor_inertia:
-            network.rotors.copy_(torch.from_numpy(np.sqrt(tree.drag[-1])))
+        rotors = terms.rotors(tree.drag)
+        if rotors is not None:
+            network.rotors.copy_(torch.from_numpy(np.sqrt(rotors)))
 
 
 def _triangular(factors: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:

@@ -223,7 +223,7 @@ def _states(bench: _Bench, samples: int, speed: float, generator: np.random.Gene
     wanted = 2.0 * speed * generator.standard_normal(shape)
     tau = inverse_dynamics(PinocchioDynamics(bench.robot), q, v, wanted)
     if bench.friction is not None:
-        tau = tau + bench.friction.torque(v)
+        tau = tau + bench.friction.feedforward(v, tau)
     tau = np.clip(tau, -bench.limit, bench.limit)
     return np.zeros(samples), q, v, bench.plant.acceleration(q, v, tau), tau
 

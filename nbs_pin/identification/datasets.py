@@ -148,6 +148,10 @@ class Dataset(Shown):
             ) from error
         return replace(self, **{name: getattr(self, name)[index] for name in (*_STATES, "t", "trajectory")})
 
+    def thinned(self, most: int) -> "Dataset":
+        """At most that many samples, evenly spaced: neighbours in a fast log say little new."""
+        return self if len(self) <= most else self.take(np.linspace(0, len(self) - 1, most).astype(int))
+
     @checked(path=writable)
     def save(self, path: str | Path) -> None:
         """Write an npz file atomically; missing folders are created.

@@ -1,13 +1,15 @@
-"""What a fit makes doubtful in its data: the unit of the torques, and friction that was not to be learned."""
+"""What a fit makes doubtful: the unit of the torques, drives that were not to be learned, learning itself."""
+
+from collections.abc import Mapping
 
 import numpy as np
 
-from nbs_pin.base.doors import option
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
-from nbs_pin.identification.fit_report import torque_errors
+from nbs_pin.identification.fit_report import FitReport
+from nbs_pin.identification.remainder import next_try, remainder
 from nbs_pin.robots.robot import Robot
 
 _SOME = 2_000
@@ -17,20 +19,33 @@ _OTHER_UNIT = 20.0
 _ALIKE = 0.5
 """Correlation of the two from which on they are of one motion."""
 _NOTICED = 0.02
-"""Unexplained share of the torque's variance of which friction is worth a word, and then half of it."""
-_TRANSITION = 0.01
-"""Speed scale of Coulomb friction [rad/s]."""
+"""Unexplained share of the torque's variance that is worth a word."""
+_WORSE = 5.0
+"""Ratio of the unexplained share on held-out data to that on fitted ones that is worth a word."""
 
 
 def doubts(
-    model: DynamicsProvider, data: Dataset, friction: JointFriction | None, robot: Robot | None
+    model: DynamicsProvider,
+    data: Dataset,
+    friction: JointFriction | None,
+    robot: Robot | None,
+    asked: Mapping[str, bool | None],
 ) -> tuple[str, ...]:
-    """Clauses that name what is doubtful and what to do."""
+    """Clauses that name what is doubtful in a model fitted to the data and what to do.
+
+    `asked` holds the arguments friction, offset and rotor_inertia of the fit.
+    """
     some = data.take(np.sort(np.random.default_rng(0).permutation(len(data))[:_SOME]))
     found = (
         "" if robot is None or data.about.get("doubts") else _unit(some, robot),
-        "" if friction is not None else _friction(model, some),
+        _missing(model, some, friction, asked),
     )
+    return tuple(text for text in found if text)
+
+
+def doubts_of_report(report: FitReport) -> tuple[str, ...]:
+    """The same of what the report says by itself."""
+    found = (_untrained(report), _held_out(report.train_nmse, report.test_nmse))
     return tuple(text for text in found if text)
 
 
@@ -50,24 +65,34 @@ def _unit(data: Dataset, robot: Robot) -> str:
     )
 
 
-def _friction(model: DynamicsProvider, data: Dataset) -> str:
-    """Friction that would explain most of what is left."""
-    left, variance = -torque_errors(model, data), data.tau.var(axis=0)
-    if not (variance > 0.0).any():
+def _missing(
+    model: DynamicsProvider, data: Dataset, friction: JointFriction | None, asked: Mapping[str, bool | None]
+) -> str:
+    """Drives that were not to be learned and would explain much of what is left."""
+    if not data.tau.std(axis=0).any():
         return ""
-    varies = variance > 1e-12 * variance.max()
-    explained = np.zeros(data.nv)
-    for i in np.flatnonzero(varies):
-        kinds = np.column_stack([data.v[:, i], np.tanh(data.v[:, i] / _TRANSITION)])
-        explained[i] = (
-            np.square(left[:, i]).mean()
-            - np.square(left[:, i] - kinds @ np.linalg.lstsq(kinds, left[:, i], rcond=None)[0]).mean()
-        )
-    share = float((explained[varies] / variance[varies]).mean())
-    total = float((np.square(left).mean(axis=0)[varies] / variance[varies]).mean())
-    if total < _NOTICED or share < 0.5 * total:
+    found = remainder(model, data, friction)
+    names = tuple(f"joint {i + 1}" for i in range(data.nv))
+    left_out = asked.get(found.cause, True) is False
+    return next_try(found, names, asked) if left_out and found.unexplained >= _NOTICED else ""
+
+
+def _held_out(train_nmse: float, test_nmse: float | None) -> str:
+    """Held-out data that are predicted far worse than the fitted ones."""
+    if test_nmse is None or not test_nmse > max(_WORSE * train_nmse, _NOTICED):
         return ""
     return (
-        f"{total:.1%} of the torque's variance is unexplained, most of which friction would explain; give "
-        f"{option('friction', True)} to learn it too"
+        f"{test_nmse:.2g} of the torque's variance is unexplained on held-out data, and {train_nmse:.2g} on those that "
+        "were fitted: the motions are too few, or held-out ones of another kind; record longer and more various ones"
+    )
+
+
+def _untrained(report: FitReport) -> str:
+    """A network that was not improved though much is left to learn."""
+    left = report.train_nmse if report.test_nmse is None else report.test_nmse
+    if report.stopped != "no better than the start" or not left > _NOTICED:
+        return ""
+    return (
+        "the network learned nothing that holds on held-out data, and the model is the untrained one with friction; "
+        "record longer and more various motions, or fit 'identified' or 'chain'"
     )

@@ -13,11 +13,12 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.compatibility import arm_fault, other_data_fault
 from nbs_pin.identification.datasets import DATA, Dataset
-from nbs_pin.identification.doubts import doubts
+from nbs_pin.identification.doubts import doubts, doubts_of_report
 from nbs_pin.identification.fit_report import FitReport, torque_nmse, zero_torque_nmse
 from nbs_pin.identification.fitters import FitTask, LearnedDynamics
-from nbs_pin.identification.identify import sign_fault
+from nbs_pin.identification.identify import rotors_wanted, sign_fault
 from nbs_pin.identification.registry import MODELS
+from nbs_pin.identification.remainder import next_try, remainder
 from nbs_pin.robots.robot import ARM, Robot
 
 _USELESS = 0.9
@@ -32,7 +33,9 @@ HELD_OUT = 0.2
     seed=SEED,
     robot=maybe(ARM),
     held_out=maybe(either(DATA, number(least=0.0, below=1.0))),
-    friction=flag,
+    friction=maybe(flag),
+    offset=maybe(flag),
+    rotor_inertia=maybe(flag),
     progress=flag,
 )
 def fit(
@@ -42,7 +45,9 @@ def fit(
     *,
     robot: Robot | None = None,
     held_out: Dataset | float | None = None,
-    friction: bool = False,
+    friction: bool | None = None,
+    offset: bool | None = None,
+    rotor_inertia: bool | None = None,
     progress: bool = False,
     **settings: Any,
 ) -> LearnedDynamics:
@@ -56,7 +61,11 @@ def fit(
             geometry; the other models take limits and drawings from it.
         held_out: Trajectories not trained on, as a dataset or a share of the data, 0 for none. They select the iterate
             of a network. None takes `HELD_OUT` if there are at least two trajectories.
-        friction: Also learn viscous and Coulomb friction, which is not part of M, C, G.
+        friction: None learns the friction that the data show, up to that of `DriveFriction`; True viscous and Coulomb
+            friction of every joint, False none. It is not part of M, C, G.
+        offset: Learn constant torques, of sensors or a pull; None those that the data show.
+        rotor_inertia: Learn rotor inertias; None those that the robot states or the data show. Networks without a
+            nominal model have them in M.
         progress: Show a progress bar. Ctrl-C ends the fit of a network and keeps the best iterate.
         **settings: Options of the model, see `fit_network`, `fit_chain` and `identify`; widths of a network.
 
@@ -78,24 +87,25 @@ def fit(
         raise ArgumentError(f"{fault}.")
     start = time.perf_counter()
     train, test = split_data(data, held_out, seed)
-    fitted = fitter(FitTask(model, train, test, seed, robot, friction, progress, settings))
-    bare = fitted.assemble(None)
+    rotors = rotors_wanted(rotor_inertia, robot)
+    fitted = fitter(FitTask(model, train, test, seed, robot, (friction, offset, rotors), progress, settings))
+    bare, asked = fitted.assemble(None), {"friction": friction, "offset": offset, "rotor_inertia": rotors}
+    left = remainder(bare, train if test is None else test, fitted.friction) if data.tau.any() else None
+    joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
     report = FitReport(
         model=model,
         seed=seed,
         samples=len(train),
         seconds=time.perf_counter() - start,
-        evaluations=fitted.evaluations,
-        parameters=fitted.parameters,
-        history=fitted.history,
-        held_out=fitted.held_out,
+        stopped=_ended(fitted.stopped, bare, train if test is None else test, fitted.friction),
         train_nmse=torque_nmse(bare, train, fitted.friction),
         test_nmse=None if test is None else torque_nmse(bare, test, fitted.friction),
-        stopped=_ended(fitted.stopped, bare, train if test is None else test, fitted.friction),
         unidentifiable=_useless(bare, train, fitted.friction) + fitted.unidentifiable,
-        details=fitted.details,
+        left={} if left is None else left.plain(),
+        next_try="" if left is None else next_try(left, joints, asked),
+        **fitted.record(),
     )
-    for doubt in doubts(bare, train, fitted.friction, robot):
+    for doubt in (*doubts(bare, train, fitted.friction, robot, asked), *doubts_of_report(report)):
         warnings.warn(f"{doubt}.", stacklevel=2)
     return fitted.assemble(report)
 

@@ -38,9 +38,16 @@ class FitReport:
     stopped: str
     """Why it ended: "converged", "iterations", "held out" (no improvement there), "interrupted", or, for a chain,
     "starts": no other random tree found the best minimum, or no physical bodies reach it; give more data or starts.
-    However it ended, "no better than zero torque" if that predicts the data as well."""
+    For a network, "no better than the start" if no iterate predicts the held-out data, or without these the training
+    data, better than the untrained network with friction. However it ended, "no better than zero torque" if that
+    predicts the data as well."""
     unidentifiable: tuple[str, ...]
     """What the data do not determine, the worst first."""
+    left: Mapping[str, Any] = field(default_factory=dict)
+    """What it leaves of the torques of the held-out data, or without these of the training data: per joint mean, RMS,
+    and the share of the residual that other effects would explain (`remainder`); empty without torque."""
+    next_try: str = ""
+    """The one thing to try next, empty if little is left."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """Further results of this kind of model, JSON-serialisable."""
 
@@ -48,7 +55,7 @@ class FitReport:
 def torque_errors(model: DynamicsProvider, data: Dataset, friction: JointFriction | None = None) -> np.ndarray:
     """Torque of the model, friction included, minus the measured torque, (samples, n) [N·m]."""
     torque = model.reference_torque(data.q, data.v, data.v, data.a)
-    return torque - data.tau if friction is None else torque + friction.torque(data.v) - data.tau
+    return torque - data.tau if friction is None else torque + friction.feedforward(data.v, torque) - data.tau
 
 
 def zero_torque_nmse(data: Dataset) -> float:

@@ -17,6 +17,7 @@ from nbs_pin.dynamics.registry import NETWORKS, make_network
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.identification.chain_fit import fit_chain
 from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.drive_choice import Wanted, terms_of_rest
 from nbs_pin.identification.fit_report import FitReport
 from nbs_pin.identification.identify import identify
 from nbs_pin.identification.network_equations import deviation_of
@@ -37,10 +38,19 @@ class FitTask:
     held_out: Dataset | None
     seed: int
     robot: Robot | None
-    friction: bool
+    drives: tuple[bool | None, bool | None, bool | None]
+    """Friction, offsets and rotor inertias wanted (`Wanted`)."""
     progress: bool
     settings: Mapping[str, Any]
     """Further keyword arguments of `fit`, not yet checked."""
+
+    def wanted(self) -> dict[str, Any]:
+        """The terms of the drives as keyword arguments."""
+        return dict(zip(("friction", "offset", "rotor_inertia"), self.drives, strict=True))
+
+    def beside(self, settings: dict[str, Any]) -> Wanted:
+        """The terms beside a network; takes the transition out of the settings."""
+        return Wanted(*self.drives, **{name: settings.pop(name) for name in ("transition",) if name in settings})
 
     def known(self, *names: str) -> dict[str, Any]:
         """The settings; raises ArgumentError if one is not among the names."""
@@ -66,10 +76,16 @@ class Fitted:
     unidentifiable: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
+    def record(self) -> dict[str, Any]:
+        """What a `FitReport` takes as it is."""
+        names = ("evaluations", "parameters", "history", "held_out", "details")
+        return {name: getattr(self, name) for name in names}
+
 
 def fit_family(task: FitTask) -> Fitted:
     """Fit a network family (`dynamics/registry.py`), scaled to the magnitudes of the data."""
     settings = task.known("loss", "optimiser", "iterations", "transition", "widths", "epsilon")
+    wanted = task.beside(settings)
     options: dict[str, Any] = {name: settings.pop(name) for name in ("widths", "epsilon") if name in settings}
     torque, rate = (deviation_of(x) for x in (task.data.tau, task.data.a))
     scales = {"inertia": (torque / rate).tolist(), "energy": float(torque.mean())} if task.data.tau.any() else {}
@@ -79,7 +95,7 @@ def fit_family(task: FitTask) -> Fitted:
         task.data,
         task.held_out,
         seed=task.seed,
-        friction=task.friction,
+        wanted=wanted,
         progress=task.progress,
         **settings,
     )
@@ -90,15 +106,14 @@ def fit_family(task: FitTask) -> Fitted:
 
 def fit_rigid_tree(task: FitTask) -> Fitted:
     """Fit a rigid tree of which only the joint tree of the data is known."""
-    settings = task.known("rotor_inertia", "transition", "regularisation", "starts", "epsilon", "right_angles")
+    settings = task.known("transition", "regularisation", "starts", "epsilon", "right_angles")
     names = () if task.robot is None else task.robot.joint_names
-    settings.setdefault("rotor_inertia", task.robot is not None and bool(task.robot.armature.any()))
-    found = fit_chain(task.data, task.seed, friction=task.friction, progress=task.progress, **settings)
+    found = fit_chain(task.data, task.seed, progress=task.progress, **task.wanted(), **settings)
     network, bodies = found.network, found.bodies
     return Fitted(
         assemble=lambda report: LagrangianDynamics(network, task.robot, found.friction, report),
         friction=found.friction,
-        parameters=sum(x.numel() for x in network.parameters()) + (2 * task.data.nv if found.friction else 0),
+        parameters=sum(x.numel() for x in network.parameters()) + bodies.drive_numbers,
         history=tuple(found.history.tolist()),
         evaluations=found.evaluations,
         stopped=found.stopped,
@@ -108,6 +123,7 @@ def fit_rigid_tree(task: FitTask) -> Fitted:
             "nmse_of_starts": found.costs.tolist(),
             "noise_Nm": np.asarray(bodies.noise).tolist(),
             "condition": float(bodies.condition),
+            "outliers": bodies.outliers,
         },
     )
 
@@ -117,13 +133,14 @@ def fit_residual(task: FitTask) -> Fitted:
     settings = task.known("optimiser", "iterations", "transition", "widths", "share")
     options: dict[str, Any] = {"widths": ResidualNetwork.fit_widths}
     options |= {name: settings.pop(name) for name in ("widths", "share") if name in settings}
-    nominal, prismatic = PinocchioDynamics(_needed(task)), task.data.prismatic.tolist()
+    wanted, prismatic = task.beside(settings), task.data.prismatic.tolist()
+    nominal = PinocchioDynamics(_with_rotors(_needed(task), task.data, wanted))
 
     def make(seed: int) -> LagrangianNetwork:
         return ResidualNetwork(nominal, prismatic, seed=seed, **options)
 
     found = fit_network(
-        make, task.data, task.held_out, seed=task.seed, friction=task.friction, progress=task.progress, **settings
+        make, task.data, task.held_out, seed=task.seed, wanted=wanted, progress=task.progress, **settings
     )
 
     def assemble(report: FitReport | None) -> LearnedDynamics:
@@ -132,6 +149,16 @@ def fit_residual(task: FitTask) -> Fitted:
         return ResidualDynamics(network, found.friction, report)
 
     return _of_network(task, found, assemble)
+
+
+def _with_rotors(robot: Robot, data: Dataset, wanted: Wanted) -> Robot:
+    """The arm with rotor inertias that its URDF leaves out, if they are wanted or the torques show them."""
+    if wanted.rotor_inertia is False or robot.armature.any():
+        return robot
+    left = data.tau - PinocchioDynamics(robot).reference_torque(data.q, data.v, data.v, data.a)
+    terms, numbers = terms_of_rest(wanted, data, left)
+    rotors = terms.rotors(numbers)
+    return robot if rotors is None or not rotors.any() else robot.with_armature(rotors)
 
 
 def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport | None], LearnedDynamics]) -> Fitted:
@@ -151,8 +178,8 @@ def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport 
 
 def fit_identified(task: FitTask) -> Fitted:
     """Identify inertial parameters for the arm's geometry."""
-    settings = task.known("rotor_inertia", "transition", "regularisation")
-    found = identify(task.data, _needed(task), friction=task.friction, **settings)
+    settings = task.known("transition", "regularisation")
+    found = identify(task.data, _needed(task), **task.wanted(), **settings)
     numbers, report = found.parameters.size, found.report
 
     def assemble(own: FitReport | None) -> LearnedDynamics:
@@ -161,11 +188,17 @@ def fit_identified(task: FitTask) -> Fitted:
     return Fitted(
         assemble=assemble,
         friction=found.friction,
-        parameters=numbers + (0 if found.friction is None else 2 * task.data.nv),
+        parameters=numbers + report.drive_numbers,
         evaluations=report.steps,
         stopped="converged" if report.converged else "iterations",
         unidentifiable=report.unidentifiable,
-        details={"noise_Nm": np.asarray(report.noise).tolist(), "condition": float(report.condition)},
+        details={
+            "noise_Nm": np.asarray(report.noise).tolist(),
+            "condition": float(report.condition),
+            "outliers": report.outliers,
+            "mass_kg": float(found.parameters[:, 0].sum()),
+            "stated_mass_kg": float(sum(body.mass for body in list(_needed(task).model.inertias)[1:])),
+        },
     )
 
 

@@ -18,6 +18,7 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
 from nbs_pin.dynamics.residual import ResidualNetwork, Terms, nominal_terms
 from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.drive_terms import DriveTerms
 
 Loss: TypeAlias = Literal["torque", "acceleration"]
 """τ̂ − τ, cheap and well conditioned; or predicted minus measured v̇, as in the paper, which needs M̂⁻¹."""
@@ -25,54 +26,63 @@ Theta: TypeAlias = Float[torch.Tensor, " parameters"]
 _LARGEST_BLOCK = 2**22  # entries of a Jacobian block, 32 MiB
 _STRIPS = 6  # of JᵀJ, each computed from the diagonal to the right
 _FLAT = 1e-6
-FIRST_FRICTION = 0.1
-"""Initial friction at a speed of one standard deviation, as a share of the torque's standard deviation."""
 
 
 class Equation(nn.Module):
-    """The residual of one sample, with friction d²v + c² tanh(v/transition), whose coefficients cannot be negative."""
+    """The residual of one sample: a network, and the terms of the drives, which are linear in their numbers."""
 
-    def __init__(
-        self, network: LagrangianNetwork, loss: Loss, friction: Float[torch.Tensor, "2 n"] | None, transition: float
-    ) -> None:
+    def __init__(self, network: LagrangianNetwork, loss: Loss, terms: DriveTerms | None) -> None:
         super().__init__()
         if loss == "acceleration" and isinstance(network, ResidualNetwork):
             raise ArgumentError(
                 f"loss 'acceleration' needs derivatives that a nominal model lacks; use {option('loss', 'torque')}."
             )
-        self.network, self.loss, self.transition = network, loss, transition
-        self.roots = None if friction is None else nn.Parameter(friction.sqrt())
+        self.network, self.loss, self.terms = network, loss, terms
+        kinds = 0 if terms is None else len(terms.kinds)
+        self.numbers = nn.Parameter(torch.zeros(kinds, network.nv, dtype=torch.float64)) if kinds else None
 
     @classmethod
     def fitted(cls, network: LagrangianNetwork, friction: JointFriction | None, loss: Loss) -> "Equation":
         """The equation of a fitted network and its friction."""
         if friction is None:
-            return cls(network, loss, None, 1.0)
-        coefficients = torch.from_numpy(np.stack([friction.viscous, friction.coulomb]))
-        return cls(network, loss, coefficients, friction.transition)
+            return cls(network, loss, None)
+        terms, numbers = DriveTerms.of_friction(friction)
+        equation = cls(network, loss, terms)
+        equation.write_numbers(numbers)
+        return equation
 
     def forward(
-        self, q: torch.Tensor, v: torch.Tensor, a: torch.Tensor, tau: torch.Tensor, *nominal: torch.Tensor
+        self,
+        q: torch.Tensor,
+        v: torch.Tensor,
+        a: torch.Tensor,
+        tau: torch.Tensor,
+        factors: torch.Tensor,
+        *nominal: torch.Tensor,
     ) -> torch.Tensor:
         """Residual of the torque [N·m] or acceleration [rad/s²], predicted minus measured."""
-        net = tau if self.roots is None else tau - self.friction_torque(v)
+        net = tau if self.numbers is None else tau - (self.numbers * factors).sum(-2)
         if self.loss == "acceleration":
             return self.network.acceleration(q, v, net) - a
-        if nominal:
-            return cast(ResidualNetwork, self.network).torque(q, v, v, a, Terms(*nominal)) - net
-        return self.network.torque(q, v, v, a) - net
+        return self.torque(q, v, a, *nominal) - net
 
-    def friction_torque(self, v: torch.Tensor) -> torch.Tensor:
-        """Friction torque [N·m]."""
-        viscous, coulomb = cast(torch.Tensor, self.roots).square()
-        return viscous * v + coulomb * torch.tanh(v / self.transition)
+    def torque(self, q: torch.Tensor, v: torch.Tensor, a: torch.Tensor, *nominal: torch.Tensor) -> torch.Tensor:
+        """The network's torque [N·m]."""
+        if nominal:
+            return cast(ResidualNetwork, self.network).torque(q, v, v, a, Terms(*nominal))
+        return self.network.torque(q, v, v, a)
+
+    def write_numbers(self, numbers: Float[np.ndarray, "kinds n"]) -> None:
+        """Set the numbers of the drives."""
+        if self.numbers is not None:
+            with torch.no_grad():
+                self.numbers.copy_(torch.from_numpy(numbers))
 
     def friction(self) -> JointFriction | None:
         """The fitted friction, None without."""
-        if self.roots is None:
+        if self.terms is None or self.numbers is None:
             return None
-        viscous, coulomb = self.roots.detach().square().numpy(force=True)
-        return JointFriction(viscous, coulomb, self.transition)
+        return self.terms.friction(self.numbers.detach().numpy(force=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +91,7 @@ class Equations:
 
     equation: Equation
     columns: tuple[torch.Tensor, ...]
-    """q, v, a, τ and the terms of a nominal model, if there is one; one row per sample."""
+    """q, v, a, τ, factors of the drives (kinds, n) and the terms of a nominal model, if any; one row per sample."""
     unit: Float[torch.Tensor, " n"]
     """Standard deviation of the measured torque or acceleration [N·m or rad/s²]."""
 
@@ -89,9 +99,13 @@ class Equations:
     def of(cls, equation: Equation, data: Dataset, unit: Float[torch.Tensor, " n"] | None = None) -> "Equations":
         """The equations of a dataset; `unit` of another dataset makes the costs of both comparable."""
         q, v, a, tau = (torch.from_numpy(x) for x in (data.q, data.v, data.a, data.tau))
-        network = equation.network
+        network, terms = equation.network, equation.terms
+        kinds = np.zeros((0, *data.v.shape)) if terms is None else terms.factors(data)
+        factors = torch.from_numpy(np.ascontiguousarray(kinds.swapaxes(0, 1)))
         nominal = nominal_terms(network.nominal, q) if isinstance(network, ResidualNetwork) else ()
-        return cls(equation, (q, v, a, tau, *nominal), deviation(tau if equation.loss == "torque" else a, unit))
+        return cls(
+            equation, (q, v, a, tau, factors, *nominal), deviation(tau if equation.loss == "torque" else a, unit)
+        )
 
     def __len__(self) -> int:
         return len(self.columns[0])
@@ -106,6 +120,32 @@ class Equations:
         with torch.no_grad():
             for p, part in zip(self.equation.parameters(), self._parts(theta).values(), strict=True):
                 p.copy_(part)
+
+    def torque_left(self, theta: Theta) -> Float[np.ndarray, "m n"]:
+        """The torque that the network leaves to the drives [N·m]."""
+        self.write(theta)
+        q, v, a, tau, _, *nominal = self.columns
+        with torch.no_grad():
+            return np.asarray((tau - self.equation.torque(q, v, a, *nominal)).numpy(force=True))
+
+    def solved(self, theta: Theta) -> Theta:
+        """The parameters with the numbers of the drives by least squares beside the network."""
+        equation = self.equation
+        if equation.terms is None or equation.numbers is None:
+            return theta
+        left, factors = self.torque_left(theta), self.columns[4].numpy(force=True).swapaxes(0, 1)
+        if not np.isfinite(left).all():
+            return theta
+        equation.write_numbers(equation.terms.solved(factors, left))
+        return self.theta
+
+    def torque_cost(self, friction: JointFriction | None) -> float:
+        """Mean square of the torque residual in units of its deviation, with the network as it is and this friction."""
+        q, v, a, tau, _, *nominal = self.columns
+        with torch.no_grad():
+            needed = self.equation.torque(q, v, a, *nominal)
+            left = needed - tau if friction is None else needed + friction.feedforward(v, needed) - tau
+        return float((left / deviation(tau)).square().mean())
 
     def residual(self, theta: Theta, rows: Int[torch.Tensor, " m"] | None = None) -> Float[torch.Tensor, "m n"]:
         """Residuals of the samples `rows`, of all for None; differentiable in theta."""
@@ -165,12 +205,6 @@ def deviation(x: Float[torch.Tensor, "m n"], given: torch.Tensor | None = None) 
 def deviation_of(x: Float[np.ndarray, "m n"]) -> JointArray:
     """`deviation` of an array."""
     return deviation(torch.from_numpy(x)).numpy()
-
-
-def first_friction(data: Dataset) -> Float[torch.Tensor, "2 n"]:
-    """Initial viscous and Coulomb coefficients."""
-    torque, speed = (deviation(torch.from_numpy(x)) for x in (data.tau, data.v))
-    return 0.5 * FIRST_FRICTION * torch.stack([torque / speed, torque])
 
 
 def _blocks(rows: Int[torch.Tensor, " m"], size: int) -> Iterator[Int[torch.Tensor, " k"]]:

@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, cast, get_args
 
 import torch
@@ -15,7 +15,9 @@ from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
 from nbs_pin.identification.datasets import Dataset
-from nbs_pin.identification.network_equations import Equation, Equations, Loss, Theta, first_friction
+from nbs_pin.identification.drive_choice import Wanted, terms_of_rest
+from nbs_pin.identification.drive_terms import DriveTerms
+from nbs_pin.identification.network_equations import Equation, Equations, Loss, Theta
 
 FitOptimiser: TypeAlias = Literal["lm", "adam", "lbfgs"]
 """Levenberg–Marquardt, first on a random subset of the samples, then on all; Adam on minibatches with cosine decay of
@@ -29,6 +31,7 @@ _COARSE_EQUATIONS, _COARSE_STEPS, _COARSE_ENOUGH = 5, 25, 3e-3  # residuals per 
 _STARTS, _STUCK = 3, 0.05  # most starts; nMSE after the coarse part above which another is tried
 _PATIENCE, _SLOW = 0.2, 0.03  # share of the iterations, and the least relative decrease in them
 _BATCH, _BATCHES, _RATE, _LBFGS_SHARE = 256, 16, 3e-3, 0.75  # largest batch, fewest batches, learning rate, share
+_AS_GOOD = 1.01  # ratio of costs up to which fewer or more terms of friction are as good
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e8
 
 
@@ -47,7 +50,8 @@ class NetworkFit:
     evaluations: int
     """How often the residuals of a sample were computed or differentiated, divided by the number of samples."""
     stopped: str
-    """"converged", "iterations", "held out" (no improvement there) or "interrupted"."""
+    """"converged", "iterations", "held out" (no improvement there), "interrupted" or "no better than the start": no
+    iterate predicts the held-out data, or the training data without these, better than the untrained network."""
 
 
 @dataclass(eq=False)
@@ -64,7 +68,8 @@ class _Search:
     work: float = 0.0
 
     def record(self, theta: Theta) -> float:
-        """Record an iterate; returns its training cost."""
+        """Record an iterate, with the numbers of the drives solved beside it; returns its training cost."""
+        theta = self.equations.solved(theta)
         self.train.append(self.equations.cost(theta))
         self.work += 1.0
         judged = self.train[-1]
@@ -75,6 +80,12 @@ class _Search:
         if judged < self.least:
             self.best, self.least, self.since = theta, judged, 0
         return self.train[-1]
+
+    @property
+    def is_untrained(self) -> bool:
+        """Whether no iterate is better than the first one."""
+        judged = self.checked or self.train
+        return self.least >= judged[0]
 
     def label(self) -> str:
         """Text of the progress bar."""
@@ -108,11 +119,13 @@ def fit_network(
     loss: Loss | str = "torque",
     optimiser: FitOptimiser | str | None = None,
     iterations: int | None = None,
-    friction: bool = False,
-    transition: float = 0.01,
+    wanted: Wanted | None = None,
     progress: bool = False,
 ) -> NetworkFit:
     """Minimise the mean of (residual/deviation)² over samples and joints; Ctrl-C ends it and keeps the best.
+
+    The numbers of the drives are solved by least squares beside the network, before training and at every iterate, so
+    that the untrained network is judged with them too.
 
     Args:
         make: Returns an untrained network for a seed. "lm" tries up to two more seeds if a start makes no progress.
@@ -122,8 +135,7 @@ def fit_network(
         loss: See `Loss`.
         optimiser: See `FitOptimiser`. None takes "lm" up to `LARGEST_FOR_LM` parameters, "lbfgs" above.
         iterations: None takes those of `ITERATIONS`.
-        friction: Also fit viscous and Coulomb friction.
-        transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
+        wanted: Friction and offsets to fit; None for none. Rotor inertias are part of M̂.
         progress: Show a progress bar.
 
     Raises:
@@ -136,9 +148,11 @@ def fit_network(
             f"the data have no torque, which M̂ = 0 explains; record some, or use {option('loss', 'acceleration')}."
         )
 
+    wanted = replace(wanted or Wanted(False, False), rotor_inertia=False)
+    first = wanted.first(data.nv) if data.tau.any() else None
+
     def begin(start: int) -> _Search:
-        begun = first_friction(data) if friction else None
-        equation = Equation(copy.deepcopy(make(start)).requires_grad_(True), cast(Loss, loss), begun, transition)
+        equation = Equation(copy.deepcopy(make(start)).requires_grad_(True), cast(Loss, loss), first)
         equations = Equations.of(equation, data)
         checked = None if held_out is None else Equations.of(equation, held_out, equations.unit)
         search = _Search(equations, checked, equations.theta)
@@ -160,8 +174,25 @@ def fit_network(
     found.equations.write(found.best)
     equation = found.equations.equation
     equation.requires_grad_(False)
-    count, work = len(found.best), round(found.work)
-    return NetworkFit(equation.network, equation.friction(), count, found.train, found.checked, work, stopped)
+    friction = _friction(found, wanted, data) if first is not None else None
+    numbers = 0 if friction is None else DriveTerms.of_friction(friction)[0].count
+    count, work = sum(p.numel() for p in equation.network.parameters()) + numbers, round(found.work)
+    if found.is_untrained and stopped != "interrupted":
+        stopped = "no better than the start"
+    return NetworkFit(equation.network, friction, count, found.train, found.checked, work, stopped)
+
+
+def _friction(found: _Search, wanted: Wanted, data: Dataset) -> JointFriction | None:
+    """The friction beside the trained network, with the terms that the torque it leaves shows (`drive_choice`)."""
+    fitted = found.equations.equation.friction()
+    if wanted.is_settled:
+        return fitted
+    left = found.equations.torque_left(found.best)
+    terms, numbers = terms_of_rest(wanted, data, left)
+    chosen = terms.friction(numbers)
+    judged = found.equations if found.held_out is None else found.held_out
+    costs = [judged.torque_cost(friction) for friction in (chosen, fitted)]
+    return chosen if costs[0] <= _AS_GOOD * costs[1] else fitted
 
 
 def _marquardt_starts(

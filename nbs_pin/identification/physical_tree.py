@@ -1,15 +1,15 @@
 """A rigid tree with physically consistent bodies, as a point of a descent: the last step of the chain fit.
 
 Placements and bodies together minimise the squared residuals, in units of the noise, plus the prior of
-`consistent_fit`, 2γ Σᵢ (tr Xᵢ − log det Xᵢ) + 2γ Σₖ (yₖ − log yₖ), for bodies and friction in units of their expected
-values. Steps along X = L exp(S) Lᵀ and y exp(s) keep them positive; the Hessian of the prior is approximated by 2γ, its
-value along L(1 + S)Lᵀ and y(1 + s).
+`consistent_fit`, 2γ Σᵢ (tr Xᵢ − log det Xᵢ) + 2γ Σₖ (yₖ − log yₖ) + γ Σₗ zₗ², for bodies and drives in units of their
+expected values. Steps along X = L exp(S) Lᵀ and y exp(s) keep them positive; the Hessian of the prior is approximated
+by 2γ, its value along L(1 + S)Lᵀ, y(1 + s) and z + s.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -29,7 +29,9 @@ class PhysicalTree:
     factors: Float[np.ndarray, "n 4 4"]
     """Square roots L of the pseudo-inertias LLᵀ, not necessarily triangular."""
     drag: Float[np.ndarray, "kinds n"]
-    """Friction coefficients and rotor inertias > 0."""
+    """Numbers of the drives, > 0 unless signed."""
+    signed: Bool[np.ndarray, "kinds n"]
+    """Which of them may be negative."""
     expected: Expected
     strength: float
     """γ."""
@@ -45,7 +47,8 @@ class PhysicalTree:
         local, share = self._in_units(), self.drag / self._usual()
         _, logarithm = np.linalg.slogdet(local)
         divergence = np.square(local).sum() - 2.0 * logarithm.sum() - 4.0 * len(local)
-        divergence += (share - np.log(share) - 1.0).sum()
+        positive = share[~self.signed]
+        divergence += (positive - np.log(positive) - 1.0).sum() + 0.5 * np.square(share[self.signed]).sum()
         return self.whole().cost(data) + 2.0 * self.strength * float(divergence) / data.q.size
 
     def normal(self, data: Measurements) -> Normal:
@@ -53,7 +56,7 @@ class PhysicalTree:
         plain, chart, free = self.whole().normal(data), self._chart(), self._free()
         local, weight = self._in_units(), self.strength / data.q.size
         bodies = coordinates(local.swapaxes(1, 2) @ local - np.eye(4))
-        slope = self._step(bodies, self.drag / self._usual() - 1.0)
+        slope = self._step(bodies, self.drag / self._usual() - ~self.signed)
         added = self._step(np.ones_like(bodies), np.ones_like(self.drag))
         gradient = chart.T @ plain.gradient - weight * slope
         hessian = chart.T @ plain.hessian @ chart + weight * np.diag(added)
@@ -69,7 +72,7 @@ class PhysicalTree:
             self,
             guess=replace(guess, rotations=_held(guess.rotations, self.angles)),
             factors=self.factors @ expm(0.5 * symmetric(bodies)),
-            drag=self.drag * np.exp(whole[inner:].reshape(self.drag.shape)),
+            drag=self._dragged(whole[inner:].reshape(self.drag.shape)),
         )
 
     def at_right_angles(self, data: Measurements, errors: float) -> "PhysicalTree":
@@ -92,6 +95,11 @@ class PhysicalTree:
 
     def _in_units(self) -> np.ndarray:
         return np.linalg.solve(self.expected.bodies, self.factors)
+
+    def _dragged(self, step: np.ndarray) -> np.ndarray:
+        """The numbers of the drives after a step."""
+        grown = self.drag * np.exp(np.where(self.signed, 0.0, step))
+        return np.where(self.signed, self.drag + step * self._usual(), grown)
 
     def _usual(self) -> np.ndarray:
         return self.expected.scalars.reshape(self.drag.shape)
@@ -123,7 +131,7 @@ class PhysicalTree:
         for i in range(n):
             body = slice(3 + JOINT * i, 3 + JOINT * i + 10)
             chart[body, body] = maps[i]
-        chart[size - kinds :, size - kinds :] = np.diag(self.drag.ravel())
+        chart[size - kinds :, size - kinds :] = np.diag(np.where(self.signed, self._usual(), self.drag).ravel())
         return chart
 
 

@@ -1,12 +1,12 @@
 """The equations of motion of an arm, linear in its unknowns: inertias, friction and rotors.
 
-    τ = Y(q, v, v̇) π + viscous·v + coulomb·tanh(v / transition) + rotor·v̇
+    τ = Y(q, v, v̇) π + terms of the drives (`drive_terms`)
 
 π are the coordinates of the bodies' pseudo-inertias. Y depends on the geometry alone: `Geometry` is what the fit needs
 of it, `RobotGeometry` that of a URDF, with Pinocchio's regressor.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -15,15 +15,16 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, PARAMETERS_OF_COORDINATES, coordinates
+from nbs_pin.dynamics.pseudo_inertia import PARAMETERS_OF_COORDINATES, coordinates
 from nbs_pin.identification.consistent_fit import in_factors
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.robots.robot import Robot
 
 _CHUNK = 1_000
 """Samples whose regressors are held in memory at once."""
+_BLOCK = 500
+"""Rows that are decomposed at once, which the cache holds."""
 _FRICTION_SHARE = 0.05
 """Expected share of friction, and of rotor inertia, in the torque."""
 _STILL = 0.1
@@ -76,29 +77,6 @@ class RobotGeometry:
         return (rows.reshape(-1, n, n, 10) @ PARAMETERS_OF_COORDINATES).reshape(-1, n, 10 * n)
 
 
-@dataclass(frozen=True)
-class Scalars:
-    """The unknowns of every joint besides the inertia of its body: those of friction, then the rotor inertia."""
-
-    friction: bool
-    rotor_inertia: bool
-    transition: float
-    """Speed scale of the Coulomb friction [rad/s]."""
-
-    def factors(
-        self, v: Float[np.ndarray, "samples n"], a: Float[np.ndarray, "samples n"]
-    ) -> Float[np.ndarray, "kinds samples n"]:
-        """Factor of each kind in the torque of its joint: v, tanh(v/transition), v̇."""
-        kinds = [v, np.tanh(v / self.transition)] if self.friction else []
-        return np.array([*kinds, *([a] if self.rotor_inertia else [])]).reshape(-1, *v.shape)
-
-    def names(self, joints: Sequence[str]) -> list[str]:
-        """Names of all unknowns of the arm, those of the bodies first."""
-        kinds = (["viscous", "coulomb"] if self.friction else []) + (["rotor"] if self.rotor_inertia else [])
-        bodies = [f"{parameter}({joint})" for joint in joints for parameter in PARAMETER_NAMES]
-        return bodies + [f"{kind}({joint})" for kind in kinds for joint in joints]
-
-
 @dataclass(frozen=True, eq=False)
 class Expected:
     """Expected values of the unknowns before any data: the units of the fit."""
@@ -116,54 +94,65 @@ class Expected:
         return np.concatenate([bodies, triangles[:, :, split:] * np.append(self.scalars, 1.0)], axis=-1)
 
 
-def joint_triangles(geometry: Geometry, data: Dataset, scalars: Scalars) -> Float[np.ndarray, "n rows columns"]:
-    """R of each joint's QR-decomposed equations, torque last: the same least squares problem in fewer rows."""
-    triangles = np.zeros((data.nv, 0, len(scalars.names(geometry.names)) + 1))
-    for rows in _rows(geometry, data, scalars):
-        triangles = triangle(np.concatenate([triangles, rows], axis=1))
-    return triangles
+def equation_rows(
+    geometry: Geometry, data: Dataset, factors: Float[np.ndarray, "kinds samples n"]
+) -> Float[np.ndarray, "n samples columns"]:
+    """The equations of each joint: factors of the coordinates of all bodies and of its own numbers, then the torque."""
+    blocks = []
+    for begin in range(0, len(data), _CHUNK):
+        part = slice(begin, begin + _CHUNK)
+        bodies = geometry.regressor(data.q[part], data.v[part], data.a[part]).swapaxes(0, 1)
+        blocks.append(
+            np.concatenate([bodies, factors[:, part].transpose(2, 1, 0), data.tau[part].T[..., None]], axis=-1)
+        )
+    return np.concatenate(blocks, axis=1)
+
+
+def of_all_joints(rows: Float[np.ndarray, "n rows columns"]) -> Float[np.ndarray, "n rows all"]:
+    """The equations with a column for the numbers of every joint, kind by kind, in place of those of their own."""
+    n, split = len(rows), 10 * len(rows)
+    own = np.einsum("irk,ij->irkj", rows[:, :, split:-1], np.eye(n)).reshape(*rows.shape[:2], -1)
+    return np.concatenate([rows[:, :, :split], own, rows[:, :, -1:]], axis=-1)
 
 
 def triangle(rows: Float[np.ndarray, "*batch rows columns"]) -> Float[np.ndarray, "*batch fewer columns"]:
     """R of the QR decomposition: fewer rows of the same least squares problem."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))
+    size = max(_BLOCK, 4 * rows.shape[-1])
+    found = rows[..., :size, :]
+    for begin in range(size, rows.shape[-2], size):
+        found = np.concatenate([np.linalg.qr(found, mode="r"), rows[..., begin : begin + size, :]], axis=-2)
+    return np.asarray(np.linalg.qr(found, mode="r"))
 
 
 def expectation(
-    geometry: Geometry, data: Dataset, scalars: Scalars, triangles: Float[np.ndarray, "n rows columns"]
+    geometry: Geometry,
+    samples: int,
+    factors: Float[np.ndarray, "kinds samples n"],
+    triangles: Float[np.ndarray, "n rows columns"],
 ) -> Expected:
     """Balls along the links, with masses that give torques of the recorded size; a small share of these is friction.
+
+    triangles: R of the equations of `of_all_joints`, of that many samples.
 
     Raises:
         ArgumentError: If the torque depends on no inertia, as at rest without gravity.
     """
-    factors, n = np.linalg.cholesky(_balls(*geometry.places)), data.nv
-    size = torque_size(triangles, len(data))
-    balls = coordinates(factors @ factors.swapaxes(1, 2)).ravel()
-    torque = np.linalg.norm(triangles[:, :, : 10 * n] @ balls, axis=1) / np.sqrt(len(data))
+    shapes, n = np.linalg.cholesky(_balls(*geometry.places)), len(triangles)
+    size = torque_size(triangles, samples)
+    balls = coordinates(shapes @ shapes.swapaxes(1, 2)).ravel()
+    torque = np.linalg.norm(triangles[:, :, : 10 * n] @ balls, axis=1) / np.sqrt(samples)
     if not torque.any():
-        raise ArgumentError(
-            f"the arm of {in_words(data, 'the data')} neither moves nor carries weight; record motions."
-        )
+        raise ArgumentError("the arm of the data neither moves nor carries weight; record motions.")
     scale = np.sqrt(n / np.square(torque / size).sum())
-    speed = np.sqrt(np.square(scalars.factors(data.v, data.a)).mean(axis=1))
+    speed = np.sqrt(np.square(factors).mean(axis=1))
     least = _STILL * speed.max(axis=-1, keepdims=True, initial=1e-9)
-    return Expected(np.sqrt(scale) * factors, (_FRICTION_SHARE * size / np.maximum(speed, least)).ravel())
+    return Expected(np.sqrt(scale) * shapes, (_FRICTION_SHARE * size / np.maximum(speed, least)).ravel())
 
 
 def torque_size(triangles: Float[np.ndarray, "n rows columns"], samples: int) -> JointArray:
     """Root mean square torque per joint [N·m], at least a millionth of the largest."""
     size = np.linalg.norm(triangles[:, :, -1], axis=1) / np.sqrt(samples)
     return np.maximum(size, 1e-6 * size.max())
-
-
-def _rows(geometry: Geometry, data: Dataset, scalars: Scalars) -> Iterator[np.ndarray]:
-    """Blocks (n, samples, unknowns + 1) of the equations, one per joint and sample, the torque last."""
-    n = data.nv
-    for begin in range(0, len(data), _CHUNK):
-        q, v, a, tau = (x[begin : begin + _CHUNK] for x in (data.q, data.v, data.a, data.tau))
-        own = np.einsum("ksj,ij->iskj", scalars.factors(v, a), np.eye(n)).reshape(n, len(q), -1)
-        yield np.concatenate([geometry.regressor(q, v, a).swapaxes(0, 1), own, tau.T[..., None]], axis=-1)
 
 
 def _balls(parents: Sequence[int], places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]:

@@ -36,7 +36,7 @@ class Measurements:
     scale: JointArray
     """Unit of the residuals [N·m]."""
     kinds: Float[np.ndarray, "kinds rows n"]
-    """Factors of the joints' scalar unknowns (`regressor.Scalars`): v, tanh(v/transition), v̇."""
+    """Factors of the numbers of the drives (`drive_terms`)."""
 
     def some(self, rows: np.ndarray) -> "Measurements":
         """The given rows."""

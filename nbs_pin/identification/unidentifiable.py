@@ -36,7 +36,7 @@ def unidentifiable(
     times that of the residuals at the data. Source: the Gauss–Newton covariance, docs/theory.md §6. Joints without
     `names` are numbered; the seed draws the other states.
     """
-    equations = Equations.of(Equation.fitted(network, friction, loss), _thinned(data))
+    equations = Equations.of(Equation.fitted(network, friction, loss), data.thinned(MOST_ROWS))
     theta, rows, n = equations.theta, torch.arange(len(equations)), data.nv
     matrix, _ = equations.normal(theta, rows)
     matrix.diagonal().add_(_PRIOR * float(matrix.diagonal().mean()))
@@ -50,11 +50,6 @@ def unidentifiable(
     scale = () if data.tau.any() else ("the torque's scale: without torque, a common factor of M, C and G is unknown",)
     left = sorted((x for x in found if x[0] > _WORTH_SAYING), reverse=True)
     return scale + tuple(f"{what}: {float(f'{x:.1g}'):,.0f} times less certain away from the data" for x, what in left)
-
-
-def _thinned(data: Dataset) -> Dataset:
-    """At most `MOST_ROWS` samples."""
-    return data.take(np.unique(np.linspace(0, len(data) - 1, MOST_ROWS).astype(int)))
 
 
 def _terms(equations: Equations, data: Dataset, seed: int) -> list[Float[torch.Tensor, "rows p"]]:

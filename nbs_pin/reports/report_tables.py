@@ -40,6 +40,7 @@ _PER_JOINT = {
         "rms_test_torque_error_Nm",
         "viscous_friction",
         "coulomb_friction_Nm",
+        "offset_Nm",
     ),
     "relative_error": ("torque_rms_Nm", "torque_deviation_Nm"),
     "covered_range_fraction": (

@@ -133,7 +133,8 @@ def motor_torque(model: DynamicsProvider, friction: JointFriction | None) -> Tor
     """The torque of the motors [N·m] for a motion (q, v, v̇), friction included."""
 
     def torque(q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        return np.asarray(inverse_dynamics(model, q, v, a) + (0.0 if friction is None else friction.torque(v)))
+        tau = inverse_dynamics(model, q, v, a)
+        return np.asarray(tau if friction is None else tau + friction.feedforward(v, tau))
 
     return torque
 

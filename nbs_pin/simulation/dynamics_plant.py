@@ -95,7 +95,7 @@ class DynamicsPlant(Plant):
         duration = _DURATION(duration)
 
         def acceleration(q: Array, v: Array) -> Array:
-            net = tau if friction is None else tau - friction.torque(v)
+            net = tau if friction is None else tau - friction.torque(v, tau)
             return dynamics.forward_dynamics(q, v, net)
 
         far = (

@@ -15,7 +15,7 @@ from nbs_pin.base.arrays import Matrices, Vectors, as_vectors, finite_result
 from nbs_pin.base.checks import all_finite
 from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
-from nbs_pin.dynamics.friction import FRICTION, JointFriction, friction_of_size
+from nbs_pin.dynamics.friction import FRICTION, JointFriction, friction_of_size, has_viscous_and_coulomb_only
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.simulation.massless import gather_joints
 from nbs_pin.simulation.plant import Plant
@@ -84,6 +84,11 @@ class MujocoPlant(Plant):
         integrator = integrator or ("rk4" if is_dropped else "implicitfast")
         if isinstance(joint_friction, JointFriction):
             friction_of_size(joint_friction, robot.nv)
+            if not has_viscous_and_coulomb_only(joint_friction):
+                raise ArgumentError(
+                    f"joint_friction is a {type(joint_friction).__name__}, and MuJoCo's joints have viscous and "
+                    "Coulomb friction only; give a JointFriction of these, or simulate a DynamicsPlant."
+                )
         mujoco.set_mju_user_warning(_LOGGER.info)
         self._robot, self._nv = robot, robot.nv
         self.integrator = integrator

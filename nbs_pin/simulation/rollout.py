@@ -16,6 +16,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.dynamics.friction import has_viscous_and_coulomb_only
 from nbs_pin.kernels.layout import IntegratorCode, Packed, known
 from nbs_pin.kernels.rollouts import Course, Rollout, Scene, rollout, rollout_adjoint, rollout_workspace
 from nbs_pin.kernels.threads import over_cores
@@ -188,6 +189,8 @@ def _scene(controller: Controller, loop: Loop) -> Scene | None:
     """Constants of the loop for the kernels, or None if one of its parts has no kernel."""
     plant = loop.plant
     if type(plant) is not DynamicsPlant or not controller.packable:
+        return None
+    if not has_viscous_and_coulomb_only(plant.friction):
         return None
     truth = plant.dynamics.packed_tree()
     belief = controller.dynamics.packed_tree() if isinstance(controller, ModelLaw) else truth

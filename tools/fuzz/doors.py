@@ -190,6 +190,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "IdentifiedDynamics.write_urdf": {"path": s.folder / "written.urdf"},
         "LagrangianDynamics": {"network": s.learned.network},
         "ResidualDynamics": {"network": s.residual.network},
+        "DriveFriction": {"viscous": Z, "coulomb": Z, "transition": 0.01, "offset": 0.1},
         "JointFriction": {"viscous": Z, "coulomb": Z, "transition": 0.01},
         "PD": {"feedforward": "gravity"},
         "PID": {"kp": np.ones(2), "effort_limit": 50.0, "continuous": np.zeros(2, bool)},

@@ -1,0 +1,199 @@
+"""Drives: friction, offsets and rotors beside the bodies, chosen by what data show and solved beside every model."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, strategies as st
+from numpy.testing import assert_allclose
+
+import nbs_pin as nbs
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
+from nbs_pin.identification.drive_choice import Wanted, terms_of_rest
+from nbs_pin.identification.drive_terms import TERMS, DriveTerms
+from nbs_pin.identification.fit_report import torque_errors, torque_nmse
+from nbs_pin.identification.remainder import EFFECTS, next_try, remainder
+
+UR5, TWO = nbs.load_robot("ur5"), nbs.load_robot("two_link")
+REAL = nbs.Noise(encoder=2**-16, torque=0.2)
+DRIVES = nbs.DriveFriction(
+    [8.0, 6.0, 0.0, 1.0, 0.0, 0.0],
+    [5.0, 4.0, 3.0, 0.0, 0.0, 0.0],
+    offset=[0.0, 0.0, 1.5, 0.0, 0.8, 0.0],
+    stribeck=[6.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    stribeck_speed=0.2,
+    load=[0.0, 0.15, 0.0, 0.0, 0.0, 0.0],
+)
+
+
+@cache
+def moved(robot, samples=600, seed=3, **options):
+    return nbs.collect(robot, "excited", samples, seed, **options)
+
+
+def driven(data, drives, rotors=0.0):
+    """The same motions with the torques of an arm with these drives."""
+    needed = data.tau
+    return replace(data, tau=needed + drives.feedforward(data.v, needed) + rotors * data.a)
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.lists(st.floats(-50.0, 50.0), min_size=6, max_size=6))
+def test_friction_of_a_torque_is_what_that_torque_was_given_for_it(v, needed):
+    v, needed = np.array(v), np.array(needed)
+    fed = DRIVES.feedforward(v, needed)
+    assert_allclose(DRIVES.torque(v, needed + fed), fed, atol=1e-10 + 1e-12 * np.abs(needed).max())
+    bare = replace(DRIVES, load=np.zeros(6))
+    assert_allclose(bare.torque(v), bare.feedforward(v, needed), atol=1e-12)
+    both = DRIVES.feedforward(torch.from_numpy(v), torch.from_numpy(needed))
+    assert_allclose(both.numpy(), fed, atol=1e-12)
+
+
+def test_factors_are_the_derivatives_of_friction():
+    data, rng = moved(UR5).take(slice(60)), np.random.default_rng(0)
+    names = TERMS[:-1]
+    terms = replace(DriveTerms.of(6, *names, transition=0.05), stribeck_speed=rng.uniform(0.1, 0.4, 6))
+    numbers = rng.uniform(0.1, 0.5, (len(names), 6))
+    friction = terms.friction(numbers)
+    total = np.einsum("kj,ksj->sj", numbers, terms.factors(data, data.tau))
+    assert_allclose(friction.feedforward(data.v, data.tau), total, rtol=1e-12, atol=1e-12)
+    again, same = DriveTerms.of_friction(friction)
+    assert again.kinds == names
+    assert_allclose(same, numbers)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """Motions of ur5 with these drives, rotors and noise, and fresh ones without noise."""
+    data = moved(UR5, 1_500, noise=REAL, duration=3.0)
+    return driven(data, DRIVES, 0.4), driven(moved(UR5), DRIVES, 0.4)
+
+
+def test_each_joint_gets_the_terms_that_it_has(noisy):
+    data, fresh = noisy
+    model = nbs.identify(data, UR5)
+    found = model.friction
+    assert_allclose(found.offset, DRIVES.offset, atol=0.15)
+    assert (found.stribeck[1:] == 0.0).all()
+    assert found.stribeck[0] > 3.0
+    assert_allclose(found.load, DRIVES.load, atol=0.04)
+    assert (found.asymmetry == 0.0).all()
+    assert_allclose(found.viscous, DRIVES.viscous, atol=0.5)
+    plain = nbs.identify(data, UR5, friction=True, offset=False)
+    ours, theirs = (torque_nmse(m, fresh, m.friction) for m in (model, plain))
+    assert ours < 0.3 * theirs
+    assert ours < 2e-3
+
+
+@pytest.mark.parametrize("robot", [TWO, UR5], ids=["two_link", "ur5"])
+def test_drives_that_are_not_there_are_not_found(robot):
+    clean = nbs.identify(moved(robot), robot)
+    assert clean.friction is None
+    assert not clean.rotor_inertia.any()
+    found = nbs.identify(moved(robot, noise=REAL), robot).friction
+    most = 0.02 * np.abs(moved(robot).tau).max(axis=0) + 0.1 * REAL.torque
+    assert found is None or (np.abs(found.torque(np.ones(robot.nv))) < most).all()
+
+
+def test_spikes_cost_little_and_are_counted(noisy):
+    data, fresh = noisy
+    rng = np.random.default_rng(1)
+    hit = rng.random(data.tau.shape) < 0.002
+    spiked = replace(data, tau=data.tau + 500.0 * hit * rng.choice([-1.0, 1.0], hit.shape))
+    clean, found = (nbs.identify(x, UR5, friction=True) for x in (data, spiked))
+    assert found.report.outliers >= 0.9 * hit.sum()
+    assert torque_nmse(found, fresh, found.friction) < 1.1 * torque_nmse(clean, fresh, clean.friction)
+
+
+def test_a_network_is_never_worse_than_the_arm_with_friction(noisy):
+    """An arm that is wrong by half in its masses; blocks held out that resemble the others little."""
+    data, _ = noisy
+    train, test = data.split(0.3, 1)
+    nominal = nbs.PinocchioDynamics(UR5)
+    left = train.tau - nominal.reference_torque(train.q, train.v, train.v, train.a)
+    terms, numbers = terms_of_rest(Wanted(rotor_inertia=False), train, left)
+    start = torque_nmse(nominal, test, terms.friction(numbers))
+    for iterations in (1, 3):
+        model = nbs.fit(train, "residual", robot=UR5, held_out=test, iterations=iterations, widths=(4,))
+        assert model.report.test_nmse <= 1.02 * start
+        assert model.report.held_out[0] >= min(model.report.held_out)
+
+
+def test_a_network_that_learns_nothing_says_so():
+    data = moved(TWO, 200, noise=nbs.Noise(torque=1.0))
+    told = nbs.fit(data, "residual", robot=TWO, widths=(4,), iterations=3).report
+    assert (told.stopped == "no better than the start") == (min(told.held_out) == told.held_out[0])
+
+
+@pytest.mark.parametrize(
+    ("effect", "argument", "change"),
+    [
+        ("constant", "offset", lambda data: 0.0 * data.v + 3.0),
+        ("v", "friction", lambda data: 4.0 * data.v),
+        ("sign v", "friction", lambda data: 3.0 * np.tanh(data.v / 0.01)),
+        ("a", "rotor_inertia", lambda data: 0.5 * data.a),
+    ],
+)
+def test_what_is_left_out_is_named(effect, argument, change):
+    data, nominal = moved(TWO), nbs.PinocchioDynamics(TWO)
+    found = remainder(nominal, replace(data, tau=data.tau + change(data) * [0.0, 1.0]), None)
+    gains = dict(zip(EFFECTS, found.gains, strict=True))
+    assert max(gains, key=gains.get) == effect
+    assert gains[effect] == pytest.approx(1.0, abs=1e-9)
+    said = next_try(found, TWO.joint_names, {argument: False})
+    assert "joint2" in said
+    assert "joint1" not in said
+    assert f"leave out {argument}=False" in said
+    assert "behaves otherwise" in next_try(found, TWO.joint_names, {argument: None})
+
+
+def test_a_delay_is_named_with_its_time():
+    data = moved(TWO)
+    late = [np.roll(data.tau[data.trajectory == k], 3, axis=0) for k in np.unique(data.trajectory)]
+    found = remainder(nbs.PinocchioDynamics(TWO), replace(data, tau=np.concatenate(late)), None)
+    step = float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0]))
+    said = next_try(found, TWO.joint_names, {})
+    assert f"{3 * step:.3g} s earlier" in said
+    assert next_try(remainder(nbs.PinocchioDynamics(TWO), data, None), TWO.joint_names, {}) == ""
+
+
+def test_laws_feed_drives_forward_and_plants_have_them():
+    drives = nbs.DriveFriction([0.5, 0.2], [1.0, 0.5], 0.1, offset=[0.3, -0.2], stribeck=[0.4, 0.0], load=[0.1, 0.05])
+    plant = nbs.DynamicsPlant(nbs.PinocchioDynamics(TWO), friction=drives)
+    motion = nbs.Sinusoid.for_robot(TWO)
+    worst = []
+    for friction in (drives, nbs.JointFriction(drives.viscous, drives.coulomb, 0.1)):
+        law = nbs.NeuralBackstepping.for_robot(TWO, friction=friction)
+        assert law.compile() is law or type(friction) is nbs.JointFriction
+        run = nbs.simulate(plant, law, motion, duration=1.0, period=0.002)
+        worst.append(np.abs(run.q - run.q_ref)[250:].max())
+    assert worst[0] < 0.01 * worst[1]
+    law = nbs.NeuralBackstepping.for_robot(TWO, friction=drives)
+    with pytest.raises(CertificateRefused, match="viscous and Coulomb friction"):
+        nbs.certify(law, 1.0, robot=TWO)
+    with pytest.raises(ArgumentError, match="viscous and Coulomb friction only"):
+        nbs.MujocoPlant(TWO, joint_friction=drives)
+
+
+def test_a_model_with_drives_is_stored_whole(tmp_path, noisy):
+    model = nbs.identify(noisy[0], UR5)
+    nbs.save(model, tmp_path / "model.nbs")
+    again = nbs.load(tmp_path / "model.nbs")
+    fresh = noisy[1]
+    assert_allclose(torque_errors(again, fresh, again.friction), torque_errors(model, fresh, model.friction))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"offset": [1.0]}, "offset of the friction"),
+        ({"load": 1.0}, "shares below 1"),
+        ({"stribeck": -0.1}, "stribeck of the friction"),
+        ({"stribeck_speed": 0.0}, "speeds > 0"),
+        ({"asymmetry": np.nan}, "asymmetry"),
+    ],
+)
+def test_what_no_drive_has_is_refused(change, words):
+    with pytest.raises(ArgumentError, match=words):
+        nbs.DriveFriction([0.1, 0.1], [0.2, 0.1], **change)
