@@ -334,6 +334,48 @@ def test_bags_of_ros_are_read_joints_by_name(tmp_path, storage):
         nbs.load_log(tmp_path / "x.mcap")
 
 
+def test_signals_in_files_of_their_own_are_put_together(tmp_path):
+    """One number a line, too."""
+    c = measured()
+    np.savetxt(tmp_path / "time.txt", c["t"])
+    np.savetxt(tmp_path / "angles.txt", c["q"], header="angles of the arm\na b c d e f")
+    np.savetxt(tmp_path / "load.txt", c["tau"].ravel())
+    files, chosen = (
+        [tmp_path / f"{name}.txt" for name in ("time", "angles", "load")],
+        {"q": "angles.txt", "tau": "load.txt"},
+    )
+    data = nbs.load_log(files, robot=ARM, columns=chosen | {"t": "time.txt:1"}, lowpass=0)
+    plain, _ = read(tmp_path, {name: c[name] for name in ("t", "q", "tau")}, lowpass=0)
+    for name in ("q", "v", "a", "tau"):
+        assert_allclose(getattr(data, name), getattr(plain, name), rtol=1e-9, atol=1e-9)
+    with pytest.raises(FileFormatError, match=r"angles\.txt:1-5: 5 columns of q|load.txt: .* match them"):
+        nbs.load_log(files, columns=chosen | {"t": "time.txt:1", "q": "angles.txt:1-5"})
+    with pytest.raises(ArgumentError, match="columns names no t; log t, q and tau"):
+        nbs.load_log(files, columns=chosen)
+
+
+def test_single_states_need_no_time_but_all_derivatives(tmp_path):
+    _, q, v, a, tau = motion()
+    some = np.random.default_rng(3).permutation(len(q))[:300]
+    np.savez(tmp_path / "states.npz", q=q[some], v=v[some], a=a[some], tau=tau[some])
+    data = nbs.load_log(tmp_path / "states.npz", robot=ARM, rate=0)
+    assert_array_equal(data.q, q[some])
+    assert data.trajectories == len(data) == 300
+    with pytest.raises(FileFormatError, match="rows without times need v and a"):
+        nbs.load_log(tmp_path / "states.npz", robot=ARM, rate=0, columns={"a": "-"})
+
+
+def test_rows_in_which_something_is_missing_are_left_out(tmp_path):
+    c = measured()
+    clean, _ = read(tmp_path, c, lowpass=0)
+    holes = {name: x.copy() for name, x in c.items()}
+    holes["tau"][77, 3] = holes["q"][500:503, 0] = np.nan
+    data, said = read(tmp_path, holes, lowpass=0)
+    assert len(said) == 2
+    assert "4 rows with entries that are missing were left out, first row 78" in said[0]
+    assert_allclose(data.q, clean.q, atol=1e-3)
+
+
 # In the shell.
 
 

@@ -49,7 +49,7 @@ def read_cells(path: Path) -> list[list[str]]:
                 data = packed.read(LARGEST // 8 + 1)
             if len(data) > LARGEST // 8:
                 raise too_large
-        text = data.decode("utf-8-sig")
+        text = _without_remarks(data.decode("utf-8-sig"))
         first = text.partition("\n")[0]
         mark = next((mark for mark in _SEPARATORS if mark in first), "")
         if not mark and len(first.split()) > 1:
@@ -68,7 +68,6 @@ def header_of(cells: Sequence[str]) -> list[str]:
     if cells and all(_is_number(cell) for cell in cells if cell.strip()):
         return []
     header = [name.strip() for name in cells]
-    header[:1] = [name.lstrip("#% ") for name in header[:1]]
     return header[:-1] if header[-1:] == [""] else header  # of a comma at the end of the line
 
 
@@ -90,14 +89,17 @@ def read_csv(path: Path, wanted: Sequence[str] = ("t",)) -> tuple[list[str], Flo
 
 
 def numbers_in(
-    path: Path, header: Sequence[str], lines: Sequence[list[str]], columns: Sequence[int]
+    path: Path, header: Sequence[str], lines: Sequence[list[str]], columns: Sequence[int], blanks: bool = False
 ) -> Float[np.ndarray, "rows columns"]:
-    """The numbers in some columns of a table below its header; raises FileFormatError as `read_csv` does."""
+    """The numbers in some columns of a table below its header; raises FileFormatError as `read_csv` does.
+
+    With `blanks`, empty cells are NaN.
+    """
     if not lines:
         raise FileFormatError(f"{path}: no rows of numbers below the header, expected at least 4; record more.")
     table = np.empty((len(lines), len(columns)))
     for row, cells in enumerate(lines):
-        table[row] = _numbers(path, row + 1, cells, header, columns)
+        table[row] = _numbers(path, row + 1, cells, header, columns, blanks)
     return table
 
 
@@ -165,6 +167,15 @@ def joint_order(path: Path, found: Sequence[str], joint_names: Sequence[str] | N
     return [found.index(name) for name in names]
 
 
+def _without_remarks(text: str) -> str:
+    """The text from its header on, which may be the last line of remarks before numbers, without its mark."""
+    first, _, rest = text.partition("\n")
+    while first[:1] in ("#", "%") and rest and header_of(re.split(r"[,;|\s]+", rest.partition("\n")[0])):
+        text = rest
+        first, _, rest = text.partition("\n")
+    return re.sub(r"\A[#%]\s*", "", text)
+
+
 def _from_one(columns: dict[str, int]) -> dict[str, int]:
     """Joints that are numbered from 0, numbered from 1."""
     if sorted(columns) != sorted(str(k) for k in range(len(columns))):
@@ -180,14 +191,16 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _numbers(path: Path, row: int, cells: list[str], header: Sequence[str], columns: Sequence[int]) -> list[float]:
+def _numbers(
+    path: Path, row: int, cells: list[str], header: Sequence[str], columns: Sequence[int], blanks: bool
+) -> list[float]:
     if len(cells) == len(header) + 1 and not cells[-1].strip():
         cells = cells[:-1]  # a comma at the end of the line
     if len(cells) != len(header):
         raise FileFormatError(f"{path}: row {row} has {len(cells)} values, expected {len(header)}; complete it.")
     numbers = []
     for k in columns:
-        cell = cells[k]
+        cell = "nan" if blanks and not cells[k].strip() else cells[k]
         try:
             # float() also accepts '1_0' and non-ASCII digits, which no instrument writes.
             numbers.append(float(cell if cell.isascii() and "_" not in cell else ""))

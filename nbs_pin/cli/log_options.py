@@ -48,11 +48,12 @@ class LogOptions(FileUnits):
     """How a log is read, where it is not t [s], q [rad] and tau [N·m] under these names."""
 
     columns: Annotated[str | None, column_names(), default("their usual names")] = None
-    """What the file calls t, q, v, a, tau and trajectory: a name, one with * for the joints, or numbers from 1."""
+    """What the file calls t, q, v, a, tau and trajectory: a name, one with * for the joints, or numbers from 1; - for
+    none. Signals in files of their own: t=time.txt:1,q=angles.txt:1-6,tau=load.txt:1-6."""
     rate: Annotated[
-        float | None, number("--rate", above=0.0, most=1e6, unit="Hz"), default("the times in the file")
+        float | None, number("--rate", least=0.0, most=1e6, unit="Hz"), default("the times in the file")
     ] = None
-    """Rows per second of a log without times [Hz]."""
+    """Rows per second of a log without times [Hz]; 0 if its rows are single states in no order."""
     trajectories: Annotated[str | None, whole_numbers("--trajectories"), default("all")] = None
     """Numbers of the trajectories to read."""
     torque_gain: Annotated[
@@ -85,8 +86,7 @@ class LogOptions(FileUnits):
         found: dict[str, Any] = {
             name: getattr(self, name) for name in ("rate", "resample", "lowpass", "window") if getattr(self, name)
         }
-        if self.lowpass == 0.0:
-            found["lowpass"] = 0.0
+        found |= {name: 0.0 for name in ("lowpass", "rate") if getattr(self, name) == 0.0}
         if self.columns is not None:
             found["columns"] = dict(part.split("=") for part in self.columns.split(","))
         if self.trajectories is not None:

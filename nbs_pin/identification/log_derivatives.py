@@ -9,7 +9,7 @@ from jaxtyping import Float
 from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import FileFormatError
 from nbs_pin.identification.datasets import Dataset, trajectory_slices
-from nbs_pin.identification.log_files import Columns
+from nbs_pin.identification.log_files import NOT_READ, Columns
 from nbs_pin.identification.measurement import ORDER, derivative
 from nbs_pin.identification.resampling import WINDOW, Even, lowpassed
 
@@ -92,7 +92,7 @@ def check_derivatives(path: Path, data: Dataset) -> None:
                 )
             said = stated[:, joint]
             if not said.any():
-                raise FileFormatError(f"{at} is 0 in every row while {of} changes; log it, or leave {name} out.")
+                raise FileFormatError(f"{at} is 0 in every row while {of} changes; log it, or {_without(name)}.")
             ratio = float(change[:, joint] @ said / (said @ said))
             raise FileFormatError(
                 f"{at} is not the derivative of {of}, which changes {ratio:.3g} times as much as {name} states; "
@@ -120,7 +120,12 @@ def _remedy(ratio: float, name: str, of: str) -> str:
     known = {np.pi / 180.0: f"convert {name} from degrees", 180.0 / np.pi: f"convert {of} from degrees"}
     known[-1.0] = f"one of their signs is wrong, so correct {name}"
     near = [remedy for factor, remedy in known.items() if abs(ratio / factor - 1.0) < 0.1]
-    return near[0] if near else f"correct its unit or the order of the columns, or leave {name} out"
+    return near[0] if near else f"correct its unit or the order of the columns, or {_without(name)}"
+
+
+def _without(name: str) -> str:
+    """How the reader leaves a quantity out."""
+    return f"leave {name} out with {option('columns', {name: NOT_READ})}"
 
 
 def _rms(x: np.ndarray) -> np.ndarray:

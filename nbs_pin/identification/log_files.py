@@ -25,6 +25,8 @@ from nbs_pin.base.npz import LARGEST
 _NEEDED = "log t, q and tau (and v and a if known)"
 CHOSEN = ("t", "trajectory", *QUANTITIES, "topic")
 """What columns can be named for."""
+NOT_READ = "-"
+"""What stands for no column."""
 _KINDS = {".csv", ".txt", ".dat", ".tsv"}
 """Ends of the names of tables in text."""
 
@@ -53,12 +55,14 @@ class Table(NamedTuple):
     cells: list[list[str]]
     """Rows of text, empty if it has `numbers`."""
     numbers: np.ndarray | None = None
+    named: bool = True
+    """Whether it has a header."""
 
     def of(self, path: Path, columns: Sequence[int]) -> Float[np.ndarray, "rows columns"]:
         """The numbers in some columns."""
         if self.numbers is not None:
             return np.asarray(self.numbers[:, list(columns)], dtype=float)
-        return numbers_in(path, self.header, self.cells, columns)
+        return numbers_in(path, self.header, self.cells, columns, blanks=True)
 
 
 def is_table(path: Path) -> bool:
@@ -71,20 +75,67 @@ def columns_of_table(
     path: Path, joint_names: Sequence[str] | None, chosen: Mapping[str, str], rate: float | None
 ) -> tuple[Columns, tuple[str, ...]]:
     """The columns of a text file (see `load_log`), joints in the order of `joint_names`, and a note on the others."""
+    table = _table(path)
+    if not table.named and not chosen:
+        raise FileFormatError(
+            f"{path}: the first line has {len(table.header)} numbers in place of a header; give "
+            f"{option('columns', {'t': '1', 'q': '2-7', 'tau': '8-13'})}, with the numbers of its columns."
+        )
+    return _of_table(path, table, joint_names, chosen, rate)
+
+
+def _table(path: Path) -> Table:
+    """The table in a text file."""
     lines = read_cells(path)
-    header = header_of(lines[0]) if lines else []
+    if not lines:
+        raise FileFormatError(f"{path}: no lines, expected a header and rows of numbers; record more.")
+    header = header_of(lines[0])
     if not header:
-        many = len(lines[0]) if lines else 0
-        if not chosen:
-            raise FileFormatError(
-                f"{path}: the first line has {many} numbers in place of a header; give "
-                f"{option('columns', {'t': '1', 'q': '2-7', 'tau': '8-13'})}, with the numbers of its columns."
-            )
-        return _of_table(path, Table([str(k + 1) for k in range(many)], lines), joint_names, chosen, rate)
+        return Table([str(k + 1) for k in range(len(lines[0]))], lines, named=False)
     if len(set(header)) != len(header):
         twice = next(name for name in header if header.count(name) > 1)
         raise FileFormatError(f"{path}: the header has '{twice}' twice, expected each name once; rename one.")
-    return _of_table(path, Table(header, lines[1:]), joint_names, chosen, rate)
+    return Table(header, lines[1:])
+
+
+def columns_of_files(
+    files: Sequence[Path], joint_names: Sequence[str] | None, chosen: Mapping[str, str], rate: float | None
+) -> Columns:
+    """The columns of signals in text files of their own, chosen as FILE:COLUMNS, or FILE for all of its columns.
+
+    A file with one number a line has those of a row in as many lines.
+    """
+    known, arrays = {file.name: file for file in files}, {}
+    for kind, spec in chosen.items():
+        name, _, part = spec.partition(":")
+        if name not in known:
+            raise ArgumentError(f"columns has {kind}={spec}, and the files are {', '.join(known)}; give one of these.")
+        table = _table(known[name])
+        picked = (
+            _picked(known[name], table.header, kind, {kind: part})
+            if part
+            else {name: k for k, name in enumerate(table.header)}
+        )
+        arrays[kind] = table.of(known[name], list(picked.values()))
+    for kind in ("t", "trajectory"):
+        if kind in arrays:
+            arrays[kind] = arrays[kind].ravel()
+    absent = [kind for kind in ("t", "q", "tau") if kind not in arrays and (kind != "t" or rate is None)]
+    if absent:
+        raise ArgumentError(f"columns names no {absent[0]}; {_NEEDED}, each as FILE:COLUMNS.")
+    rows = len(arrays["t"]) if "t" in arrays else min(len(arrays[kind]) for kind in arrays)
+    for kind, x in arrays.items():
+        if kind in QUANTITIES and x.shape[1] == 1 and len(x) > rows and len(x) % rows == 0:
+            arrays[kind] = x.reshape(rows, -1)
+        elif len(x) != rows:
+            raise FileFormatError(f"{chosen[kind]}: {len(x)} rows, expected {rows} as in the others; match them.")
+    found = [str(k + 1) for k in range(arrays["q"].shape[1])]
+    wrong = [kind for kind in QUANTITIES if kind in arrays and arrays[kind].shape[1] != len(found)]
+    if wrong:
+        raise FileFormatError(
+            f"{chosen[wrong[0]]}: {arrays[wrong[0]].shape[1]} columns of {wrong[0]}, and {len(found)} of q; match them."
+        )
+    return _columns(files[0], arrays, found, joint_names, rate)
 
 
 def _of_table(
@@ -109,7 +160,8 @@ def _of_table(
     if time is None and rate is None:
         raise FileFormatError(
             f"{path}: no column 't' of times among {', '.join(header)}, expected one; name it with "
-            f"{option('columns', {'t': 'NAME'})}, or give {option('rate', BLANK)} in Hz if the rows are evenly spaced."
+            f"{option('columns', {'t': 'NAME'})}, or give {option('rate', BLANK)} in Hz if rows are evenly spaced, or "
+            "0 if they are single states."
         )
     numbers = next(iter(_picked(path, header, "trajectory", chosen).values()), None)
     places = used | {name: [k] for name, k in (("t", time), ("trajectory", numbers)) if k is not None}
@@ -123,6 +175,8 @@ def _of_table(
 
 def _picked(path: Path, header: list[str], kind: str, chosen: Mapping[str, str]) -> dict[str, int]:
     """The columns of a quantity by the names of the joints: those chosen, or those called as usual."""
+    if chosen.get(kind) == NOT_READ:
+        return {}
     if kind not in chosen:
         return (
             joint_columns(header, kind) if kind in QUANTITIES else {kind: header.index(kind)} if kind in header else {}
@@ -171,11 +225,12 @@ def columns_of_arrays(
         table = Table([str(k + 1) for k in range(matrix.shape[1])], [], matrix)
         return _of_table(path, table, joint_names, chosen, rate)
     for kind, name in chosen.items():
-        if name not in stored:
+        if name not in stored and name != NOT_READ:
             raise ArgumentError(f"columns has {kind}={name}, and {path} {', '.join(stored)}; correct the name.")
     arrays = {kind: stored[ROS_NAMES[kind]] for kind in QUANTITIES if ROS_NAMES[kind] in stored}
     arrays |= {name: stored[name] for name in CHOSEN if name in stored}
-    arrays |= {kind: stored[name] for kind, name in chosen.items()}
+    arrays |= {kind: stored[name] for kind, name in chosen.items() if name != NOT_READ}
+    arrays = {kind: x for kind, x in arrays.items() if chosen.get(kind) != NOT_READ}
     if "t" not in arrays and "time" in stored:
         arrays["t"] = stored["time"]
     absent = [name for name in ("t", "q", "tau") if name not in arrays and (name != "t" or rate is None)]
@@ -244,12 +299,15 @@ def _columns(
 ) -> Columns:
     """The columns with joints in the requested order and trajectories numbered."""
     order, rows = joint_order(path, found, joint_names), len(arrays["q"])
-    numbers = arrays.get("trajectory", np.zeros(rows))
+    single = rate == 0.0
+    if single and not {"v", "a"} <= arrays.keys():
+        raise FileFormatError(f"{path}: rows without times need v and a, which cannot be found from q; log them.")
+    numbers = np.arange(rows) if single else arrays.get("trajectory", np.zeros(rows))
     if not np.array_equal(numbers, np.round(numbers)):
         raise FileFormatError(f"{path}: 'trajectory' must hold a whole number in every row; number them 0, 1, 2, ….")
     given = {kind: arrays[kind].astype(float)[:, order] for kind in QUANTITIES if kind in arrays}
     return Columns(
-        t=arrays["t"].astype(float) if rate is None else np.arange(rows) / rate,
+        t=arrays["t"].astype(float) if rate is None else np.arange(rows) / (rate or np.inf),
         q=given["q"],
         tau=given["tau"],
         v=given.get("v"),

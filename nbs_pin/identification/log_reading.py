@@ -19,6 +19,7 @@ from nbs_pin.identification.log_files import (
     Columns,
     arrays_of_matlab,
     columns_of_arrays,
+    columns_of_files,
     columns_of_table,
     is_table,
 )
@@ -55,7 +56,11 @@ class LogSettings:
 def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings) -> Dataset:
     """The samples in the files; `about["notes"]` says what was put right. Errors are those of `load_log`."""
     path, chosen = files[0], _chosen(settings.columns)
-    read, notes = _joined([_read(file, robot, chosen, settings.rate) for file in files], files)
+    if any(spec.partition(":")[0] in {file.name for file in files} for spec in chosen.values()):
+        names = None if robot is None else robot.joint_names
+        read, notes = columns_of_files(files, names, chosen, settings.rate), list[str]()
+    else:
+        read, notes = _joined([_read(file, robot, chosen, settings.rate) for file in files], files)
     if settings.trajectories is not None:
         read = _only(path, read, settings.trajectories)
         notes.append("rows are counted in the trajectories that are read")
@@ -64,9 +69,11 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
     read = _in_units(path, _scaled(read, settings), joints, settings.degrees, settings.time_unit, robot)
     if settings.zero is not None:
         read = read._replace(q=read.q + settings.zero)
+    read, absent, blanks = _filled(read)
     _dataset(path, read._replace(v=read.q, a=read.q), tree, name, {})  # refuses what is no table of numbers
-    spacing = _spacing(read)
-    read, more = _put_right(path, read, joints, settings.degrees)
+    spacing, more = _spacing(read), list[str]()
+    if spacing["rows"] > len(np.unique(read.trajectory)):  # not of single states
+        read, more = _put_right(path, read, joints, settings.degrees, absent)
     read = _advanced(read, settings.delay) if settings.delay else read
     lowpass = 0.0 if settings.lowpass is None and settings.window is not None else settings.lowpass
     even = evenly(path, read, settings.resample, lowpass)
@@ -74,7 +81,7 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
     about = {
         "log": str(path),
         "read": spacing,
-        "notes": [*notes, *more, *even.notes],
+        "notes": [*notes, *blanks, *more, *even.notes],
         "lowpass_Hz": even.lowpass,
         "differentiated": [kind for kind in "va" if getattr(even.columns, kind) is None],
     }
@@ -156,8 +163,27 @@ def _spacing(columns: Columns) -> dict[str, Any]:
     return {"rows": len(columns.t), "steps_s": [float(f(known)) for f in (np.min, np.median, np.max)]}
 
 
-def _put_right(path: Path, columns: Columns, joints: Joints, degrees: bool | None) -> tuple[Columns, list[str]]:
-    """The columns without wraps and without what is wrong in single rows, and notes on it."""
+def _filled(columns: Columns) -> tuple[Columns, np.ndarray, list[str]]:
+    """The columns with NaN in q, v, a and tau bridged, which rows had some, and a note on them."""
+    found, absent, place = {}, np.zeros(len(columns.t), dtype=bool), np.arange(len(columns.t))
+    for name in ("q", "v", "a", "tau"):
+        x = getattr(columns, name)
+        if x is not None and np.isnan(x).any() and np.isfinite(columns.t).all():
+            blank = np.isnan(x).any(axis=1)
+            absent |= blank
+            if blank.all():
+                continue
+            found[name] = np.column_stack([np.interp(place, place[~blank], y[~blank]) for y in x.T])
+    if not absent.any() or absent.mean() > 0.5:
+        return columns, np.zeros(len(columns.t), dtype=bool), []
+    rows = f"{np.count_nonzero(absent)} rows with entries that are missing were left out"
+    return columns._replace(**found), absent, [f"{rows}, first row {int(np.argmax(absent)) + 1}"]
+
+
+def _put_right(
+    path: Path, columns: Columns, joints: Joints, degrees: bool | None, absent: Bool[np.ndarray, " rows"]
+) -> tuple[Columns, list[str]]:
+    """The columns without wraps, rows in which something is absent and what is wrong in single rows; notes on it."""
     found = repaired(columns, joints)
     columns, stretches = found.columns, trajectory_slices(found.columns.trajectory)
     turned, parted = unwrapped(columns.q, joints, stretches, degrees), parted_at_gaps(columns)
@@ -165,7 +191,7 @@ def _put_right(path: Path, columns: Columns, joints: Joints, degrees: bool | Non
     fault = turned.fault or seam_fault(columns.t, columns.q, joints, stretches)
     if fault:
         raise FileFormatError(f"{path}: {fault}.")
-    columns = columns._replace(trajectory=parted.numbers).take(found.fresh & parted.kept)
+    columns = columns._replace(trajectory=parted.numbers).take(found.fresh & parted.kept & ~absent)
     return columns, [*found.notes, *turned.notes, *([parted.note] if parted.note else [])]
 
 

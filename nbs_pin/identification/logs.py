@@ -41,7 +41,7 @@ def _files(name: str, value: Any) -> tuple[Any, ...]:
     path=_files,
     robot=maybe(ARM),
     columns=maybe(mapping),
-    rate=maybe(number(above=0.0, most=1e6, unit="Hz")),
+    rate=maybe(number(least=0.0, most=1e6, unit="Hz")),
     trajectories=maybe(many(count(), 1, 1_000_000, "numbers")),
     degrees=maybe(flag),
     time_unit=maybe(text),
@@ -88,8 +88,8 @@ def load_log(
     Args:
         path: The file or files.
         robot: Gives names, tree and ranges of the joints. None assumes a serial arm.
-        columns: Names in the file by t, q, v, a, tau, trajectory: {"q": "pos_*"}, * for the joint, or {"q": "2-7"}.
-        rate: Rows per second, for a log without times [Hz].
+        columns: Names in the file, as {"q": "pos_*"}, * for the joint, {"q": "2-7"} by number, {"v": "-"} to leave out.
+        rate: Rows per second, for a log without times [Hz]; 0 for single states in no order.
         trajectories: Numbers of the trajectories to read. None reads all.
         degrees: True converts angles, False takes them as radians, None refuses values that look like degrees.
         time_unit: The unit of t: "s", "ms", "us" or "ns". None takes seconds and refuses times that look otherwise.
