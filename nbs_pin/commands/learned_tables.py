@@ -10,39 +10,52 @@ from nbs_pin.base.units import column
 from nbs_pin.commands.results import table, tell
 from nbs_pin.reports.verdicts import verdict_of
 
+_WIDE = 4
+"""Columns of the drives in one table."""
+_HEADINGS = {
+    "constant": "const",
+    "sign v": "±v",
+    "√|v| sign v": "±√v",
+    "|τ| sign v": "±load",
+    "τ earlier or later": "delay",
+}
 _ENDED = {"held out": "no further progress on held-out data", "iterations": "all iterations done"}
 
 
 def print_learned(console: Console, title: str, figures: dict[str, Any], *, verbose: bool, interrupted: bool) -> None:
     """Print how good the model is, and a row per joint."""
-    test, viscous, of = figures["rms_test_torque_error_Nm"], figures["viscous_friction"], figures["units"]
-    none = ["none"] * len(figures["joints"])
-    coulomb = [f"{x:.3g}" for x in figures["coulomb_friction_Nm"] or ()] or none
-    columns = [
-        column("torque\ndeviation", [f"{x:.4g}" for x in figures["torque_deviation_Nm"]], of["torque"]),
-        column("error", [f"{x:.2e}" for x in figures["rms_torque_error_Nm"]], of["torque"]),
-        column("error, held\nout", none if test is None else [f"{x:.2e}" for x in test], of["torque"]),
-        column("viscous\nfriction", none if viscous is None else [f"{x:.3g}" for x in viscous], of["damping"]),
-        column("Coulomb\nfriction", coulomb, of["torque"]),
-    ]
-    columns += _drives(figures)
+    verdict = verdict_of(figures, interrupted=interrupted)
+    lines, tables = [*verdict.more, *_lines(figures)], [_errors(title, figures), *_drives(figures), *_left(figures)]
+    tell(console, f"{title}: {verdict.said}", lines, tables, verbose=verbose)
+
+
+def _per_joint(title: str, figures: dict[str, Any], columns: list[tuple[str, list[str]]]) -> Any:
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)
-    verdict = verdict_of(figures, interrupted=interrupted)
-    tell(
-        console,
-        f"{title}: {verdict.said}",
-        [*verdict.more, *_lines(figures)],
-        [shown, *_left(figures)],
-        verbose=verbose,
-    )
+    return shown
 
 
-def _drives(figures: dict[str, Any]) -> list[tuple[str, list[str]]]:
-    """Columns of what was found of the drives besides viscous and Coulomb friction."""
+def _errors(title: str, figures: dict[str, Any]) -> Any:
+    """How far the torque is off."""
+    test, of, left = figures["rms_test_torque_error_Nm"], figures["units"], figures["left"]
+    columns = [
+        column("torque\ndeviation", [f"{x:.4g}" for x in figures["torque_deviation_Nm"]], of["torque"]),
+        column("error", [f"{x:.2e}" for x in figures["rms_torque_error_Nm"]], of["torque"]),
+    ]
+    if test is not None:
+        columns.append(column("error, held\nout", [f"{x:.2e}" for x in test], of["torque"]))
+    if left:
+        columns.append(column("mean of\nit", [f"{x:+.1e}" for x in left["mean_Nm"]], of["torque"]))
+    return _per_joint(title, figures, columns)
+
+
+def _drives(figures: dict[str, Any]) -> list[Any]:
+    """What was found of the drives, in tables that a narrow terminal holds."""
     of = figures["units"]
     kinds = (
+        ("viscous_friction", "viscous\nfriction", of["damping"]),
+        ("coulomb_friction_Nm", "Coulomb\nfriction", of["torque"]),
         ("offset_Nm", "offset", of["torque"]),
         ("rotor_inertia", "rotor\ninertia", of["inertia"]),
         ("viscous_asymmetry", "viscous,\n± by sign", of["damping"]),
@@ -50,28 +63,24 @@ def _drives(figures: dict[str, Any]) -> list[tuple[str, list[str]]]:
         ("stribeck_speed", "Stribeck\nspeed", of["velocity"]),
     )
     found = [column(head, [f"{x:.3g}" for x in figures[name]], unit) for name, head, unit in kinds if figures.get(name)]
-    share = figures.get("load_friction_share")
-    return found + ([("friction\nover load", [f"{x:.1%}" for x in share])] if share else [])
+    if figures.get("load_friction_share"):
+        found.append(("friction\nover load", [f"{x:.1%}" for x in figures["load_friction_share"]]))
+    parts = [found[k : k + _WIDE] for k in range(0, len(found), _WIDE)]
+    return [_per_joint("drives" if k == 0 else "drives, continued", figures, part) for k, part in enumerate(parts)]
 
 
 def _left(figures: dict[str, Any]) -> list[Any]:
-    """The table of what is left of the torque, and of the share of that which single effects would explain."""
-    left, of = figures["left"], figures["units"]
+    """Of what is left of the torque, the share that single effects would explain."""
+    left = figures["left"]
     if not left:
         return []
-    headings = {"constant": "constant", "τ earlier or later": "delay"}
     columns = [
-        column("mean", [f"{x:+.2e}" for x in left["mean_Nm"]], of["torque"]),
-        ("share of\nvariance", ["—" if x is None else f"{x:.2e}" for x in left["nmse"]]),
-        *((headings.get(name, name), [f"{x:.0%}" for x in share]) for name, share in left["explained_by"].items()),
+        ("share of\nvariance", ["—" if x is None else f"{x:.1e}" for x in left["nmse"]]),
+        *((_HEADINGS.get(name, name), [f"{x:.0%}" for x in share]) for name, share in left["explained_by"].items()),
     ]
-    where = "on the data" if figures["test_nmse"] is None else "on held-out data"
-    shown = table(
-        f"what is left {where}, and the share of it that would be explained by", *(head for head, _ in columns)
-    )
-    for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
-        shown.add_row(Text(joint), *row)
-    return [shown]
+    where = "the data" if figures["test_nmse"] is None else "held-out data"
+    title = f"left of the torque on {where}: share of its variance, and of that left, by effect"
+    return [_per_joint(title, figures, columns)]
 
 
 def _lines(figures: dict[str, Any]) -> list[str]:

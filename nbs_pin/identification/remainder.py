@@ -19,7 +19,7 @@ _SIGN = 0.01
 """Speed within which sign v is smooth [rad/s]."""
 _SHIFTS = (-20, -10, -5, -3, -2, -1, 1, 2, 3, 5, 10, 20)
 """Samples by which the torque is shifted."""
-_LEFT, _MUCH = 0.002, 0.2
+_LEFT, _MUCH = 0.01, 0.2
 """Share of the torque's variance that is worth an explanation, and share of what is left that one effect explains."""
 _TRIES = {
     "constant": ("offset", "the torque of {joints} has an offset"),
