@@ -1,5 +1,6 @@
 """Drives: friction, offsets and rotors beside the bodies, chosen by what data show and solved beside every model."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -10,7 +11,7 @@ from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
 import nbs_pin as nbs
-from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
+from nbs_pin.base.exceptions import ArgumentError, CertificateRefused, RobotError
 from nbs_pin.identification.drive_choice import Wanted, terms_of_rest
 from nbs_pin.identification.drive_terms import TERMS, DriveTerms
 from nbs_pin.identification.fit_report import torque_errors, torque_nmse
@@ -197,3 +198,28 @@ def test_a_model_with_drives_is_stored_whole(tmp_path, noisy):
 def test_what_no_drive_has_is_refused(change, words):
     with pytest.raises(ArgumentError, match=words):
         nbs.DriveFriction([0.1, 0.1], [0.2, 0.1], **change)
+
+
+SPECK = '<mass value="1e-9"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'
+
+
+@pytest.mark.parametrize("inertial", ["", f"<inertial>{SPECK}</inertial>"], ids=["none", "rounded"])
+def test_bodies_are_learned_where_the_file_has_geometry_alone(tmp_path, inertial):
+    xml = TWO.urdf.xml.decode()
+    bare = re.sub(r"<inertial>.*?</inertial>", inertial, xml, flags=re.DOTALL)
+    assert bare != xml
+    path = tmp_path / "two_link.urdf"
+    path.write_text(bare)
+    with pytest.raises(RobotError, match=r"or learn all bodies from a log \(inertia_from='links'\)"):
+        nbs.load_robot(path)
+    with pytest.warns(UserWarning, match="balls of 1 kg"):
+        robot = nbs.load_robot(path, inertia_from="links", gravity=9.8)
+    data = replace(moved(TWO), about={})
+    model = nbs.fit(data, "identified", robot=robot)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (20, 2))
+    assert_allclose(model.mass_matrix(q), nbs.PinocchioDynamics(TWO).mass_matrix(q), atol=1e-8)
+    assert model.report.details["stated_mass_kg"] is None
+    with pytest.raises(ArgumentError, match="only the geometry was taken"):
+        nbs.fit(data, "residual", robot=robot)
+    again = nbs.load_robot(model.write_urdf(tmp_path / "learned.urdf"), gravity=9.8)
+    assert_allclose(nbs.PinocchioDynamics(again).mass_matrix(q), model.mass_matrix(q), atol=1e-8)

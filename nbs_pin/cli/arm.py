@@ -138,8 +138,9 @@ class ArmOptions:
     repeated."""
     repair: bool = False
     """Take the nearest inertia of a rigid body where the file states one that no body has."""
-    inertia_from: Literal["file", "shapes"] = "file"
-    """Inertia of bodies without mass: shapes fills their shapes with 1000 kg/m³, a guess."""
+    inertia_from: Literal["file", "shapes", "links"] = "file"
+    """Inertia of bodies without mass: shapes fills their shapes with 1000 kg/m³, a guess. links takes the geometry of
+    the file alone, with balls for bodies that are to be learned."""
     arg: tyro.conf.UseAppendAction[tuple[Annotated[str, text("NAME:=VALUE", _checked(_read_argument))], ...]] = ()
     """Argument of a .xacro file; may be given several times."""
     package_dir: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="DIR")] = ()

@@ -105,9 +105,6 @@ def _short(value: float | None) -> str:
 def _masses(details: dict[str, Any]) -> list[str]:
     """The mass that was found beside that of the URDF, and outliers."""
     found, stated, outliers = (details.get(name) for name in ("mass_kg", "stated_mass_kg", "outliers"))
-    mass = (
-        [f"mass {found:.3g} kg, {stated:.3g} kg in the URDF; of it the base and parallel axes show little"]
-        if found
-        else []
-    )
+    beside = "" if stated is None else f", {stated:.3g} kg in the URDF"
+    mass = [f"mass {found:.3g} kg{beside}; of it, torques do not show what the base carries"] if found else []
     return mass + ([f"{outliers} torques are far from all others, and count little"] if outliers else [])

@@ -33,7 +33,7 @@ def run(options: Log, console: Console, notes: Console) -> None:
         with warnings.catch_warnings(record=True) as said:  # printed below, in order
             warnings.simplefilter("always")
             data = load_log(options.data[0] if len(options.data) == 1 else options.data, robot=robot, **options.read())
-        found = None if robot is None else log_doubts(data, robot)
+        found = None if robot is None or not robot.has_bodies else log_doubts(data, robot)
     prefix = f"{options.data[0]}: "
     lines = [str(warning.message).removeprefix(prefix) for warning in said]
     tell(console, _verdict(options, data), [*_facts(data, found), *lines], [_joints(data, robot, found)],

@@ -37,7 +37,7 @@ def doubts(
     """
     some = data.take(np.sort(np.random.default_rng(0).permutation(len(data))[:_SOME]))
     found = (
-        "" if robot is None or data.about.get("doubts") else _unit(some, robot),
+        "" if robot is None or not robot.has_bodies or data.about.get("doubts") else _unit(some, robot),
         _missing(model, some, friction, asked),
     )
     return tuple(text for text in found if text)

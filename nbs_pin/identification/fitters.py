@@ -133,6 +133,10 @@ def fit_residual(task: FitTask) -> Fitted:
     settings = task.known("optimiser", "iterations", "transition", "widths", "share")
     options: dict[str, Any] = {"widths": ResidualNetwork.fit_widths}
     options |= {name: settings.pop(name) for name in ("widths", "share") if name in settings}
+    if not _needed(task).has_bodies:
+        raise ArgumentError(
+            "model 'residual' corrects the masses of a URDF, and of this only the geometry was taken; fit 'identified'."
+        )
     wanted, prismatic = task.beside(settings), task.data.prismatic.tolist()
     nominal = PinocchioDynamics(_with_rotors(_needed(task), task.data, wanted))
 
@@ -197,7 +201,7 @@ def fit_identified(task: FitTask) -> Fitted:
             "condition": float(report.condition),
             "outliers": report.outliers,
             "mass_kg": float(found.parameters[:, 0].sum()),
-            "stated_mass_kg": float(sum(body.mass for body in list(_needed(task).model.inertias)[1:])),
+            "stated_mass_kg": _stated_mass(_needed(task)),
         },
     )
 
@@ -206,3 +210,8 @@ def _needed(task: FitTask) -> Robot:
     if task.robot is None:
         raise ArgumentError(f"model '{task.model}' needs the arm's URDF; give {option('robot', BLANK)}.")
     return task.robot
+
+
+def _stated_mass(robot: Robot) -> float | None:
+    """The mass of the URDF [kg], None where only its geometry was taken."""
+    return float(sum(body.mass for body in list(robot.model.inertias)[1:])) if robot.has_bodies else None

@@ -128,7 +128,7 @@ def load_log(
         _refuse_settings(files[0], settings.given())
         return _of_arm(files[0], load_dataset(files[0]), robot)
     data = samples_of(files, robot, settings)
-    doubts = () if robot is None else log_doubts(data, robot).doubts
+    doubts = () if robot is None or not robot.has_bodies else log_doubts(data, robot).doubts
     for note in [*data.about["notes"], *doubts, *_poor(data)]:
         warnings.warn(f"{files[0]}: {note}.", stacklevel=3)
     return replace(data, about={**data.about, "doubts": list(doubts)})

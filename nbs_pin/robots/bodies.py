@@ -1,6 +1,7 @@
 """Bodies of a description: masses and inertias that a rigid body can have, and what is taken where there is none."""
 
 import warnings
+import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Iterable
 
@@ -18,6 +19,8 @@ _POINT = 1e-9
 """Radius of gyration below which a body counts as a point mass [m]."""
 _NEGLECTED = 1e-14
 """MuJoCo drops bodies below 1e-15 kg."""
+_SMALLEST = 0.05
+"""Least radius of a ball in place of a body [m]."""
 _HEAVIEST = 1e6
 """Largest mass that an arm can have [kg]."""
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -30,6 +33,9 @@ def check_bodies(robot: Node, joints: list[Joint], options: UrdfOptions, package
     need a link without shapes between two joints, as where two axes cross: whether M(q) ≻ 0 is tested on the whole arm.
     What is welded to the world is not judged: an inertia there that no body has is taken away.
     """
+    if options.inertia_from == "links":
+        _put_balls(robot, joints)
+        return
     above = {joint.child: joint for joint in joints}
     mass: dict[str, float] = defaultdict(float)
     links: dict[str, list[Node]] = defaultdict(list)
@@ -52,8 +58,35 @@ def check_bodies(robot: Node, joints: list[Joint], options: UrdfOptions, package
         if len(names) < sum(joint.moves for joint in joints):
             remedy += f", lock what moves none ({lock_too(options, names)})"
         if options.inertia_from != "shapes":
-            remedy += f", or take the inertia of its shapes as a guess ({option('inertia_from', 'shapes')})"
+            remedy += f", take the inertia of its shapes as a guess ({option('inertia_from', 'shapes')})"
+        remedy += f", or learn all bodies from a log ({option('inertia_from', 'links')})"
         raise joint.node.refuse(problem, remedy)
+
+
+def _put_balls(robot: Node, joints: list[Joint]) -> None:
+    """A ball of 1 kg in every link that a joint moves, midway to the joints behind it, in place of what is stated."""
+    moved = {joint.child for joint in joints if joint.moves}
+    for link in robot.named("link"):
+        for stated in link.element.findall("inertial"):
+            link.element.remove(stated)
+        name = link.text("name")
+        if name not in moved:
+            continue
+        behind = [np.array(_origin(joint)) for joint in joints if joint.parent == name]
+        centre = 0.5 * np.mean(behind, axis=0) if behind else np.zeros(3)
+        moment = 0.4 * max(float(np.linalg.norm(centre)), _SMALLEST) ** 2
+        inertial = ET.SubElement(link.element, "inertial")
+        ET.SubElement(inertial, "origin", {"xyz": " ".join(repr(float(x)) for x in centre)})
+        ET.SubElement(inertial, "mass", {"value": "1.0"})
+        equal = dict.fromkeys(("ixx", "iyy", "izz"), repr(moment))
+        ET.SubElement(inertial, "inertia", equal | dict.fromkeys(("ixy", "ixz", "iyz"), "0.0"))
+    text = "the bodies are balls of 1 kg along the links, as only the geometry of the file was to be taken"
+    warnings.warn(f"{text}; learn them before anything else.", stacklevel=2)
+
+
+def _origin(joint: Joint) -> tuple[float, ...]:
+    origin = joint.node.child("origin")
+    return (0.0, 0.0, 0.0) if origin is None else origin.numbers("xyz", 3, (0.0, 0.0, 0.0))
 
 
 def _without_mass_behind(empty: list[Joint], joints: list[Joint]) -> list[Joint]:

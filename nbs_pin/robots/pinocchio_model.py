@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.mass_matrix import weak_joints
 from nbs_pin.robots.urdf import Urdf
@@ -45,4 +46,5 @@ def check_inertia(urdf: Urdf, model: pin.Model, options: UrdfOptions) -> None:
     unsaid = own is not None and own.find("axis") is None
     problem += "; it states no <axis>, which URDF reads as 1 0 0" if unsaid else ""
     remedy = f"{'add <axis xyz=…>, ' if unsaid else ''}give the links behind it inertia about its axis"
-    raise RobotError(f"{urdf.path}: joint '{names[0]}': {problem}; {remedy}, or lock it ({lock_too(options, names)}).")
+    rest = f"lock it ({lock_too(options, names)}), or learn all bodies from a log ({option('inertia_from', 'links')})"
+    raise RobotError(f"{urdf.path}: joint '{names[0]}': {problem}; {remedy}, {rest}.")

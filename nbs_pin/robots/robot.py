@@ -183,6 +183,11 @@ class Robot(Shown, Kinematics):
         urdf = replace(self.urdf, joints=joints)
         return replace(self, urdf=urdf, model=with_limits(self.model.copy(), urdf))
 
+    @property
+    def has_bodies(self) -> bool:
+        """Whether its bodies are those of the description, and not balls in place of them (inertia_from="links")."""
+        return self.options.get("inertia_from") != "links"
+
     def with_armature(self, armature: PerJoint | Mapping[str, float]) -> "Robot":
         """The same arm with this rotor inertia, as the joints feel it [kg·m², kg].
 
@@ -320,7 +325,8 @@ def load_robot(
         limits: Limits in place of the file's, by joint ("*" for all) and by "lower", "upper" [rad, m], "effort"
             [N·m, N] and "velocity" [rad/s, m/s]; None for no limit.
         repair: Take the nearest inertia that a rigid body can have where the file states one that none has.
-        inertia_from: "file", or "shapes" to fill the shapes of bodies without mass with 1000 kg/m³, as a guess.
+        inertia_from: "file", or "shapes" to fill the shapes of bodies without mass with 1000 kg/m³, as a guess, or
+            "links" to take only the geometry, with balls for bodies, as for an arm whose bodies are to be learned.
         xacro_args: Values of the arguments of a `.xacro` file.
         package_dirs: Folders with ROS packages, for `$(find …)` and package:// in the file. Also searched are packages
             around and beside the file, ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.

@@ -17,8 +17,8 @@ from nbs_pin.base.exceptions import ArgumentError
 ZeroLimits: TypeAlias = Literal["refuse", "unlimited"]
 """How to treat limits that are left out, an effort or velocity that is not > 0 and an empty range at zero."""
 ZERO_LIMITS: tuple[ZeroLimits, ...] = get_args(ZeroLimits)
-InertiaFrom: TypeAlias = Literal["file", "shapes"]
-"""Whether bodies without mass are refused, or filled with material."""
+InertiaFrom: TypeAlias = Literal["file", "shapes", "links"]
+"""Whether bodies without mass are refused, or filled with material; or whether all bodies are balls along the links."""
 INERTIA_FROM: tuple[InertiaFrom, ...] = get_args(InertiaFrom)
 DRIVE = ("armature", "rotor_inertia", "viscous_friction", "coulomb_friction")
 """Arguments with a number ≥ 0 by joint."""
