@@ -12,6 +12,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.bearable import Bearable
+from nbs_pin.controllers.excitation import _UPPER, _WEIGHTS, _row, _to_values
 from nbs_pin.controllers.gains import effective_inertia, sample_configurations
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
 from nbs_pin.controllers.unknowns import ADAPTS, Carrier, model_body
@@ -321,6 +322,57 @@ def test_estimates_make_a_model_whose_torque_is_that_of_the_law(robot):
     tau = law.law.dynamics.reference_torque(q, v, v_r, a_r) + law._now(memory.duals, q, v, v_r, a_r).torque()
     found = model.reference_torque(q, v, v_r, a_r) + model.friction.torque(v_r)
     np.testing.assert_allclose(found, tau, rtol=0.0, atol=1e-9 * np.abs(tau).max())
+
+
+@pytest.mark.parametrize("adapts", KINDS, ids="+".join)
+def test_what_a_motion_shows_is_the_slope_of_the_torque(robot, adapts):
+    """Y of the shares against differences of the law's torque, and changes of values against those of shares."""
+    law, rng = law_for(robot, adapts), np.random.default_rng(11)
+    memory = stirred(law, ())
+    q, v, v_r, a_r = rng.normal(size=(4, 1, robot.nv))
+    direction, h = rng.normal(size=memory.duals.size), 1e-5
+
+    def at(step):
+        duals = memory.duals + step * direction
+        now = law._now(duals[None], q, v, v_r, a_r)
+        x = np.concatenate([(now.shares.bodies[0][:, *_UPPER] * _WEIGHTS).ravel(), now.shares.numbers[0]])
+        return now, x, now.torque()[0], law.estimate(memory._replace(duals=duals)).values
+
+    (now, more, up, high), (_, less, down, low) = at(h), at(-h)
+    rows = np.concatenate([_row(now, unit[None]) for unit in np.eye(robot.nv)])
+    np.testing.assert_allclose(rows @ (more - less), up - down, rtol=1e-5, atol=1e-9 * np.abs(up).max())
+    np.testing.assert_allclose(_to_values(law.unknowns) @ (more - less), high - low, rtol=1e-5, atol=1e-11)
+
+
+@pytest.mark.parametrize("at_rest", [False, True])
+def test_an_estimate_says_how_far_it_may_be_off(at_rest):
+    """The truth is within three deviations; an arm at rest shows neither rotors nor viscous friction."""
+    robot = nbs.load_robot("panda")
+    law = nbs.AdaptiveLaw.for_robot(robot)
+    plant, moving = nbs.MujocoPlant(robot.with_payload(tool_frame(robot), 2.0)), nbs.Sinusoid.for_robot(robot)
+    run = nbs.simulate(plant, law, nbs.Hold(moving.offset) if at_rest else moving, 10.0, 0.001, check=False)
+    found, truth = law.estimate(run), np.zeros(31)
+    truth[0] = 2.0
+    np.testing.assert_array_equal(found.values, run.estimates[-1])
+    assert (np.abs(found.values - truth) <= 3.0 * found.deviation).all()
+    rotors = np.array(["rotor" in name for name in found.names])
+    assert (found.deviation[rotors] > 0.99 * law.largest_rotor).all() == at_rest
+    hidden = " ".join(found.unexcited)
+    names = [name.rpartition(" [")[0] for name in found.names if "rotor" in name or "viscous" in name]
+    assert all(name in hidden for name in names) == at_rest
+    assert ("directions not excited" in repr(found)) == at_rest
+    assert "may be off by" in found._repr_html_()
+
+
+def test_only_one_motion_of_the_law_says_what_it_has_shown():
+    robot = nbs.load_robot("two_link")
+    law, plant, still = law_for(robot, ["load"]), nbs.DynamicsPlant.for_robot(robot), nbs.Hold([0.1, 0.2])
+    runs = [
+        nbs.simulate(plant, one, still, 0.01, 0.001, q0=q0) for one, q0 in ((law.law, None), (law, np.zeros((2, 2))))
+    ]
+    for run in runs:
+        with pytest.raises(ArgumentError, match=r"expected one motion of this law, q of shape \(rows, 2\)"):
+            law.estimate(run)
 
 
 def test_files_keep_rates_of_a_law_that_was_trained_first(tmp_path, robot):

@@ -40,6 +40,13 @@ def _row(tag: str, cells: Sequence[str]) -> str:
     return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
 
 
+def mixture(parts: Any, names: Sequence[str]) -> str:
+    """The largest components of a direction in words, such as "+0.80 link1 m −0.60 link2 m"."""
+    parts = np.asarray(parts) / np.linalg.norm(parts)
+    largest = [k for k in np.argsort(-np.abs(parts))[:4] if abs(parts[k]) > 0.2]
+    return " ".join(f"{parts[k]:+.2f} {names[k]}" for k in largest)
+
+
 def joints_told(count: int) -> str:
     """A number of joints in words."""
     return f"{count} joint{'' if count == 1 else 's'}"

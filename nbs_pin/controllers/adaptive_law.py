@@ -1,6 +1,7 @@
 """A law whose model adapts to the arm: an unknown load, links, friction, rotors, constant torques."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -21,7 +22,7 @@ from nbs_pin.base.arrays import (
 from nbs_pin.base.checks import PerJoint, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import defines, known_code
-from nbs_pin.base.records import Reference
+from nbs_pin.base.records import Reference, Run
 from nbs_pin.base.shown import joints_told
 from nbs_pin.base.storable import storable
 from nbs_pin.controllers.adapting_model import AdaptingModel
@@ -36,6 +37,7 @@ from nbs_pin.controllers.compiled_adaptive import (
 from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.estimates import Estimate, estimate_of
+from nbs_pin.controllers.excitation import excitation
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -307,12 +309,29 @@ class AdaptiveLaw(Controller, nn.Module):
     def _now(self, duals: Array, q: Array, v: Array, v_r: Array, a_r: Array) -> AdaptingModel:
         return AdaptingModel.of(self.unknowns, *self._tree, duals, q, v, v_r, a_r)
 
-    def estimate(self, believed: AdaptiveMemory | Array | None = None) -> Estimate:
-        """What is believed of the unknowns with this memory, or over a run: `law.estimate(run.estimates)`.
+    def estimate(self, believed: AdaptiveMemory | Run | Array | None = None) -> Estimate:
+        """What is believed of the unknowns with this memory, after a run, or at every instant of one.
 
-        None is the start. An array has values in the units of the arm, not duals. Raises ArgumentError for another
-        number of them.
+        Args:
+            believed: A memory; a run with one start, whose last estimates are returned with how far each may be off,
+                as its second half has shown (docs/theory.md §10); or `run.estimates`, values in the units of the arm,
+                not duals. None is the start.
+
+        Raises:
+            ArgumentError: For another number of values, or a run of several starts or without estimates.
+
+        Example:
+            >>> import nbs_pin as nbs
+            >>> robot = nbs.load_robot("two_link")
+            >>> law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), load_mass=1.0)
+            >>> plant = nbs.DynamicsPlant.for_robot(robot.with_payload("tip", 0.5))
+            >>> run = nbs.simulate(plant, law, nbs.Sinusoid.for_robot(robot), 4.0, 0.001)
+            >>> found = law.estimate(run)
+            >>> bool(abs(found.load_mass - 0.5) < 3.0 * found.deviation[0]), len(found.unexcited) > 0
+            (True, True)
         """
+        if isinstance(believed, Run):
+            return self._after(believed)
         known = self.robot, self._believed, self.unknowns
         if believed is None or isinstance(believed, AdaptiveMemory):
             given = self.unknowns.start if believed is None else believed.duals
@@ -320,6 +339,18 @@ class AdaptiveLaw(Controller, nn.Module):
             return estimate_of(*known, _plain(duals))
         (values,) = as_vectors(len(self.unknowns.start), believed=believed)
         return Estimate(*known, _plain(values))
+
+    def _after(self, run: Run) -> Estimate:
+        """The last estimates of a run, and how far they may be off."""
+        if run.estimates is None or run.q.ndim != 2 or run.nv != self.nv:
+            has = "no estimates" if run.estimates is None else f"q of shape {run.q.shape}"
+            raise ArgumentError(
+                f"estimate was given a run with {has}, expected one motion of this law, q of shape (rows, {self.nv});"
+                " give that, or run.estimates."
+            )
+        last = self.estimate(run.estimates[-1])
+        seen = excitation(self.law, self.output, self.unknowns, *self._tree, run, last.names)
+        return replace(last, deviation=seen.deviation, unexcited=seen.unexcited)
 
     def compile(self) -> Controller:  # type: ignore[override]  # torch.nn.Module has another compile
         """The law as machine code (`Controller.compile`); itself for a subclass, or around a law that has none."""

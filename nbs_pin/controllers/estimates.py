@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from nbs_pin.base.shown import Shown
+from nbs_pin.base.shown import Cells, Shown
 from nbs_pin.base.units import units_of
 from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
@@ -45,6 +45,10 @@ class Estimate(Shown):
     unknowns: Unknowns
     values: Float[np.ndarray, "*batch k"]
     """What `names` lists: ten parameters of every body in Pinocchio's order, then the numbers of the joints."""
+    deviation: Float[np.ndarray, " k"] | None = None
+    """How far each value may be off, like a standard deviation (docs/theory.md §10); None without a run."""
+    unexcited: tuple[str, ...] = ()
+    """Directions of the values that the run did not show at all, each of the width of its interval, in words."""
 
     @property
     def names(self) -> list[str]:
@@ -71,7 +75,18 @@ class Estimate(Shown):
             centre = ", ".join(f"{1e3 * x:z.0f}" for x in self.load_centre)
             there = f"load {float(self.load_mass):.3g} kg at ({centre}) mm of {name}"
             own = [there if abs(self.load_mass) > NO_MASS else f"no load at {name}"]
-        return self.robot.name, *own, f"{len(self.unknowns.bodies)} bodies, {len(self.unknowns.numbers)} numbers"
+        hidden = [f"{len(self.unexcited)} directions not excited"] if self.unexcited else []
+        counts = f"{len(self.unknowns.bodies)} bodies, {len(self.unknowns.numbers)} numbers"
+        return self.robot.name, *own, counts, *hidden
+
+    def _cells(self) -> Cells:
+        if self.deviation is None:
+            return Cells()
+        rows = [
+            (name, f"{value:z.3g}", f"{off:.2g}")
+            for name, value, off in zip(self.names, self.values.tolist(), self.deviation.tolist(), strict=True)
+        ]
+        return Cells(("", "believed", "may be off by"), rows)
 
     @property
     def load_mass(self) -> Float[np.ndarray, "*batch"]:

@@ -87,6 +87,16 @@ def signals_of(law: ModelLaw, output: Output, q: Array, v: Array, q_ref: Array, 
     return Signals(share * v_ref, share * a_ref, filtered)
 
 
+def feedback_of(law: ModelLaw, q: Array, v: Array, q_ref: Array, v_ref: Array, a_ref: Array) -> Array:
+    """What a law adds to its model, (..., n) [N·m], of computed torque an acceleration; ωMz2 counts as model."""
+    if isinstance(law, LyapunovLaw):
+        e = law.errors(q, v, q_ref, v_ref, a_ref)
+        return e.gradient + law.damping_force(e.z2)
+    assert isinstance(law, PD | ComputedTorque)
+    kp, kd = law.gains.like(q)
+    return kp * law.dynamics.difference(q, q_ref) + kd * (v - v_ref)
+
+
 def damping_of(law: ModelLaw, output: Output, mass: Float[np.ndarray, "poses n n"]) -> Float[np.ndarray, "poses n n"]:
     """A matrix Δ with V̇ ≤ −sᵀΔs without a wrong torque, at poses with these mass matrices; for PD without the εM."""
     if isinstance(law, LyapunovLaw):

@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import mixture
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, PARAMETERS_OF_COORDINATES, coordinates
 from nbs_pin.identification.consistent_fit import ConsistentFit, consistent_fit, in_factors
@@ -290,10 +291,7 @@ def _direction(direction: np.ndarray, expected: Expected, names: list[str]) -> s
     mass = np.square(expected.bodies[:, 3]).sum(axis=1)
     spread = np.square(expected.bodies[:, :3]).sum(axis=(1, 2))
     units = np.column_stack([mass, *[np.sqrt(mass * spread)] * 3, *[spread] * 6])
-    parts = np.concatenate([(moved / units).ravel(), direction[10 * n :]])
-    parts /= np.linalg.norm(parts)
-    largest = [k for k in np.argsort(-np.abs(parts))[:4] if abs(parts[k]) > 0.2]
-    return " ".join(f"{parts[k]:+.2f} {names[k]}" for k in largest)
+    return mixture(np.concatenate([(moved / units).ravel(), direction[10 * n :]]), names)
 
 
 def nmse(equations: np.ndarray, fit: ConsistentFit, data: Dataset) -> float:
