@@ -24,8 +24,8 @@ from nbs_pin.identification.log_files import (
     is_table,
 )
 from nbs_pin.identification.repairs import repaired
-from nbs_pin.identification.resampling import evenly, parted_at_gaps
-from nbs_pin.motions.recordings import Joints, degrees_fault, in_radians, seam_fault, seconds_in, time_fault, unwrapped
+from nbs_pin.identification.resampling import evenly, parted
+from nbs_pin.motions.recordings import TURN, Joints, degrees_fault, in_radians, seams, seconds_in, time_fault, unwrapped
 from nbs_pin.robots.robot import Robot
 
 
@@ -186,13 +186,13 @@ def _put_right(
     """The columns without wraps, rows in which something is absent and what is wrong in single rows; notes on it."""
     found = repaired(columns, joints)
     columns, stretches = found.columns, trajectory_slices(found.columns.trajectory)
-    turned, parted = unwrapped(columns.q, joints, stretches, degrees), parted_at_gaps(columns)
+    turned = unwrapped(columns.q, joints, stretches, degrees)
+    if turned.fault:
+        raise FileFormatError(f"{path}: {turned.fault}.")
     columns = columns._replace(q=turned.q)
-    fault = turned.fault or seam_fault(columns.t, columns.q, joints, stretches)
-    if fault:
-        raise FileFormatError(f"{path}: {fault}.")
-    columns = columns._replace(trajectory=parted.numbers).take(found.fresh & parted.kept & ~absent)
-    return columns, [*found.notes, *turned.notes, *([parted.note] if parted.note else [])]
+    pieces = parted(columns, seams(columns.t, columns.q, joints, stretches))
+    columns = columns._replace(trajectory=pieces.numbers).take(found.fresh & pieces.kept & ~absent)
+    return columns, [*found.notes, *turned.notes, *pieces.notes]
 
 
 def _advanced(columns: Columns, delay: float) -> Columns:
@@ -214,11 +214,10 @@ def _serial(n: int, prismatic: Sequence[bool] | None) -> tuple[np.ndarray, np.nd
 
 
 def _joints(columns: Columns, prismatic: Bool[np.ndarray, " n"], robot: Robot | None) -> Joints:
-    """What is known of the joints; those of an unknown arm are numbered and turn within limits."""
+    """What is known of the joints; those of an unknown arm are numbered. Which may turn further is by their range."""
     if robot is not None:
-        return Joints.of(robot)
-    names = [f"joint {i + 1}" for i in range(columns.q.shape[1])]
-    return Joints(names, np.zeros(len(names), dtype=bool), prismatic)
+        return Joints(robot.joint_names, ~robot.prismatic & (robot.upper - robot.lower > TURN), robot.prismatic)
+    return Joints([f"joint {i + 1}" for i in range(columns.q.shape[1])], ~prismatic, prismatic)
 
 
 def _in_units(

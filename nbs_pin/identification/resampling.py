@@ -5,6 +5,7 @@ forwards and backwards, so that they keep their relation at every instant (Gauti
 new are left out.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.identification.datasets import trajectory_slices
 from nbs_pin.identification.log_files import Columns
 from nbs_pin.identification.measurement import ORDER, derivative
+from nbs_pin.motions.recordings import Seam
 
 EVEN = 1e-3
 """Tolerance of even spacing, as a share of the step."""
@@ -68,35 +70,36 @@ class Parted(NamedTuple):
 
     numbers: Int[np.ndarray, " rows"]
     kept: Bool[np.ndarray, " rows"]
-    note: str
+    notes: tuple[str, ...]
 
 
-def parted_at_gaps(columns: Columns) -> Parted:
-    """Another trajectory after every long gap; short pieces are not kept."""
+def parted(columns: Columns, seams: Sequence[Seam]) -> Parted:
+    """Another trajectory after every long gap and at every seam; short pieces are not kept."""
     numbers, kept = columns.trajectory.copy(), np.ones(len(columns.t), dtype=bool)
     gaps: list[tuple[float, int]] = []
     for rows in trajectory_slices(columns.trajectory):
         steps = np.diff(columns.t[rows])
         if not len(steps):
             continue
-        at = np.flatnonzero(steps > max(_GAP * float(np.median(steps)), _SHORT_GAP)) + 1
-        for begin, end in pairwise([0, *at.tolist(), rows.stop - rows.start]) if at.size else ():
+        long = np.flatnonzero(steps > max(_GAP * float(np.median(steps)), _SHORT_GAP)) + 1
+        gaps += [(float(steps[k - 1]), rows.start + int(k)) for k in long]
+        cuts = {*long.tolist(), *(seam.row - rows.start for seam in seams if rows.start < seam.row < rows.stop)}
+        for begin, end in pairwise([0, *sorted(cuts), rows.stop - rows.start]) if cuts else ():
             piece = slice(rows.start + begin, rows.start + end)
             numbers[piece] = numbers.max() + 1 if begin else numbers[rows.start]
             kept[piece] = end - begin >= _PIECE
-        gaps += [(float(steps[k - 1]), rows.start + int(k)) for k in at]
-    if not gaps or not kept.any():
-        return Parted(columns.trajectory, np.ones(len(columns.t), dtype=bool), "")
-    longest, row = max(gaps, key=lambda gap: gap[0])
+    notes = [seams[0].note + (f", and {len(seams) - 1} more elsewhere" if len(seams) > 1 else "")] if seams else []
+    if gaps:
+        longest, row = max(gaps, key=lambda gap: gap[0])
+        more = f", and less in {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""
+        notes.append(
+            f"{longest:.4g} s are missing between rows {row} and {row + 1}{more}: another trajectory begins there"
+        )
     left = int(np.count_nonzero(~kept))
-    return Parted(
-        numbers,
-        kept,
-        f"{longest:.4g} s are missing between rows {row} and {row + 1}"
-        + (f", and less in {len(gaps) - 1} more gaps" if len(gaps) > 1 else "")
-        + ": another trajectory begins there"
-        + (f" ({left} rows in pieces of fewer than {_PIECE} are left out)" if left else ""),
-    )
+    if left == len(kept):
+        return Parted(columns.trajectory, ~kept, ())
+    notes += [f"{left} rows in pieces of fewer than {_PIECE} were left out"] if left else []
+    return Parted(numbers, kept, tuple(notes))
 
 
 def evenly(path: Path, columns: Columns, resample: float | None, lowpass: float | None) -> Even:

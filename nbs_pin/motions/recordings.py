@@ -36,7 +36,7 @@ class Joints(NamedTuple):
 
     names: Sequence[str]
     continuous: Bool[np.ndarray, " n"]
-    """True for joints that turn without limit."""
+    """True for joints that turn without limit, or may at least turn further than by one turn."""
     prismatic: Bool[np.ndarray, " n"]
 
     @classmethod
@@ -170,8 +170,8 @@ def unwrapped(
         if found and joints.continuous[i]:
             often = "once," if len(found) == 1 else f"{len(found)} times, first"
             notes.append(
-                f"{name} jumps by a turn {often} between rows {found[0] + 1} and {found[0] + 2}; it "
-                "turns without limit, so it was unwrapped"
+                f"{name} jumps by a turn {often} between rows {found[0] + 1} and {found[0] + 2}; it can turn further, "
+                "so it was unwrapped"
             )
         elif found:
             k = found[0]
@@ -205,23 +205,33 @@ def _degree_wrap_fault(x: Float[np.ndarray, " rows"], start: int, name: str) -> 
     )
 
 
-def seam_fault(
+class Seam(NamedTuple):
+    """Where one recording seems to end and another to begin."""
+
+    row: int
+    """The first row of the other, from 0."""
+    note: str
+
+
+def seams(
     t: Float[np.ndarray, " rows"], q: Float[np.ndarray, "rows n"], joints: Joints, stretches: Sequence[slice]
-) -> str:
-    """Where one recording seems to end and another to begin: a jump that no motor makes, and no return."""
+) -> list[Seam]:
+    """Jumps that no motor makes, and no return."""
+    found = []
     for rows in stretches:
         speed = np.abs(np.diff(q[rows], axis=0)) / np.diff(t[rows])[:, None]
         if len(speed) < _WINDOW:
             continue
         jumps = speed > np.maximum(_SEAM * np.percentile(speed, 80, axis=0), _NO_MOTOR)
-        if jumps.any():
-            k, i = np.argwhere(jumps)[0]
-            x, row = q[rows, i], rows.start + int(k) + 1
-            return (
+        for k in map(int, np.flatnonzero(jumps.any(axis=1))):
+            i, row = int(np.argmax(jumps[k])), rows.start + k + 1
+            x = q[rows, i]
+            note = (
                 f"q of {joints.names[i]} jumps from {x[k]:.4g} to {x[k + 1]:.4g} between rows {row} and {row + 1}: "
-                "does another recording begin there? number the recordings in a column 'trajectory'"
+                "another recording begins there"
             )
-    return ""
+            found.append(Seam(row, note))
+    return found
 
 
 def _outlier_fault(x: Float[np.ndarray, " rows"], start: int, name: str) -> str:
