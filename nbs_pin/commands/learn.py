@@ -152,6 +152,7 @@ def figures(result: Learned) -> dict[str, Any]:
     return plain(
         report
         | {
+            "doubts": list(result.train.about.get("doubts", ())),
             "trajectories": result.train.trajectories,
             "test_samples": 0 if result.test is None else len(result.test),
             "joints": result.joints,

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.doors import option
+from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.units import column, units
 from nbs_pin.cli.log import Log
 from nbs_pin.cli.values import OptionError
@@ -62,6 +62,8 @@ def _facts(data: Dataset, found: LogDoubts | None) -> list[str]:
     if isinstance(read, dict):
         least, usual, most = read["steps_s"]
         facts.append(f"{read['rows']} rows, usually {1.0 / usual:.4g} Hz, {least:.3g} to {most:.3g} s apart")
+    if found is None:
+        facts.append(f"units, signs and delays are questioned with {option('robot', BLANK)}")
     derived = " and ".join(data.about.get("differentiated", ()))
     facts.append(f"{len(data)} rows to learn from" + (f"; {derived} differentiated" if derived else ""))
     if found is not None and math.isfinite(found.delay):

@@ -60,7 +60,7 @@ def fit(
         robot: The arm; its masses and lengths may be inaccurate. "residual" needs its nominal model, "identified" its
             geometry; the other models take limits and drawings from it.
         held_out: Trajectories not trained on, as a dataset or a share of the data, 0 for none. They select the iterate
-            of a network. None takes `HELD_OUT` if there are at least two trajectories.
+            of a network. None takes `HELD_OUT` if there are at least two trajectories or one long recording.
         friction: None learns the friction that the data show, up to that of `DriveFriction`; True viscous and Coulomb
             friction of every joint, False none. It is not part of M, C, G.
         offset: Learn constant torques, of sensors or a pull; None those that the data show.

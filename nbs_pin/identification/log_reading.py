@@ -23,7 +23,7 @@ from nbs_pin.identification.log_files import (
     columns_of_table,
     is_table,
 )
-from nbs_pin.identification.repairs import repaired
+from nbs_pin.identification.repairs import beyond, repaired
 from nbs_pin.identification.resampling import evenly, parted
 from nbs_pin.motions.recordings import TURN, Joints, degrees_fault, in_radians, seams, seconds_in, time_fault, unwrapped
 from nbs_pin.robots.robot import Robot
@@ -71,9 +71,9 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
         read = read._replace(q=read.q + settings.zero)
     read, absent, blanks = _filled(read)
     _dataset(path, read._replace(v=read.q, a=read.q), tree, name, {})  # refuses what is no table of numbers
-    spacing, more = _spacing(read), list[str]()
+    spacing, more, limits = _spacing(read), list[str](), None
     if spacing["rows"] > len(np.unique(read.trajectory)):  # not of single states
-        read, more = _put_right(path, read, joints, settings.degrees, absent)
+        read, limits, more = _put_right(path, read, joints, settings.degrees, absent)
     read = _advanced(read, settings.delay) if settings.delay else read
     lowpass = 0.0 if settings.lowpass is None and settings.window is not None else settings.lowpass
     even = evenly(path, read, settings.resample, lowpass)
@@ -87,7 +87,8 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
     }
     data = _dataset(path, whole.columns, tree, name, about)
     check_derivatives(path, data)
-    return data.take(whole.kept) if len(whole.kept) < len(data) else data
+    kept = whole.kept if limits is None else whole.kept[~beyond(data.tau[whole.kept], limits)]
+    return data.take(kept) if len(kept) < len(data) else data
 
 
 def _read(
@@ -182,8 +183,8 @@ def _filled(columns: Columns) -> tuple[Columns, np.ndarray, list[str]]:
 
 def _put_right(
     path: Path, columns: Columns, joints: Joints, degrees: bool | None, absent: Bool[np.ndarray, " rows"]
-) -> tuple[Columns, list[str]]:
-    """The columns without wraps, rows in which something is absent and what is wrong in single rows; notes on it."""
+) -> tuple[Columns, np.ndarray, list[str]]:
+    """The columns without wraps and what is wrong in single rows, the limits of the torques, and notes."""
     found = repaired(columns, joints)
     columns, stretches = found.columns, trajectory_slices(found.columns.trajectory)
     turned = unwrapped(columns.q, joints, stretches, degrees)
@@ -192,7 +193,7 @@ def _put_right(
     columns = columns._replace(q=turned.q)
     pieces = parted(columns, seams(columns.t, columns.q, joints, stretches))
     columns = columns._replace(trajectory=pieces.numbers).take(found.fresh & pieces.kept & ~absent)
-    return columns, [*found.notes, *turned.notes, *pieces.notes]
+    return columns, found.limits, [*found.notes, *turned.notes, *pieces.notes]
 
 
 def _advanced(columns: Columns, delay: float) -> Columns:

@@ -1,8 +1,8 @@
 """Single rows of a log that are wrong, found by comparison with the rows around them, and put right with a note.
 
 Rows are counted from 1 in notes. What is found: rows that repeat the one before, spikes of up to three rows, angles
-that stood still while the joint moved, velocities that are zero throughout. A torque that is cut off at a largest value
-is only named, since what it was is unknown.
+that stood still while the joint moved, velocities that are zero throughout. Where a torque is cut off at a
+largest value, what it was is unknown, and the rows are left out.
 """
 
 from collections.abc import Sequence
@@ -33,6 +33,8 @@ _FRESH = 1.6
 """Step after an angle stood still, in the steps around: two or more are made up for."""
 _CUT_ROWS, _CUT_SHARE = 3, 5e-4
 """A largest torque is a limit if it lasts so many rows in succession, and is that share of all rows."""
+_NEAR_LIMIT, _MOST_CUT = 0.03, 0.8
+"""Distance from a limit, as a share of it, at which rows are left out; largest share of all rows that are."""
 
 
 _CALLED = {"q": "position", "v": "velocity", "tau": "torque"}
@@ -45,6 +47,8 @@ class Repaired(NamedTuple):
     columns: Columns
     fresh: Bool[np.ndarray, " rows"]
     """Rows that do not merely repeat the one before."""
+    limits: Float[np.ndarray, "2 n"]
+    """Least and largest torque at which tau is cut off, infinite where it is not."""
     notes: tuple[str, ...]
 
 
@@ -52,14 +56,15 @@ def repaired(columns: Columns, joints: Joints) -> Repaired:
     """The columns without what is wrong in single rows; all rows are there still, so that they can be named."""
     fresh, repeats = _fresh(columns)
     columns, zeros = _without_zero_rates(columns, joints)
-    rows, notes = trajectory_slices(columns.trajectory), [*repeats, *zeros, *_cut(columns.tau, fresh, joints)]
+    limits, cut = _cut(columns.tau, fresh, joints)
+    rows, notes = trajectory_slices(columns.trajectory), [*repeats, *zeros, *cut]
     for name in _CALLED:
         x = getattr(columns, name)
         if x is not None:
             x, noted = _without_spikes(x, columns.t, rows, joints, name)
             columns, notes = columns._replace(**{name: x}), notes + noted
     q, noted = _moving(columns.q, columns.t, rows, joints, fresh)
-    return Repaired(columns._replace(q=q), fresh, (*notes, *noted))
+    return Repaired(columns._replace(q=q), fresh, limits, (*notes, *noted))
 
 
 def _fresh(columns: Columns) -> tuple[np.ndarray, list[str]]:
@@ -188,20 +193,29 @@ def _stale(x: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
     return found
 
 
-def _cut(tau: Float[np.ndarray, "rows n"], fresh: Bool[np.ndarray, " rows"], joints: Joints) -> list[str]:
-    """Where torques stay at a largest value."""
-    notes = []
+def _cut(
+    tau: Float[np.ndarray, "rows n"], fresh: Bool[np.ndarray, " rows"], joints: Joints
+) -> tuple[np.ndarray, list[str]]:
+    """The torques at which they are cut off, since they stay there, and notes on that."""
+    limits, notes = np.array([[-np.inf], [np.inf]]) * np.ones(tau.shape[1]), []
     for i, name in enumerate(joints.names):
-        for value in {float(tau[:, i].max()), float(tau[:, i].min())}:
+        unit = units("torque", joints.prismatic)[i]
+        for side, value in enumerate((float(tau[:, i].min()), float(tau[:, i].max()))):
             at = (tau[:, i] == value) & fresh
             if _long(at, _CUT_ROWS - 1).any() and _CUT_SHARE < at.mean() < 0.5 and np.ptp(tau[:, i]) > 0.0:
-                unit = units("torque", joints.prismatic)[i]
+                limits[side, i] = value
                 notes.append(
-                    f"tau of {name} is {value:.6g} {unit} in {_rows(at)}, first row {_first(at)}, and never beyond: a "
-                    "limit of the motor or of the recording, where the torque was not what is written; leave such "
-                    "motions out"
+                    f"tau of {name} is cut off at {value:.6g} {unit}, which it has in {_rows(at)}, first row "
+                    f"{_first(at)}: a limit of the motor or of the recording; rows near it were left out"
                 )
-    return notes
+    return limits, notes
+
+
+def beyond(tau: Float[np.ndarray, "rows n"], limits: Float[np.ndarray, "2 n"]) -> Bool[np.ndarray, " rows"]:
+    """Rows whose torque, which may be smoothed since, is near a limit or beyond; none where that leaves too few."""
+    margins = np.where(np.isfinite(limits), _NEAR_LIMIT * np.abs(limits), 0.0)
+    rows = ((tau < limits[0] + margins[0]) | (tau > limits[1] - margins[1])).any(axis=1)
+    return np.asarray(rows & (rows.mean() < _MOST_CUT))
 
 
 def _bridged(x: np.ndarray, t: np.ndarray, odd: np.ndarray, stretches: Sequence[slice]) -> np.ndarray:
