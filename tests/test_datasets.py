@@ -522,7 +522,6 @@ ROWS = "".join(f"\n{0.1 * k:g},0,{0.1 * k:g},0,1,0,{k},1" for k in range(9))
         ("t,", "clock,", "no column 't' of times"),
         ("v2", "w2", "no column 'v_2'"),
         ("0.1,0,", "0.1,0.5,", "whole number"),
-        ("0.1,0,", "0.2,0,", "sample 3 is not after sample 2"),
         ("0.1,0,", "nan,0,", "t of sample 2 is nan"),
         ("0.1,0,", "0.1,0,7,", "row 2 has"),
         ("0.1,0,", "0.1,x,", "row 2"),

@@ -14,6 +14,7 @@ from nbs_pin import cli
 from nbs_pin.base.csv_files import joint_columns
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.identification.datasets import recordings
+from nbs_pin.identification.fit import split_data
 from nbs_pin.identification.log_files import Columns
 from nbs_pin.identification.resampling import lowpassed
 from tests.commands import refusal
@@ -227,7 +228,9 @@ def test_of_one_long_log_the_end_is_held_out_after_a_pause(tmp_path):
     assert test.t[-1] == data.t[-1]
     assert test.t[0] - train.t[-1] >= 0.5
     assert np.ptp(test.t) == pytest.approx(0.2 * np.ptp(data.t), rel=0.02)
-    assert nbs.fit(data, "identified", robot=ARM, friction=True).report.test_nmse < 0.01
+    assert_array_equal(split_data(data)[1].q, test.q)
+    with pytest.raises(ArgumentError, match="only one trajectory"):
+        data.take(data.t < 4.0).split(0.2)
 
 
 @pytest.mark.parametrize("own_time", [False, True])
@@ -379,6 +382,24 @@ def test_rows_in_which_something_is_missing_are_left_out(tmp_path):
     assert len(said) == 2
     assert "4 rows with entries that are missing were left out, first row 78" in said[0]
     assert_allclose(data.q, clean.q, atol=1e-3)
+
+
+def test_times_that_stand_still_or_go_back_are_understood(tmp_path):
+    """As of a recorder that writes some messages twice, and of two recordings one after the other."""
+    c = measured()
+    twice = np.sort(np.r_[np.arange(len(c["t"])), 1000, 2000, len(c["t"]) - 1])
+    data, said = read(tmp_path, {name: x[twice] for name, x in c.items()}, lowpass=0)
+    plain, _ = read(tmp_path, c, lowpass=0)
+    assert len(said) == 1
+    assert "3 rows with the time of the row before were left out, first row 1002" in said[0]
+    assert_allclose(data.a, plain.a, atol=1e-6)
+    both, said = read(tmp_path, {name: np.concatenate([x, x]) for name, x in c.items()}, lowpass=0)
+    assert len(said) == 1
+    assert f"time goes back between rows {len(c['t'])} and {len(c['t']) + 1}: another recording begins there" in said[0]
+    assert both.trajectories == 2
+    assert_array_equal(both.a[: len(plain)], plain.a)
+    with pytest.raises(FileFormatError, match="time must increase along a trajectory"):
+        read(tmp_path, c | {"t": c["t"][::-1]})
 
 
 # In the shell.

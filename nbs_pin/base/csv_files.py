@@ -129,7 +129,7 @@ def joint_columns(header: Sequence[str], kind: str) -> dict[str, int]:
             named = [(next(part for part in match.groups() if part), k) for match, k in found if match]
             columns = dict(named)
             if columns and len(columns) == len(named):
-                return _from_one(columns)
+                return from_one(columns)
     return {}
 
 
@@ -176,7 +176,7 @@ def _without_remarks(text: str) -> str:
     return re.sub(r"\A[#%]\s*", "", text)
 
 
-def _from_one(columns: dict[str, int]) -> dict[str, int]:
+def from_one(columns: dict[str, int]) -> dict[str, int]:
     """Joints that are numbered from 0, numbered from 1."""
     if sorted(columns) != sorted(str(k) for k in range(len(columns))):
         return columns

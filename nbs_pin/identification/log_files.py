@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from nbs_pin.base.csv_files import (
     QUANTITIES,
     ROS_NAMES,
+    from_one,
     header_of,
     joint_columns,
     joint_order,
@@ -199,7 +200,7 @@ def _picked(path: Path, header: list[str], kind: str, chosen: Mapping[str, str])
             named = {(match[1] if "*" in part else str(len(found) + 1)): k for match, k in matches if match}
             if not named:
                 raise ArgumentError(f"columns has {kind}={part}, and {path} {', '.join(header)}; correct the name.")
-            found |= named
+            found |= from_one(named)
     return found
 
 

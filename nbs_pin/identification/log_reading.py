@@ -28,6 +28,9 @@ from nbs_pin.identification.resampling import evenly, parted
 from nbs_pin.motions.recordings import TURN, Joints, degrees_fault, in_radians, seams, seconds_in, time_fault, unwrapped
 from nbs_pin.robots.robot import Robot
 
+_MOST_RESTARTS = 1000
+"""Most times that the clock of a file goes back where recordings begin; a clock that does so more often is none."""
+
 
 @dataclass(frozen=True)
 class LogSettings:
@@ -69,7 +72,7 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
     read = _in_units(path, _scaled(read, settings), joints, settings.degrees, settings.time_unit, robot)
     if settings.zero is not None:
         read = read._replace(q=read.q + settings.zero)
-    read, absent, blanks = _filled(read)
+    read, absent, blanks = _filled(*_clocked(read))
     _dataset(path, read._replace(v=read.q, a=read.q), tree, name, {})  # refuses what is no table of numbers
     spacing, more, limits = _spacing(read), list[str](), None
     if spacing["rows"] > len(np.unique(read.trajectory)):  # not of single states
@@ -164,35 +167,59 @@ def _spacing(columns: Columns) -> dict[str, Any]:
     return {"rows": len(columns.t), "steps_s": [float(f(known)) for f in (np.min, np.median, np.max)]}
 
 
-def _filled(columns: Columns) -> tuple[Columns, np.ndarray, list[str]]:
-    """The columns with NaN in q, v, a and tau bridged, which rows had some, and a note on them."""
-    found, absent, place = {}, np.zeros(len(columns.t), dtype=bool), np.arange(len(columns.t))
+def _clocked(columns: Columns) -> tuple[Columns, np.ndarray, list[str]]:
+    """The columns with times that increase, rows that have the time of the row before, and notes.
+
+    Where time goes back another recording begins.
+    """
+    t, numbers, notes = columns.t.copy(), columns.trajectory.copy(), []
+    same = np.diff(columns.trajectory) == 0
+    back = np.flatnonzero(same & (np.diff(t) < 0.0)) + 1
+    stopped = np.append(False, same & (np.diff(t) == 0.0))
+    if not np.isfinite(t).all() or stopped.mean() > 0.5 or len(back) > _MOST_RESTARTS:
+        return columns, np.zeros(len(t), dtype=bool), []
+    if len(back):
+        more = f", and {len(back) - 1} more times" if len(back) > 1 else ""
+        notes.append(f"time goes back between rows {back[0]} and {back[0] + 1}{more}: another recording begins there")
+        numbers = np.unique(numbers, return_inverse=True)[1] + np.searchsorted(back, np.arange(len(t)), side="right")
+    if stopped.any():
+        many = f"{np.count_nonzero(stopped)} rows with the time of the row before were left out"
+        notes.append(f"{many}, first row {int(np.argmax(stopped)) + 1}")
+        for rows in trajectory_slices(numbers):
+            place, moves = np.arange(rows.stop - rows.start), ~stopped[rows]
+            late = place > place[moves].max()  # at the end, which nothing follows
+            t[rows] = np.interp(place, place[moves], t[rows][moves]) + 1e-6 * np.cumsum(late)
+    return columns._replace(t=t, trajectory=numbers), stopped, notes
+
+
+def _filled(columns: Columns, absent: np.ndarray, notes: list[str]) -> tuple[Columns, np.ndarray, list[str]]:
+    """The columns with NaN in q, v, a and tau bridged, which rows had some or are absent already, and notes."""
+    found, holes, place = {}, np.zeros(len(columns.t), dtype=bool), np.arange(len(columns.t))
     for name in ("q", "v", "a", "tau"):
         x = getattr(columns, name)
-        if x is not None and np.isnan(x).any() and np.isfinite(columns.t).all():
+        if x is not None and np.isnan(x).any() and not np.isnan(x).all():
             blank = np.isnan(x).any(axis=1)
-            absent |= blank
-            if blank.all():
-                continue
-            found[name] = np.column_stack([np.interp(place, place[~blank], y[~blank]) for y in x.T])
-    if not absent.any() or absent.mean() > 0.5:
-        return columns, np.zeros(len(columns.t), dtype=bool), []
-    rows = f"{np.count_nonzero(absent)} rows with entries that are missing were left out"
-    return columns._replace(**found), absent, [f"{rows}, first row {int(np.argmax(absent)) + 1}"]
+            holes |= blank
+            if not blank.all():
+                found[name] = np.column_stack([np.interp(place, place[~blank], y[~blank]) for y in x.T])
+    if not holes.any() or holes.mean() > 0.5:
+        return columns, absent, notes
+    many = f"{np.count_nonzero(holes)} rows with entries that are missing were left out"
+    return columns._replace(**found), absent | holes, [*notes, f"{many}, first row {int(np.argmax(holes)) + 1}"]
 
 
 def _put_right(
     path: Path, columns: Columns, joints: Joints, degrees: bool | None, absent: Bool[np.ndarray, " rows"]
 ) -> tuple[Columns, np.ndarray, list[str]]:
     """The columns without wraps and what is wrong in single rows, the limits of the torques, and notes."""
-    found = repaired(columns, joints)
+    found = repaired(columns, joints, absent)
     columns, stretches = found.columns, trajectory_slices(found.columns.trajectory)
     turned = unwrapped(columns.q, joints, stretches, degrees)
     if turned.fault:
         raise FileFormatError(f"{path}: {turned.fault}.")
     columns = columns._replace(q=turned.q)
     pieces = parted(columns, seams(columns.t, columns.q, joints, stretches))
-    columns = columns._replace(trajectory=pieces.numbers).take(found.fresh & pieces.kept & ~absent)
+    columns = columns._replace(trajectory=pieces.numbers).take(found.fresh & pieces.kept)
     return columns, found.limits, [*found.notes, *turned.notes, *pieces.notes]
 
 

@@ -52,9 +52,12 @@ class Repaired(NamedTuple):
     notes: tuple[str, ...]
 
 
-def repaired(columns: Columns, joints: Joints) -> Repaired:
-    """The columns without what is wrong in single rows; all rows are there still, so that they can be named."""
-    fresh, repeats = _fresh(columns)
+def repaired(columns: Columns, joints: Joints, absent: Bool[np.ndarray, " rows"]) -> Repaired:
+    """The columns without what is wrong in single rows; all rows are there still, so that they can be named.
+
+    Rows that are `absent` for another reason are not fresh.
+    """
+    fresh, repeats = _fresh(columns, absent)
     columns, zeros = _without_zero_rates(columns, joints)
     limits, cut = _cut(columns.tau, fresh, joints)
     rows, notes = trajectory_slices(columns.trajectory), [*repeats, *zeros, *cut]
@@ -67,16 +70,17 @@ def repaired(columns: Columns, joints: Joints) -> Repaired:
     return Repaired(columns._replace(q=q), fresh, limits, (*notes, *noted))
 
 
-def _fresh(columns: Columns) -> tuple[np.ndarray, list[str]]:
+def _fresh(columns: Columns, absent: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Rows whose q, v or tau differ from the row before: an arm that is asked too soon answers the same again."""
     same = np.zeros(len(columns.t), dtype=bool)
     signals = [x for x in (columns.q, columns.v, columns.tau) if x is not None]
     for rows in trajectory_slices(columns.trajectory):
         alike = np.logical_and.reduce([(np.diff(x[rows], axis=0) == 0.0).all(axis=1) for x in signals])
         same[rows] = np.append(False, alike & ~_long(alike, _REPEATED))
+    same &= ~absent
     if not same.any() or same.mean() > 0.5:
-        return np.ones(len(same), dtype=bool), []
-    return ~same, [f"{_rows(same)} that repeat the one before were left out, first row {_first(same)}"]
+        return ~absent, []
+    return ~(same | absent), [f"{_rows(same)} that repeat the one before were left out, first row {_first(same)}"]
 
 
 def _without_zero_rates(columns: Columns, joints: Joints) -> tuple[Columns, list[str]]:
