@@ -64,6 +64,7 @@ from .dynamics.provider import DynamicsProvider as DynamicsProvider
 from .dynamics.residual import ResidualDynamics as ResidualDynamics
 from .identification.collect import collect as collect
 from .identification.datasets import Dataset as Dataset, load_dataset as load_dataset
+from .identification.exciting_motion import ExcitingMotion as ExcitingMotion, exciting_motion as exciting_motion
 from .identification.fit import fit as fit
 from .identification.identify import identify as identify
 from .identification.logs import load_log as load_log

@@ -45,6 +45,7 @@ HOMES = {
     "toppra": {"motions.least_time"},
     "scipy": {"motions", "robots.mass_matrix", "inertia", "accuracy", "identification", "certificates"},
     "clarabel": {"inertia.multipliers"},
+    "coal": {"robots.collisions"},
     "flint": {"verification.balls"},
     "jsonschema": {"verification.document"},
     "threadpoolctl": {"identification.chain_fit", "identification.explain"},

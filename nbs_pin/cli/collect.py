@@ -23,7 +23,7 @@ class Collect(Reported):
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
     """An arm by name (see nbs-pin robots) or a path to a .urdf, .xacro or MJCF file."""
     recipe: Literal["excited", "reference", "passive", "uniform"] = "excited"
-    """excited: random multisine torques about a soft PD. reference: tracking of sinusoids.
+    """excited: random multisine torques about a soft PD. reference: tracking of --reference, or of sinusoids.
     passive: one swing without torque from q = 0, as in the paper; it does not determine the scale of the torque.
     uniform: independent random states, which no real arm provides."""
     samples: Annotated[int, integer("--samples", least=1, most=10_000_000)] = 10_000
@@ -32,8 +32,12 @@ class Collect(Reported):
         float | None, number("--sampling", least=0.001, most=10.0, unit="s"), default("0.01 to 0.05, passive 0.001")
     ] = None
     """Sampling time, a whole number of milliseconds [s]."""
-    duration: Annotated[float, number("--duration", above=0.0, most=1000.0, unit="s")] = 3.0
+    duration: Annotated[
+        float | None, number("--duration", above=0.0, most=1000.0, unit="s"), default("3, or the reference's")
+    ] = None
     """Length of an excited or reference trajectory [s]."""
+    reference: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("random sinusoids")] = None
+    """Motion that --recipe reference follows, a .csv or .npz file as nbs-pin excite writes it."""
     speed: Annotated[float, number("--speed", above=0.0, most=100.0, unit="rad/s")] = 2.0
     """Typical joint speed; peaks stay near the velocity limits [rad/s]."""
     friction: bool = False

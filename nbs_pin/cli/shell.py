@@ -24,6 +24,7 @@ from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.compare import Compare
+from nbs_pin.cli.excite import Excite
 from nbs_pin.cli.exit_codes import BAD_INPUT, NO_PROMISE, SIGNALLED
 from nbs_pin.cli.export import Export
 from nbs_pin.cli.faults import Faults
@@ -43,6 +44,7 @@ from nbs_pin.cli.verify import Verify
 COMMANDS: dict[str, type] = {
     "track": Track,
     "train": Train,
+    "excite": Excite,
     "collect": Collect,
     "log": Log,
     "learn": Learn,

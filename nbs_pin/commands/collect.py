@@ -16,6 +16,7 @@ from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import torque_limits
 from nbs_pin.identification.measurement import Noise
+from nbs_pin.motions.reference_files import load_reference
 from nbs_pin.reports.captions import chosen
 from nbs_pin.reports.plotting import ACTUAL, LIMIT, TORQUE, Heading, picture
 from nbs_pin.reports.verdicts import verdict_of
@@ -38,6 +39,7 @@ def run(options: Collect, console: Console, notes: Console) -> None:
     given = keywords(options, collect) | {
         "noise": Noise(0.0 if options.encoder_bits is None else 2.0**-options.encoder_bits, options.torque_noise),
         "acceleration": "differentiated" if options.differentiated else None,
+        "reference": None if options.reference is None else load_reference(options.reference, robot),
     }
     with results.made() as folder:
         data = collect(robot, options.recipe, options.samples, options.seed, **given, progress=True)

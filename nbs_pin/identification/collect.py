@@ -11,6 +11,7 @@ import numpy as np
 from nbs_pin.base.arguments import SEED, a, checked, choice, count, either, flag, maybe, number
 from nbs_pin.base.arrays import Array, Vectors
 from nbs_pin.base.checks import whole
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.controllers.controller import Controller, MemorylessController
@@ -21,7 +22,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.excitation import configuration_box, excitation, soft_pd, torque_limits, work
 from nbs_pin.identification.measurement import CLEAN_WINDOW, QUANTISED_WINDOW, Noise, derivative, quantised
-from nbs_pin.motions.references import DesiredMotion, Hold
+from nbs_pin.motions.references import MOTION, DesiredMotion, Hold
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 from nbs_pin.simulation.simulate import simulate
@@ -34,6 +35,7 @@ RECORD_STEP = 1e-3
 """Control period, plant step and spacing of the samples that are differentiated [s]."""
 _TIMED = ("excited", "reference")
 _TRAJECTORIES = 20
+_DURATION = 3.0  # [s]
 
 
 @checked(
@@ -45,7 +47,8 @@ _TRAJECTORIES = 20
     acceleration=maybe(choice(*get_args(Acceleration))),
     friction=either(FRICTION, flag),
     sampling=maybe(number(least=RECORD_STEP, most=10.0, unit="s")),
-    duration=number(above=0.0, most=1000.0, unit="s"),
+    duration=maybe(number(above=0.0, most=1000.0, unit="s")),
+    reference=maybe(MOTION),
     speed=number(above=0.0, most=1000.0, unit="rad/s"),
     progress=flag,
 )
@@ -59,14 +62,16 @@ def collect(
     acceleration: str | None = None,
     friction: bool | JointFriction = False,
     sampling: float | None = None,
-    duration: float = 3.0,
+    duration: float | None = None,
+    reference: DesiredMotion | None = None,
     speed: float = 2.0,
     progress: bool = False,
 ) -> Dataset:
     """Collect samples of the arm's motion in MuJoCo, as they would be recorded in an experiment.
 
     - "excited": random multisine torques, 0.2 to 1.5 Hz, about a soft PD, from anywhere in the joint ranges
-    - "reference": PD+ along `Sinusoid.for_robot` of random frequency and phase, as in typical use of an arm
+    - "reference": PD+ along the motion `reference`, such as that of `exciting_motion`; without one along
+      `Sinusoid.for_robot` of random frequency and phase, as in typical use of an arm
     - "passive": one swing from rest at q = 0 without torque, a sample every 1 ms: the paper's data, which cannot
       distinguish M, G from c·M, c·G (docs/theory.md §6)
     - "uniform": independent random q (one turn at most), v and τ within limits; not measurable, but fully identifiable
@@ -80,8 +85,11 @@ def collect(
         acceleration: Source of v̇, "simulator" or "differentiated" from v (Savitzky–Golay); τ is then the mean of the
             torques held before and after. None takes "simulator"; quantised encoders give v and v̇ as derivatives of q.
         friction: True simulates that of the URDF, a `JointFriction` another (MuJoCo has no transition); τ includes it.
-        sampling: Sampling time [s], whole ms. None takes 0.001 for "passive", else 0.01 to 0.05, for 20 trajectories.
-        duration: Longest duration of an "excited" or "reference" trajectory [s].
+        sampling: Sampling time [s], whole ms. None takes 0.001 for "passive", else 0.01 to 0.05, for 20 trajectories,
+            or 0.001 to 0.05, for one along `reference`.
+        duration: Longest duration of an "excited" or "reference" trajectory [s]. None takes that of the `reference`,
+            if it states one, else 3.
+        reference: A motion for the recipe "reference", from its beginning in every trajectory.
         speed: Bound of |v| in "uniform" [rad/s]; typical |v| in "excited", with peaks near the velocity limit.
         progress: Show a progress bar at a terminal if the collection takes longer than 2 s.
 
@@ -96,13 +104,15 @@ def collect(
         Dataset(100 samples of two_link, 100 trajectories, 2 joints)
     """
     noise = noise or Noise()
-    _check(recipe, noise, acceleration)
+    _check(recipe, noise, acceleration, reference)
     acting = JointFriction.of(robot) if friction is True else friction or None
-    interval = _interval(recipe, samples, sampling, duration)
+    duration = float(getattr(reference, "duration", _DURATION)) if duration is None else duration
+    interval = _interval(recipe, samples, sampling, duration, 1 if reference else _TRAJECTORIES)
     stride = whole(interval, RECORD_STEP, "sampling", "step of the record")
-    counts = [samples] if recipe == "passive" else _shares(samples, int(duration / interval + 1e-9))
+    longest = int(duration / interval + 1e-9)
+    counts = [samples] if recipe == "passive" else _shares(samples, longest, 1 if reference else 2)
     generator, differentiated = np.random.default_rng(seed), acceleration == "differentiated" or noise.encoder > 0.0
-    bench = _bench(recipe, robot, acting, speed)
+    bench = _bench(recipe, robot, acting, speed, reference)
     if recipe == "uniform":
         counts, columns = [1] * samples, _states(bench, samples, speed, generator)
     else:
@@ -174,10 +184,12 @@ class _Bench:
         return _Record(t, q, v, self.plant.acceleration(q, v, tau), tau)
 
 
-def _bench(recipe: str, robot: Robot, friction: JointFriction | None, speed: float) -> _Bench:
+def _bench(
+    recipe: str, robot: Robot, friction: JointFriction | None, speed: float, reference: DesiredMotion | None
+) -> _Bench:
     aims: dict[str, Callable[[np.random.Generator], DesiredMotion]] = {
         "excited": partial(excitation, robot, speed=speed),
-        "reference": partial(work, robot),
+        "reference": partial(work, robot) if reference is None else lambda _: reference,
     }
     law: Controller = _Idle(robot.nv)
     if recipe == "excited":
@@ -228,23 +240,26 @@ def _states(bench: _Bench, samples: int, speed: float, generator: np.random.Gene
     return np.zeros(samples), q, v, bench.plant.acceleration(q, v, tau), tau
 
 
-def _interval(recipe: str, samples: int, sampling: float | None, duration: float) -> float:
-    """Time between samples [s]: `sampling`, or the default of the recipe."""
+def _interval(recipe: str, samples: int, sampling: float | None, duration: float, trajectories: int) -> float:
+    """Time between samples [s]: `sampling`, or the default of the recipe, for so many trajectories."""
     if sampling is None:
-        spread = round(_TRAJECTORIES * duration / samples / RECORD_STEP)
-        sampling = RECORD_STEP * (1 if recipe == "passive" else min(max(spread, 10), 50))
+        spread = round(trajectories * duration / samples / RECORD_STEP)
+        sampling = RECORD_STEP * (1 if recipe == "passive" else min(max(spread, 10 if trajectories > 1 else 1), 50))
     if duration < sampling and recipe in _TIMED:
         raise ArgumentError(f"duration is {duration} s, expected at least sampling = {sampling:g} s; make it longer.")
     return sampling
 
 
-def _shares(samples: int, longest: int) -> list[int]:
-    """Samples of each trajectory: nearly equal, at most `longest`, for two or more trajectories if possible."""
-    count = min(max(math.ceil(samples / max(longest, 1)), 2), samples)
+def _shares(samples: int, longest: int, fewest: int) -> list[int]:
+    """Samples of each trajectory: nearly equal, at most `longest`, for `fewest` trajectories or more if possible."""
+    count = min(max(math.ceil(samples / max(longest, 1)), fewest), samples)
     return np.diff(np.linspace(0, samples, count + 1).astype(int)).tolist()
 
 
-def _check(recipe: str, noise: Noise, acceleration: str | None) -> None:
+def _check(recipe: str, noise: Noise, acceleration: str | None, reference: DesiredMotion | None) -> None:
+    if reference is not None and recipe != "reference":
+        remedy = option("recipe", "reference")
+        raise ArgumentError(f"a reference was given, and recipe '{recipe}' follows none; give {remedy}.")
     if noise.encoder > 0.0 and acceleration == "simulator":
         raise ArgumentError("acceleration 'simulator' excludes rounded encoders; leave acceleration out.")
     if recipe == "uniform" and (noise.encoder > 0.0 or acceleration == "differentiated"):

@@ -20,6 +20,9 @@ _USABLE = 0.1
 _CONSTANT = 100.0
 """That ratio above which it says nothing, as the torque hardly varies."""
 
+_ILL = 1e5
+"""Condition number of an exciting motion above which sensors would leave some parameters to the prior."""
+
 
 class Verdict(NamedTuple):
     """What the results amount to."""
@@ -314,6 +317,22 @@ def _collected(figures: Mapping[str, Any]) -> Verdict:
     return Verdict(GOOD if covered[least] >= 0.5 else WARNING, said, (limited,))
 
 
+def _exciting(figures: Mapping[str, Any]) -> Verdict:
+    """How well the parameters are excited, and what that takes of the arm."""
+    condition, joints = _number(figures["condition_number"]), figures["joints"]
+    said = f"condition number {condition:.3g} of {figures['unknowns']} unknowns, in {figures['duration_s']:g} s"
+    peaks = []
+    for what in ("velocity", "torque"):
+        shares = [_number(share) for share in figures[f"peak_{what}_fraction"]]
+        most = max(range(len(joints)), key=shares.__getitem__)
+        peaks.append(f"{shares[most]:.0%} of the {what} limit of {joints[most]}")
+    more = [f"at most it takes {' and '.join(peaks)}"]
+    if figures["nearest"]:
+        first, second = figures["nearest"]
+        more.append(f"{first} and {second} come nearest to each other, {measured(figures['clearance_m'], 'm')}")
+    return Verdict(GOOD if condition < _ILL else WARNING, said, tuple(more))
+
+
 def _benched(figures: Mapping[str, Any]) -> Verdict:
     told = ", ".join(f"{time:.3g} µs of {what}" for what, time in figures["control_step_p50_us"].items())
     return Verdict(NOTE, f"one control step takes, in the median, {told}" if told else "no control step was timed")
@@ -332,6 +351,7 @@ _JUDGES: dict[str, Callable[[Mapping[str, Any]], Verdict]] = {
     "rms_test_torque_error_Nm": _learned,
     "held_out_cost_lowered_by": _trained,
     "covered_range_fraction": _collected,
+    "condition_number": _exciting,
     "control_step_p50_us": _benched,
     "stopped": _tracking,
 }

@@ -1,14 +1,13 @@
 """The paper's experiments on its two-link arm reproduced: Table I, its figures and the sweep over α."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from nbs_pin.base.records import Run
+from nbs_pin.base.torch_threads import one_thread
 from nbs_pin.controllers.neural_backstepping import paper_controller
 from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.reports.charts import plot_motions
@@ -41,7 +40,7 @@ def reproduce_paper(
     scale = scale or Scale()
     seeds = range(seed, seed + scale.seeds)
     alphas = np.linspace(0.0, 2.0, scale.alphas + 1)[1:]
-    with _one_thread():
+    with one_thread():
         pids, pid_runs = paper_table.pid_rows(scale.duration)
         authors, authors_run = paper_table.authors_rows(seeds, scale.epochs, scale.duration, progress)
         package, package_runs = paper_table.package_rows(seeds, scale.epochs, scale.duration, progress)
@@ -50,17 +49,6 @@ def reproduce_paper(
         flat = paper_alpha.as_printed(alphas, seeds, scale.epochs, scale.duration)
         swept = paper_alpha.sweep(alphas, seed, scale.epochs, scale.duration, progress)
     yield paper_alpha.section(flat, swept, seeds, folder)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch on one thread: with these small matrices several threads take ten times as long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _motions(seeds: range, authors: Run, package: Sequence[Run], pids: dict[str, Run], folder: Path) -> Section:

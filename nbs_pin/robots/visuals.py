@@ -106,7 +106,31 @@ def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple
     So are links with a visual that cannot be drawn, whatever is wrong with it: a warning names link and fault. Meshes
     may also be read from `package_dirs`.
     """
+    visuals, faults = _shapes(robot, _root(robot), package_dirs)
+    for reason in dict.fromkeys(faults.values()):
+        links = [name for name, fault in faults.items() if fault == reason]
+        several = f"links {', '.join(map(repr, links[:5]))}{' …' * (len(links) > 5)} are drawn as capsules"
+        warnings.warn(
+            f"{several if len(links) > 1 else f'link {links[0]!r} is drawn as a capsule'}: {reason}", stacklevel=2
+        )
+    return (*visuals, *_capsules(robot, {visual.link for visual in visuals}, set(faults)))
+
+
+def collision_shapes(robot: Robot) -> tuple[tuple[Visual, ...], dict[str, str]]:
+    """The collision shapes of all links, the visual ones of links without; and what is wrong with others, by link."""
     root = _root(robot)
+    for link in root.iterfind("link"):
+        if link.find("collision") is not None:
+            for visual in link.findall("visual"):
+                link.remove(visual)
+            for shape in link.findall("collision"):
+                shape.tag = "visual"
+    visuals, faults = _shapes(robot, root)
+    return tuple(visuals), faults
+
+
+def _shapes(robot: Robot, root: Any, package_dirs: Iterable[str | Path] = ()) -> tuple[list[Visual], dict[str, str]]:
+    """The shapes of the visuals in the description, and the faults of those that cannot be drawn, by link."""
     packages = Packages(robot.urdf.path, (*package_dirs, *robot.options.get("package_dirs", ())))
     faults = _without_faulty_visuals(root)
     description = _described(robot, root)
@@ -118,13 +142,7 @@ def link_visuals(robot: Robot, package_dirs: Iterable[str | Path] = ()) -> tuple
                 visuals += _drawn(link.name, visual, _parts(visual.geometry, packages), materials)
             except MeshError as error:
                 faults.setdefault(link.name, str(error))
-    for reason in dict.fromkeys(faults.values()):
-        links = [name for name, fault in faults.items() if fault == reason]
-        several = f"links {', '.join(map(repr, links[:5]))}{' …' * (len(links) > 5)} are drawn as capsules"
-        warnings.warn(
-            f"{several if len(links) > 1 else f'link {links[0]!r} is drawn as a capsule'}: {reason}", stacklevel=2
-        )
-    return (*visuals, *_capsules(robot, {visual.link for visual in visuals}, set(faults)))
+    return visuals, faults
 
 
 def tips(robot: Robot) -> tuple[Tip, ...]:
