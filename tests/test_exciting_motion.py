@@ -19,7 +19,7 @@ from nbs_pin.robots.collisions import SelfDistances
 from tests.commands import check_results_are_kept_unless_forced, printed_by, summary
 from tests.random_arms import random_arm
 
-QUICK = {"duration": 4.0, "band": 1.0, "starts": 2}
+QUICK = {"duration": 4.0, "band": 1.0, "starts": 1}
 TWO = nbs.load_robot("two_link")
 FOLDABLE = """<robot name="foldable"><link name="base"/>{}</robot>"""
 
@@ -34,7 +34,7 @@ def foldable(tmp_path_factory):
         parts.append(
             f'<link name="bar{i}">{body}<collision>{shape}</collision></link><joint name="j{i}" type="revolute">'
             f'<origin xyz="{0.3 * (i > 1)} 0 0"/><parent link="{parent}"/><child link="bar{i}"/><axis xyz="0 0 1"/>'
-            '<limit lower="-2.9" upper="2.9" effort="20" velocity="3"/></joint>'
+            f'<limit lower="{-2.9 + 2.4 * (i > 1)}" upper="2.9" effort="20" velocity="3"/></joint>'
         )
     path = tmp_path_factory.mktemp("arms") / "foldable.urdf"
     path.write_text(FOLDABLE.format("".join(parts)))
@@ -107,7 +107,7 @@ def test_limits_are_kept_between_the_instants_of_the_search(seed, share, acceler
     assert_allclose([x[[0, -1]] for x in moved[1:]], 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [2])
 def test_the_condition_number_is_that_of_pinocchios_regressor(seed, tmp_path, monkeypatch):
     robot = random_arm(seed, tmp_path, joints=3)
     options = {"friction": False, "rotor_inertia": False}
@@ -170,7 +170,7 @@ def test_what_it_excites_is_identified():
     assert_allclose(seen, truth, atol=0.01 * np.abs(truth).max())
 
 
-@pytest.mark.parametrize("calls", [0, 25, 70])
+@pytest.mark.parametrize("calls", [0, 10, 60])
 def test_ctrl_c_keeps_the_best_so_far(calls, monkeypatch):
     value, left = Problem.value, [calls]
 
@@ -181,7 +181,7 @@ def test_ctrl_c_keeps_the_best_so_far(calls, monkeypatch):
         return value(self, *arguments)
 
     monkeypatch.setattr(Problem, "value", interrupted)
-    if calls < 40:  # within the first start
+    if calls < 20:  # within the first start
         with pytest.raises(KeyboardInterrupt):
             exciting_motion(TWO, **QUICK)
         return
@@ -194,7 +194,7 @@ def test_ctrl_c_keeps_the_best_so_far(calls, monkeypatch):
     ("options", "words"),
     [
         ({"band": 0.1}, "hold 1 multiples"),
-        ({"duration": 1000.0}, "at most"),
+        ({"duration": 1000.0}, "hold 1000 multiples"),
         ({"duration": np.nan}, "duration is nan"),
         ({"band": np.inf}, "band is inf"),
         ({"share": 1.5}, "share is 1.5"),
@@ -212,7 +212,7 @@ def test_bad_options_are_refused(options, words):
 @pytest.mark.parametrize(
     ("robot", "words"),
     [
-        (lambda: TWO.with_effort_limit([0.5, 0.5]), "'joint1' cannot hold the arm with 80% of its effort, 0.4 N·m"),
+        (lambda: TWO.with_effort_limit([0.01, 9.0]), "'joint1' cannot hold the arm with 80% of its effort, 0.008 N·m"),
         (lambda: TWO.with_friction(coulomb=[1.0, 90.0]), "Coulomb friction 90 N·m of joint 'joint2' takes all of 80%"),
     ],
 )
@@ -225,16 +225,16 @@ def test_the_command_writes_a_motion_that_track_and_collect_follow(tmp_path, cap
     folder = tmp_path / "x"
 
     def run(out, *options):
-        words = ["excite", "two_link", "--duration", "4", "--starts", "2", "--out", str(out), "-v", *options]
+        words = ["excite", "two_link", "--duration", "2", "--starts", "1", "--out", str(out), "-v", *options]
         return cli.main(words)
 
     check_results_are_kept_unless_forced(run, folder, ("--seed", "3"), "another motion", capsys)
     figures = summary(folder)["figures"]
-    expected = exciting_motion(TWO, duration=4.0, starts=2, seed=3)
+    expected = exciting_motion(TWO, duration=2.0, starts=1, seed=3)
     assert figures["condition_number"] == expected.condition
     assert sorted(path.name for path in folder.iterdir()) == ["excitation.png", "motion.csv", "summary.json"]
     read = nbs.load_reference(folder / "motion.csv", TWO)
-    t = np.linspace(0.0, 4.0, 77)
+    t = np.linspace(0.0, 2.0, 77)
     assert_allclose(read(t).a, expected(t).a, atol=1e-4 * np.abs(expected(t).a).max())
     said = printed_by("track", "two_link", "--reference", folder / "motion.csv", "--out", tmp_path / "y")
     assert "converged" in said

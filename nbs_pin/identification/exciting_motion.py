@@ -32,7 +32,7 @@ FEWEST_HARMONICS, MOST_HARMONICS = 2, 50
 """Multiples of 1 / duration in the band."""
 _ROWS = 1_000_000
 """Most rows of a file."""
-_NEAR, _POSES = 0.15, 400
+_NEAR, _POSES = 0.05, 400
 """Pairs of bodies that come nearer than this in one of so many random poses are watched in the search [m]."""
 _TRANSITION = 0.01
 """Speed scale of Coulomb friction, that of `identify` [rad/s]."""
@@ -132,7 +132,7 @@ def exciting_motion(
     clearance: float | None = 0.01,
     friction: bool = True,
     rotor_inertia: bool = True,
-    starts: int = 16,
+    starts: int = 40,
     seed: int = 0,
     progress: bool = False,
 ) -> ExcitingMotion:
