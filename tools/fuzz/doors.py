@@ -19,7 +19,7 @@ RESULTS = (
     "Attack", "Certificate", "ModelErrors", "Monitored", "Training", "Proposal", "Verification", "Robot", "Reference",
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
-    "FaultReport", "Mode", "Sample", "ExternalTorque", "ObservedTorques", "Estimate", "TransientBound",
+    "FaultReport", "Mode", "Sample", "ExcitingMotion", "ExternalTorque", "ObservedTorques", "TransientBound",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -114,6 +114,9 @@ class Stock:
     def _tool_path(self) -> Any:
         begin = self.robot.pose(BENT, "tip")[:3, 3]
         return nbs.ToolPath.line(begin, [-0.1, 0.0, 0.05])
+
+    def _exciting(self) -> Any:
+        return nbs.exciting_motion(self.robot, duration=2.0, starts=1)
 
     def _tool_motion(self) -> Any:
         return nbs.tool_motion(self.robot, self.tool_path, "tip", posture=BENT)
@@ -234,11 +237,13 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "attack": {"rounds": 0, "starts": 1, "effort_limit": np.inf},
         "certified_margins": {"acceleration": 2.0, "velocity": 1.0},
         "certify": {"duration": 0.5, "q0": Q, "v0": Z},
-        "collect": {"recipe": "uniform", "samples": 20, "friction": False, "duration": 3.0},
+        "collect": {"recipe": "uniform", "samples": 20, "friction": False, "duration": 3.0, "reference": None},
         "compare": {"samples": 20, "motions": 1, "run": None, "friction": None},
         "about": {"path": s.path("law.nbs", functools.partial(nbs.save, s.law))},
         "load": {"path": s.path("law.nbs", functools.partial(nbs.save, s.law)), "robot": None},
         "save": {"path": s.folder / "saved.nbs"},
+        "exciting_motion": {"duration": 2.0, "band": 1.0, "starts": 1},
+        "ExcitingMotion.save": {"path": s.folder / "exciting.csv", "period": 0.01},
         "fit": {"model": "chain", "friction": False, "held_out": None, "starts": 1},
         "identify": {"friction": False, "rotor_inertia": False},
         "load_dataset": {"path": s.path("data.npz", s.data.save)},
@@ -293,7 +298,7 @@ def _subjects(s: Stock) -> dict[str, Any]:
         nbs.Sampled(np.arange(5.0), np.zeros((5, 2))), s.motion, nbs.SinusoidalTorque([1.0, 2.0], 2.0),
         nbs.SlidingMode.for_robot(s.robot), nbs.SlotineLi.for_robot(s.robot), nbs.SquareWave([1.0, 2.0], 2.0),
         nbs.TimeOutside(), nbs.TorqueAware.for_robot(s.robot), nbs.TorqueNoise(1.0, 0.01), nbs.Uncertainty(0.1),
-        nbs.Watch(s.certificate), s.tool_path, s.tool_motion, nbs.Margins(0.1),
+        nbs.Watch(s.certificate), s.exciting, s.tool_path, s.tool_motion, nbs.Margins(0.1),
         nbs.tool_errors(s.run, s.robot, "tip"), nbs.ChangingPlant(s.plant, [(0.005, nbs.MujocoPlant(s.robot))]),
         nbs.tool_errors(s.run, s.robot, "tip"), s.observer, s.observer.observe(s.run),
     ]  # fmt: skip
