@@ -70,8 +70,7 @@ def collect(
     """Collect samples of the arm's motion in MuJoCo, as they would be recorded in an experiment.
 
     - "excited": random multisine torques, 0.2 to 1.5 Hz, about a soft PD, from anywhere in the joint ranges
-    - "reference": PD+ along the motion `reference`, such as that of `exciting_motion`; without one along
-      `Sinusoid.for_robot` of random frequency and phase, as in typical use of an arm
+    - "reference": PD+ along `reference`, or `Sinusoid.for_robot` of random frequency and phase, as in typical use
     - "passive": one swing from rest at q = 0 without torque, a sample every 1 ms: the paper's data, which cannot
       distinguish M, G from c·M, c·G (docs/theory.md §6)
     - "uniform": independent random q (one turn at most), v and τ within limits; not measurable, but fully identifiable
@@ -85,11 +84,10 @@ def collect(
         acceleration: Source of v̇, "simulator" or "differentiated" from v (Savitzky–Golay); τ is then the mean of the
             torques held before and after. None takes "simulator"; quantised encoders give v and v̇ as derivatives of q.
         friction: True simulates that of the URDF, a `JointFriction` another (MuJoCo has no transition); τ includes it.
-        sampling: Sampling time [s], whole ms. None takes 0.001 for "passive", else 0.01 to 0.05, for 20 trajectories,
-            or 0.001 to 0.05, for one along `reference`.
-        duration: Longest duration of an "excited" or "reference" trajectory [s]. None takes that of the `reference`,
-            if it states one, else 3.
-        reference: A motion for the recipe "reference", from its beginning in every trajectory.
+        sampling: Sampling time [s], whole ms. None takes 0.001 for "passive", else 0.01 to 0.05, for 20 trajectories;
+            0.001 to 0.05, for one, along a given reference.
+        duration: Longest "excited" or "reference" trajectory [s]. None takes the `reference.duration`, else 3.
+        reference: A motion for the recipe of that name, such as an `ExcitingMotion`; every trajectory begins with it.
         speed: Bound of |v| in "uniform" [rad/s]; typical |v| in "excited", with peaks near the velocity limit.
         progress: Show a progress bar at a terminal if the collection takes longer than 2 s.
 
@@ -106,11 +104,7 @@ def collect(
     noise = noise or Noise()
     _check(recipe, noise, acceleration, reference)
     acting = JointFriction.of(robot) if friction is True else friction or None
-    duration = float(getattr(reference, "duration", _DURATION)) if duration is None else duration
-    interval = _interval(recipe, samples, sampling, duration, 1 if reference else _TRAJECTORIES)
-    stride = whole(interval, RECORD_STEP, "sampling", "step of the record")
-    longest = int(duration / interval + 1e-9)
-    counts = [samples] if recipe == "passive" else _shares(samples, longest, 1 if reference else 2)
+    counts, interval, stride = _parts(recipe, samples, sampling, duration, reference)
     generator, differentiated = np.random.default_rng(seed), acceleration == "differentiated" or noise.encoder > 0.0
     bench = _bench(recipe, robot, acting, speed, reference)
     if recipe == "uniform":
@@ -119,7 +113,6 @@ def collect(
         instruments = _Instruments(stride, noise, differentiated)
         seen = [instruments.read(bench, generator, k) for k in tracked(counts, "collecting data", progress)]
         columns = tuple(np.concatenate(parts) for parts in zip(*seen, strict=True))
-    t, q, v, a, tau = columns
     about: dict[str, Any] = {
         "recipe": recipe,
         "seed": seed,
@@ -130,9 +123,10 @@ def collect(
         "speed": speed,
         "robot": {"source": robot.source, "sha256": robot.sha256, "options": robot.options},
     }
+    t, q, v, a, tau = columns
     tau = tau + noise.torque * generator.standard_normal(tau.shape)
-    trajectory = np.repeat(np.arange(len(counts)), counts)
-    return Dataset(q, v, a, tau, t, trajectory, robot.parents, robot.prismatic, robot.name, about)
+    of = np.repeat(np.arange(len(counts)), counts)
+    return Dataset(q, v, a, tau, t, of, robot.parents, robot.prismatic, robot.name, about)
 
 
 class _Idle(MemorylessController):
@@ -248,6 +242,18 @@ def _interval(recipe: str, samples: int, sampling: float | None, duration: float
     if duration < sampling and recipe in _TIMED:
         raise ArgumentError(f"duration is {duration} s, expected at least sampling = {sampling:g} s; make it longer.")
     return sampling
+
+
+def _parts(
+    recipe: str, samples: int, sampling: float | None, duration: float | None, reference: DesiredMotion | None
+) -> tuple[list[int], float, int]:
+    """Samples of each trajectory, the time between samples [s], and how many rows of the record that is."""
+    longest = float(getattr(reference, "duration", _DURATION)) if duration is None else duration
+    interval = _interval(recipe, samples, sampling, longest, 1 if reference else _TRAJECTORIES)
+    stride = whole(interval, RECORD_STEP, "sampling", "step of the record")
+    if recipe == "passive":
+        return [samples], interval, stride
+    return _shares(samples, int(longest / interval + 1e-9), 1 if reference else 2), interval, stride
 
 
 def _shares(samples: int, longest: int, fewest: int) -> list[int]:

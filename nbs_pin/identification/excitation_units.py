@@ -34,10 +34,11 @@ class Units:
     """Orthonormal directions of the base parameters, in these units."""
 
     @classmethod
-    def of(cls, robot: Robot, scalars: Scalars, effort: JointArray, box: Reference) -> "Units":
-        """The units for motions about box.q within ± box.v and ± box.a, all of shape (2, n): lowest and highest."""
+    def of(cls, robot: Robot, scalars: Scalars, effort: JointArray, lowest: Reference, highest: Reference) -> "Units":
+        """The units for motions whose states (n,) lie between the lowest and the highest."""
         rng = np.random.default_rng(0)
-        q, v, a = (low + (high - low) * rng.random((_STATES, robot.nv)) for low, high in box)
+        between = zip(lowest, highest, strict=True)
+        q, v, a = (low + (high - low) * rng.random((_STATES, robot.nv)) for low, high in between)
         tau = effort * rng.choice([-1.0, 1.0], size=q.shape)
         data, geometry = _dataset(robot, q, v, a, tau), RobotGeometry(robot)
         expected = expectation(geometry, data, scalars, joint_triangles(geometry, data, scalars))

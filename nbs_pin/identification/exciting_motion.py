@@ -177,8 +177,23 @@ def exciting_motion(
         >>> import nbs_pin as nbs
         >>> motion = nbs.exciting_motion(nbs.load_robot("two_link"), duration=4.0, starts=1)
         >>> motion.duration, motion.band
-        (4.0, 0.5)
+        (4.0, 1.0)
     """
+    harmonics, effort = _harmonics(duration, band), torque_limits(robot)
+    bounds = _bounds(robot, share, acceleration, effort)
+    every = None if clearance is None else _distances(robot, clearance)
+    near = None if every is None else every.restricted(_random(bounds), _NEAR)
+    in_units = _units(robot, Scalars(friction, rotor_inertia, _TRANSITION), bounds, harmonics / duration, effort)
+    with one_thread():
+        found = search(Problem(robot, in_units, bounds, duration, harmonics, near), every, starts, seed, progress)
+    if isinstance(found, Failure):
+        raise ArgumentError(_why(found, robot, share, bounds, clearance))
+    unknowns, clear, nearest = in_units.base.shape[1], found.clearance, found.nearest
+    return ExcitingMotion(robot.joint_names, found.motion, found.condition, unknowns, clear, nearest, found.interrupted)
+
+
+def _harmonics(duration: float, band: float) -> int:
+    """The number of multiples of 1/duration within the band; raises ArgumentError if they are too few or too many."""
     harmonics = int(band * duration + 1e-9)
     if not FEWEST_HARMONICS <= harmonics <= MOST_HARMONICS:
         remedy = "a longer duration or a wider band" if harmonics < FEWEST_HARMONICS else "less of either"
@@ -186,24 +201,16 @@ def exciting_motion(
             f"{duration:g} s and a band of {band:g} Hz hold {harmonics} multiples of 1/duration, expected "
             f"{FEWEST_HARMONICS} to {MOST_HARMONICS}; give {remedy}."
         )
-    effort = torque_limits(robot)
-    bounds = _bounds(robot, share, acceleration, effort)
-    every = None if clearance is None else _distances(robot, clearance)
-    highest = 2.0 * np.pi * harmonics / duration
-    speed = np.minimum(bounds.velocity, highest * bounds.half)
-    pull = np.minimum(bounds.acceleration, highest * speed)
-    reach = (np.array([middle - size, middle + size]) for middle, size in (
-        (bounds.middle, bounds.half), (0.0 * speed, speed), (0.0 * pull, pull)
-    ))  # fmt: skip
-    units_ = Units.of(robot, Scalars(friction, rotor_inertia, _TRANSITION), effort, Reference(*reach))
-    near = None if every is None else every.restricted(_random(bounds), _NEAR)
-    with one_thread():
-        found = search(Problem(robot, units_, bounds, duration, harmonics, near), every, starts, seed, progress)
-    if isinstance(found, Failure):
-        raise ArgumentError(_why(found, robot, share, bounds, clearance))
-    unknowns = units_.base.shape[1]
-    clear, nearest = found.clearance, found.nearest
-    return ExcitingMotion(robot.joint_names, found.motion, found.condition, unknowns, clear, nearest, found.interrupted)
+    return harmonics
+
+
+def _units(robot: Robot, scalars: Scalars, bounds: Bounds, band: float, effort: JointArray) -> Units:
+    """The units for motions within the bounds, whose highest frequency is `band` [Hz]."""
+    speed = np.minimum(bounds.velocity, 2.0 * np.pi * band * bounds.half)
+    pull = np.minimum(bounds.acceleration, 2.0 * np.pi * band * speed)
+    lowest = Reference(bounds.middle - bounds.half, -speed, -pull)
+    highest = Reference(bounds.middle + bounds.half, speed, pull)
+    return Units.of(robot, scalars, effort, lowest, highest)
 
 
 def _bounds(robot: Robot, share: float, acceleration: PerJoint | None, effort: JointArray) -> Bounds:
