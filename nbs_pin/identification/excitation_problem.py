@@ -124,10 +124,9 @@ class Problem:
         return self._known[per_wave]
 
     def _gram(self, regressor: torch.Tensor, v: Rows, a: Rows) -> Float[torch.Tensor, "base base"]:
-        scalars = self.units.scalars
-        kinds = [v, torch.tanh(v / max(scalars.transition, _SMOOTH))] if scalars.friction else []
-        kinds += [a] if scalars.rotor_inertia else []
-        every = torch.cat([regressor, *map(torch.diag_embed, kinds)], dim=-1)
+        terms = self.units.terms
+        factors = {"viscous": v, "coulomb": torch.tanh(v / max(terms.transition, _SMOOTH)), "rotor": a}
+        every = torch.cat([regressor, *(torch.diag_embed(factors[kind]) for kind in terms.kinds)], dim=-1)
         design = (every / self._drive["effort"][:, None]).flatten(0, 1) @ self._columns
         return design.T @ design / len(design)
 

@@ -18,11 +18,11 @@ from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import Shown, joints_told
 from nbs_pin.base.torch_threads import one_thread
 from nbs_pin.base.units import units
+from nbs_pin.identification.drive_terms import DriveTerms
 from nbs_pin.identification.excitation import torque_limits
 from nbs_pin.identification.excitation_problem import Bounds, Problem
 from nbs_pin.identification.excitation_search import Failure, search
 from nbs_pin.identification.excitation_units import Units
-from nbs_pin.identification.regressor import Scalars
 from nbs_pin.motions.fourier import Fourier
 from nbs_pin.motions.references import resting_posture
 from nbs_pin.robots.collisions import SelfDistances
@@ -34,8 +34,6 @@ _ROWS = 1_000_000
 """Most rows of a file."""
 _NEAR, _POSES = 0.05, 400
 """Pairs of bodies that come nearer than this in one of so many random poses are watched in the search [m]."""
-_TRANSITION = 0.01
-"""Speed scale of Coulomb friction, that of `identify` [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,7 +181,8 @@ def exciting_motion(
     bounds = _bounds(robot, share, acceleration, effort)
     every = None if clearance is None else _distances(robot, clearance)
     near = None if every is None else every.restricted(_random(bounds), _NEAR)
-    in_units = _units(robot, Scalars(friction, rotor_inertia, _TRANSITION), bounds, harmonics / duration, effort)
+    names = (("viscous", "coulomb") if friction else ()) + (("rotor",) if rotor_inertia else ())
+    in_units = _units(robot, DriveTerms.of(robot.nv, *names), bounds, harmonics / duration, effort)
     with one_thread():
         found = search(Problem(robot, in_units, bounds, duration, harmonics, near), every, starts, seed, progress)
     if isinstance(found, Failure):
@@ -204,13 +203,13 @@ def _harmonics(duration: float, band: float) -> int:
     return harmonics
 
 
-def _units(robot: Robot, scalars: Scalars, bounds: Bounds, band: float, effort: JointArray) -> Units:
+def _units(robot: Robot, terms: DriveTerms, bounds: Bounds, band: float, effort: JointArray) -> Units:
     """The units for motions within the bounds, whose highest frequency is `band` [Hz]."""
     speed = np.minimum(bounds.velocity, 2.0 * np.pi * band * bounds.half)
     pull = np.minimum(bounds.acceleration, 2.0 * np.pi * band * speed)
     lowest = Reference(bounds.middle - bounds.half, -speed, -pull)
     highest = Reference(bounds.middle + bounds.half, speed, pull)
-    return Units.of(robot, scalars, effort, lowest, highest)
+    return Units.of(robot, terms, effort, lowest, highest)
 
 
 def _bounds(robot: Robot, share: float, acceleration: PerJoint | None, effort: JointArray) -> Bounds:

@@ -120,7 +120,7 @@ def _explain(
     terms, factors, triangles, outliers = _equations(geometry, some, wanted)
     expected = expectation(geometry, len(some), factors, triangles)
     equations = expected.in_units(triangles)
-    base = _base_directions(geometry, some, terms, expected)
+    base = base_directions(geometry, some, terms, expected)
     signed = terms.signed.ravel()
     noise = _noise(equations, base.shape[1] + others, len(some))
     fit, design, noise = _physical(equations, noise, some, regularisation, signed)
@@ -217,7 +217,7 @@ def _robust(rows: Float[np.ndarray, "n samples columns"]) -> tuple[np.ndarray, i
     return weighted, outliers
 
 
-def _base_directions(
+def base_directions(
     geometry: Geometry, data: Dataset, terms: DriveTerms, expected: Expected
 ) -> Float[np.ndarray, "unknowns base"]:
     """An orthonormal basis of the directions that the torque can depend on, from random states at the data's speeds."""
