@@ -22,7 +22,7 @@ _STAGES = (
 """Weights and most iterations of each stage. Those that are far ahead after 20 iterations mostly stay so to the end."""
 _KEPT = 4
 """One start in so many goes on to the next stage."""
-_MEMORY = 20
+_MEMORY = 10
 """Corrections of L-BFGS."""
 _POSTURES = 2000
 """Random postures among which one is sought that the arm can hold."""
