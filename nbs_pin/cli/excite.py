@@ -41,7 +41,7 @@ class Excite(Reported):
     """Joint friction is not to be identified."""
     no_rotor_inertia: bool = False
     """Rotor inertias are not to be identified."""
-    starts: Annotated[int, integer("--starts", least=1, most=10_000)] = 40
+    starts: Annotated[int, integer("--starts", least=1, most=10_000)] = 24
     """Random starts of the search; more take longer and may find better."""
     period: Annotated[float, number("--period", least=1e-5, most=1.0, unit="s")] = 0.001
     """Time from row to row of motion.csv [s]."""

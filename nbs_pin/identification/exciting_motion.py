@@ -130,7 +130,7 @@ def exciting_motion(
     clearance: float | None = 0.01,
     friction: bool = True,
     rotor_inertia: bool = True,
-    starts: int = 40,
+    starts: int = 24,
     seed: int = 0,
     progress: bool = False,
 ) -> ExcitingMotion:
