@@ -43,6 +43,7 @@ from .controllers.potential import Potential as Potential
 from .controllers.sliding_mode import SlidingMode as SlidingMode
 from .controllers.slotine_li import SlotineLi as SlotineLi
 from .dynamics.analytic import AnalyticDynamics as AnalyticDynamics
+from .dynamics.coupled import CoupledDynamics as CoupledDynamics
 from .dynamics.equations import (
     bias as bias,
     energy as energy,

@@ -223,3 +223,63 @@ def test_bodies_are_learned_where_the_file_has_geometry_alone(tmp_path, inertial
         nbs.fit(data, "residual", robot=robot)
     again = nbs.load_robot(model.write_urdf(tmp_path / "learned.urdf"), gravity=9.8)
     assert_allclose(nbs.PinocchioDynamics(again).mass_matrix(q), model.mass_matrix(q), atol=1e-8)
+
+
+WRIST = np.eye(6)
+WRIST[5, 4] = 1.0
+GEARS = nbs.DriveFriction([8.0, 7.0, 5.0, 2.0, 1.5, 1.0], [6.0, 5.0, 4.0, 2.0, 1.5, 1.2], offset=0.1, coupling=WRIST)
+ROTORS = np.array([1.0, 1.0, 0.5, 0.3, 0.2, 0.15])
+
+
+@pytest.fixture(scope="module")
+def wrist():
+    """Noisy motions of ur5, of which motor 6 turns q5 + q6, and the same without coupling; fresh ones of both."""
+    alone = replace(GEARS, coupling=None)
+
+    def made(data):
+        joined = driven(data, GEARS)
+        joined = replace(joined, tau=joined.tau + data.a @ (WRIST.T * ROTORS @ WRIST))
+        return joined, driven(data, alone, ROTORS)
+
+    return made(moved(UR5, 1_500, noise=REAL, duration=3.0)), made(moved(UR5))
+
+
+@pytest.mark.parametrize("at_motors", [False, True], ids=["torques of joints", "torques of motors"])
+def test_a_coupled_wrist_is_found_and_is_as_good_as_an_uncoupled_one(wrist, at_motors):
+    (joined, alone), (fresh, fresh_alone) = wrist
+    data = replace(joined, tau=joined.tau @ np.linalg.inv(WRIST)) if at_motors else joined
+    said = "torques of the log are those of the motors" if at_motors else "torques of the log are those of the joints"
+    with pytest.warns(UserWarning, match=f"motor of wrist_3_joint also turns .* with wrist_2_joint, and the {said}"):
+        model = nbs.identify(data, UR5)
+    assert_allclose(model.coupling, WRIST, atol=0.01)
+    assert_allclose(model.motor_inertia, ROTORS, atol=0.1)
+    usual = nbs.identify(alone, UR5)
+    ours, theirs = torque_nmse(model, fresh, model.friction), torque_nmse(usual, fresh_alone, usual.friction)
+    assert ours < 1.2 * theirs
+    given = nbs.fit(data, "identified", robot=UR5, coupling=WRIST, held_out=0.0)
+    assert torque_nmse(given, fresh, given.friction) < 1.2 * theirs
+
+
+def test_a_wrist_without_coupling_has_none(wrist):
+    (_, alone), _ = wrist
+    assert type(nbs.identify(alone, UR5)) is nbs.IdentifiedDynamics
+
+
+def test_coupled_dynamics_are_those_of_an_arm(tmp_path):
+    own = np.stack([body.toDynamicParameters() for body in list(TWO.model.inertias)[1:]])
+    model = nbs.CoupledDynamics(TWO, own, [[1.0, 0.0], [0.5, 1.0]], motor_inertia=[0.3, 0.7])
+    rng = np.random.default_rng(0)
+    q, v, a = rng.normal(size=(3, 5, 2))
+    tau = nbs.inverse_dynamics(model, q, v, a)
+    needed = (model.mass_matrix(q) @ a[..., None] + model.coriolis_matrix(q, v) @ v[..., None])[..., 0]
+    assert_allclose(tau, needed + model.gravity(q))
+    assert_allclose(model.forward_dynamics(q, v, tau), a)
+    arguments = [torch.tensor(x[0], requires_grad=True) for x in (q, v, tau)]
+    assert torch.autograd.gradcheck(model.forward_dynamics, arguments, atol=1e-6)
+    assert torch.autograd.gradcheck(lambda *x: model.reference_torque(x[0], x[1], x[1], x[2]), arguments, atol=1e-6)
+    nbs.save(model, tmp_path / "model.nbs")
+    assert_allclose(nbs.load(tmp_path / "model.nbs").mass_matrix(q), model.mass_matrix(q))
+    with pytest.raises(ArgumentError, match="no coupled drives"):
+        model.write_urdf(tmp_path / "model.urdf")
+    with pytest.raises(ArgumentError, match="invertible 2×2"):
+        nbs.CoupledDynamics(TWO, own, [[1.0, 1.0], [1.0, 1.0]])

@@ -9,7 +9,7 @@ import tyro
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.log_options import LogOptions, whole_numbers
 from nbs_pin.cli.reported import Reported
-from nbs_pin.cli.values import Verbose, choice, default, integer, number
+from nbs_pin.cli.values import Verbose, choice, couplings, default, integer, number
 from nbs_pin.identification.registry import MODELS
 
 
@@ -39,6 +39,9 @@ class Learn(LogOptions, Reported):
     """Constant torques to learn, as of a sensor that is not zero at rest."""
     rotors: Literal["auto", "on", "off"] = "auto"
     """Rotor inertias to learn; networks without a URDF have them in M."""
+    coupling: Annotated[str, couplings("--coupling")] = "auto"
+    """Motors that turn with several joints, for identified: 6.5=1 where motor 6 also turns with joint 5; auto looks for
+    such neighbours, off is none."""
     transition: Annotated[float, number("--transition", above=0.0, most=10.0, unit="rad/s")] = 0.01
     """Speed within which Coulomb friction changes its sign [rad/s]."""
     held_out: Annotated[float, number("--held-out", least=0.0, most=0.9, unit="")] = 0.2

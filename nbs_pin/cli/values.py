@@ -66,6 +66,20 @@ def configuration(flag: str) -> PrimitiveConstructorSpec[str]:
     return _spec("Q1,Q2,…", parse, str)
 
 
+def couplings(flag: str) -> PrimitiveConstructorSpec[str]:
+    """A tyro parser of auto, off, or entries of a matrix as in 6.5=1,5.4=-1; raises OptionError for any other text."""
+
+    def parse(words: list[str]) -> str:
+        entry = r"[1-9]\d?\.[1-9]\d?=[-+]?\d+(\.\d*)?"
+        if words[0] not in ("auto", "off") and not re.fullmatch(rf"{entry}(,{entry})*", words[0]):
+            raise OptionError(
+                f"{flag} is '{words[0]}'; give auto, off, or how often a motor turns with another joint: {flag} 6.5=1."
+            )
+        return words[0]
+
+    return _spec("auto|off|K.J=X,…", parse, str)
+
+
 def positive_list(flag: str, most: float, unit: str) -> PrimitiveConstructorSpec[str]:
     """A tyro parser of comma-separated numbers in (0, most], kept as text for `plain_numbers`; raises OptionError."""
 

@@ -21,7 +21,9 @@ from nbs_pin.commands.learned_tables import print_learned
 from nbs_pin.commands.results import Results, drawing, sha256_of
 from nbs_pin.dynamics.friction import DriveFriction, JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.identification.coupling import settled_with
 from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.fit import fit, split_data
 from nbs_pin.identification.fit_report import FitReport, torque_errors
 from nbs_pin.identification.logs import load_log
@@ -57,7 +59,8 @@ def run(options: Learn, console: Console, notes: Console) -> None:
     data, held_out = _held_out(data, options)
     asked = {"friction": options.friction, "offset": options.offset, "rotor_inertia": options.rotors}
     drives = {name: _ASKED[choice] for name, choice in asked.items()}
-    common = {"held_out": held_out, "transition": options.transition, "progress": True} | drives
+    common: dict[str, Any] = {"held_out": held_out, "transition": options.transition, "progress": True} | drives
+    common["coupling"] = _matrix(options.coupling, data.nv)
     with results.made() as folder:
         result = learn(data, options.model, robot, options.seed, **common, **given)
         interrupted = result.report.stopped == "interrupted"
@@ -108,6 +111,20 @@ def arm_of(data: Dataset) -> Robot | None:
     return robot
 
 
+def _matrix(typed: str, n: int) -> np.ndarray | bool | None:
+    """The coupling that was typed."""
+    if typed in ("auto", "off"):
+        return False if typed == "off" else None
+    matrix = np.eye(n)
+    for entry in typed.split(","):
+        place, _, turns = entry.partition("=")
+        motor, joint = (int(k) for k in place.split("."))
+        if motor > n or joint > n or motor == joint:
+            raise OptionError(f"--coupling has {place}, expected the numbers of a motor and another joint up to {n}.")
+        matrix[motor - 1, joint - 1] = float(turns)
+    return matrix
+
+
 def _held_out(data: Dataset, options: Learn) -> tuple[Dataset, Dataset | float]:
     """The data without the trajectories to hold out, and these, or the share to hold out of all."""
     if options.held_out_trajectories is None:
@@ -136,6 +153,10 @@ def data_and_arm(
 def learn(data: Dataset, model: str, robot: Robot | None, seed: int = 0, **settings: Any) -> Learned:
     """The model that `fit` learns from the data, with its settings and errors, and the data held out as a test."""
     train, test = split_data(data, settings.pop("held_out", None), seed)
+    if model == "identified" and robot is not None:
+        wanted = Wanted(settings.get("friction"), settings.get("offset"), settings.get("rotor_inertia"))
+        train, test, coupled = settled_with(train, test, robot, settings.get("coupling"), wanted)
+        settings["coupling"] = coupled or False
     found = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
     joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
     return Learned(found, found.report, found.friction, train, test, joints, tuple(data.prismatic.tolist()))

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from nbs_pin.base.arguments import a, check_fields, checked, maybe, number
-from nbs_pin.base.arrays import JointArray, Vectors, array_namespace, as_vectors, constant_like
+from nbs_pin.base.arrays import Array, JointArray, Vectors, array_namespace, as_vectors, constant_like
 from nbs_pin.base.checks import floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
@@ -68,17 +69,18 @@ class JointFriction:
         return self.torque(v)
 
 
-@storable(("viscous", "coulomb", "transition", "offset", "asymmetry", "stribeck", "stribeck_speed", "load"))
+@storable(("viscous", "coulomb", "transition", "offset", "asymmetry", "stribeck", "stribeck_speed", "load", "coupling"))
 @dataclass(frozen=True, eq=False)
 class DriveFriction(JointFriction):
     """Friction of a real drive, and the offset of its torque sensor or current.
 
         f = offset + viscous·v + asymmetry·|v| + (coulomb + stribeck·exp(−(v/v_s)²) + load·|x|)·tanh(v/transition)
 
-    for the torque x = τ − f that is left for the arm and v_s = stribeck_speed. A number stands for every joint; a
-    Coulomb torque that differs between the directions is an offset. Laws feed it forward, as written and not compiled;
-    `certify` and MuJoCo take viscous and Coulomb friction only. Source of the terms: Bona and Indri, "Friction
-    compensation in robotics: an overview", CDC 2005.
+    for the torque x = τ − f that is left for the arm and v_s = stribeck_speed. With a `coupling` N all of this is of
+    the motors, which turn with φ̇ = N v: the joints feel Nᵀ f(N v), and motors carry N⁻ᵀ times their torque. A number
+    stands for every joint; a Coulomb torque that differs between the directions is an offset. Laws feed it forward, as
+    written and not compiled; `certify` and MuJoCo take viscous and Coulomb friction only. Source of the terms: Bona
+    and Indri, "Friction compensation in robotics: an overview", CDC 2005.
 
     Raises:
         ArgumentError: If a number is not finite, one that must be ≥ 0 is negative, or lengths differ.
@@ -102,6 +104,8 @@ class DriveFriction(JointFriction):
     """Speed at which 1/e of that is left [rad/s]."""
     load: JointArray = 0.0  # type: ignore[assignment]  # becomes an array
     """Coulomb friction as a share, below 1, of the torque that is left for the arm."""
+    coupling: Float[np.ndarray, "n n"] | None = None
+    """N, invertible; None is the identity."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,6 +118,8 @@ class DriveFriction(JointFriction):
                 kind = "numbers" if least < 0.0 else "numbers ≥ 0"
                 raise ArgumentError(f"{name} of the friction is {told(value)}; give {n} finite {kind}, one per joint.")
             object.__setattr__(self, name, value)
+        if self.coupling is not None:
+            object.__setattr__(self, "coupling", coupling_of(self.coupling, n))
         if not self.stribeck_speed.min() > 0.0:
             raise ArgumentError(f"stribeck_speed is {told(self.stribeck_speed)}; give speeds > 0 [rad/s].")
         if not self.load.max() < 1.0:
@@ -124,20 +130,32 @@ class DriveFriction(JointFriction):
 
         x = τ − f solves x (1 + load·tanh(v/transition)·sign x) = τ − f₀ for the friction f₀ of no load.
         """
-        loadless, side = self._loadless(v)
+        (v,) = as_vectors(self.viscous.size, v=v)
+        loadless, side = self._loadless(self._times(v, "to motors"))
         if tau is None:
-            return loadless
-        left = tau - loadless
-        return tau - left / (1.0 + constant_like(v, self.load) * side * array_namespace(v).sign(left))
+            return self._times(loadless, "torque to joints")
+        given = self._times(tau, "torque to motors")
+        left = given - loadless
+        found = given - left / (1.0 + constant_like(v, self.load) * side * array_namespace(v).sign(left))
+        return self._times(found, "torque to joints")
 
     def feedforward(self, v: Vectors, needed: Vectors) -> Vectors:
         """What the motor must give at v beyond the torque `needed` [N·m] by the arm without friction [N·m]."""
-        loadless, side = self._loadless(v)
-        return loadless + constant_like(v, self.load) * abs(needed) * side
+        (v,) = as_vectors(self.viscous.size, v=v)
+        loadless, side = self._loadless(self._times(v, "to motors"))
+        carried = self._times(needed, "torque to motors")
+        return self._times(loadless + constant_like(v, self.load) * abs(carried) * side, "torque to joints")
+
+    def _times(self, x: Vectors, way: str) -> Vectors:
+        """Speeds of the motors, or torques of the motors or joints, from those of the others."""
+        if self.coupling is None:
+            return x
+        matrices = {"to motors": self.coupling.T, "torque to joints": self.coupling}
+        matrix = matrices[way] if way in matrices else np.linalg.inv(self.coupling)
+        return x @ constant_like(x, matrix)
 
     def _loadless(self, v: Vectors) -> tuple[Vectors, Vectors]:
         """The friction of x = 0, and tanh(v/transition)."""
-        (v,) = as_vectors(self.viscous.size, v=v)
         xp, of = array_namespace(v), {name: constant_like(v, getattr(self, name)) for name in _OF_DRIVE}
         dry = of["coulomb"] + of["stribeck"] * xp.exp(-((v / of["stribeck_speed"]) ** 2))
         side = xp.tanh(v / self.transition)
@@ -162,3 +180,14 @@ def friction_of_size(friction: JointFriction | None, nv: int) -> JointFriction |
             f"the friction is for {friction.viscous.size} joints, the arm has {nv}; give one per joint."
         )
     return friction
+
+
+def coupling_of(coupling: Float[Array, "n n"], n: int) -> np.ndarray:
+    """N as an array; raises ArgumentError unless it is an invertible n×n matrix."""
+    matrix = floats("coupling", coupling)
+    if matrix.shape != (n, n) or not abs(np.linalg.det(matrix)) > 1e-9:
+        raise ArgumentError(
+            f"coupling has shape {matrix.shape}, expected an invertible {n}×{n} matrix; row k holds how motor k turns "
+            "with every joint."
+        )
+    return matrix

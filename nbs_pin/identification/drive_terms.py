@@ -117,17 +117,28 @@ class DriveTerms:
             name: np.where(row, given.get(name, np.zeros(n)), 0.0) for name, row in zip(TERMS, self.used, strict=True)
         }
 
-    def friction(self, found: Float[np.ndarray, "kinds n"]) -> JointFriction | None:
+    def friction(
+        self, found: Float[np.ndarray, "kinds n"], coupling: Float[np.ndarray, "n n"] | None = None
+    ) -> JointFriction | None:
         """The friction with these numbers, of the simplest class that has its terms; None if no joint has any."""
         numbers = self.numbers(found)
         plain, more = self.used[:2].any(), self.used[2:6].any()
         if not (plain or more):
             return None
         viscous, coulomb = numbers["viscous"], numbers["coulomb"]
-        if not more:
+        if not more and coupling is None:
             return JointFriction(viscous, coulomb, self.transition)
-        rest = {name: numbers[name] for name in ("offset", "asymmetry", "stribeck", "load")}
-        return DriveFriction(viscous, coulomb, self.transition, stribeck_speed=self.stribeck_speed, **rest)
+        return DriveFriction(
+            viscous,
+            coulomb,
+            self.transition,
+            numbers["offset"],
+            numbers["asymmetry"],
+            numbers["stribeck"],
+            self.stribeck_speed,
+            numbers["load"],
+            coupling,
+        )
 
     def rotors(self, found: Float[np.ndarray, "kinds n"]) -> JointArray | None:
         """The rotor inertias with these numbers, None if no joint has any."""

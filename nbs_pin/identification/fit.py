@@ -12,8 +12,10 @@ from nbs_pin.base.registry import entry
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.compatibility import arm_fault, other_data_fault
+from nbs_pin.identification.coupling import Coupling, Given, settled_with
 from nbs_pin.identification.datasets import DATA, Dataset
 from nbs_pin.identification.doubts import doubts, doubts_of_report
+from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.fit_report import FitReport, torque_nmse, zero_torque_nmse
 from nbs_pin.identification.fitters import FitTask, LearnedDynamics
 from nbs_pin.identification.identify import rotors_wanted, sign_fault
@@ -48,6 +50,7 @@ def fit(
     friction: bool | None = None,
     offset: bool | None = None,
     rotor_inertia: bool | None = None,
+    coupling: Given = None,
     progress: bool = False,
     **settings: Any,
 ) -> LearnedDynamics:
@@ -66,6 +69,7 @@ def fit(
         offset: Learn constant torques, of sensors or a pull; None those that the data show.
         rotor_inertia: Learn rotor inertias; None those that the robot states or the data show. Networks without a
             nominal model have them in M.
+        coupling: Motors that turn several joints, for "identified", as in `identify`; the other models have none.
         progress: Show a progress bar. Ctrl-C ends the fit of a network and keeps the best iterate.
         **settings: Options of the model, see `fit_network`, `fit_chain` and `identify`; widths of a network.
 
@@ -88,6 +92,8 @@ def fit(
     start = time.perf_counter()
     train, test = split_data(data, held_out, seed)
     rotors = rotors_wanted(rotor_inertia, robot)
+    train, test, coupled = _uncoupled(model, train, test, robot, coupling, Wanted(friction, offset, rotors))
+    settings |= {"coupling": coupled or False} if model == "identified" else {}
     fitted = fitter(FitTask(model, train, test, seed, robot, (friction, offset, rotors), progress, settings))
     bare, asked = fitted.assemble(None), {"friction": friction, "offset": offset, "rotor_inertia": rotors}
     left = remainder(bare, train if test is None else test, fitted.friction) if data.tau.any() else None
@@ -108,6 +114,17 @@ def fit(
     for doubt in (*doubts(bare, train, fitted.friction, robot, asked), *doubts_of_report(report)):
         warnings.warn(f"{doubt}.", stacklevel=2)
     return fitted.assemble(report)
+
+
+def _uncoupled(
+    model: str, train: Dataset, test: Dataset | None, robot: Robot | None, given: Given, wanted: Wanted
+) -> tuple[Dataset, Dataset | None, Coupling | None]:
+    """Data with the torques of the joints, and the coupling of the drives, which only "identified" knows."""
+    if model == "identified" and robot is not None:
+        return settled_with(train, test, robot, given, wanted, stacklevel=5)
+    if given is not None and given is not False:
+        raise ArgumentError(f"model '{model}' takes no coupling; fit 'identified' with the arm's geometry.")
+    return train, test, None
 
 
 def split_data(data: Dataset, held_out: Dataset | float | None = None, seed: int = 0) -> tuple[Dataset, Dataset | None]:

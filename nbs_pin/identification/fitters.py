@@ -8,6 +8,7 @@ import numpy as np
 
 from nbs_pin.base.doors import BLANK, names_of, option
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.dynamics.coupled import CoupledDynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
@@ -182,11 +183,14 @@ def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport 
 
 def fit_identified(task: FitTask) -> Fitted:
     """Identify inertial parameters for the arm's geometry."""
-    settings = task.known("transition", "regularisation")
+    settings = task.known("transition", "regularisation", "coupling")
     found = identify(task.data, _needed(task), **task.wanted(), **settings)
     numbers, report = found.parameters.size, found.report
 
     def assemble(own: FitReport | None) -> LearnedDynamics:
+        if isinstance(found, CoupledDynamics):
+            numbers = (found.coupling, found.friction, found.motor_inertia)
+            return CoupledDynamics(_needed(task), found.parameters, *numbers, own)
         return IdentifiedDynamics(_needed(task), found.parameters, found.friction, found.rotor_inertia, own)
 
     return Fitted(

@@ -9,10 +9,12 @@ import numpy as np
 from nbs_pin.base.arguments import checked, flag, maybe, number
 from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.dynamics.coupled import CoupledDynamics
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
 from nbs_pin.identification.compatibility import arm_fault
 from nbs_pin.identification.consistent_fit import consistent_fit
+from nbs_pin.identification.coupling import CoupledGeometry, Given, settled
 from nbs_pin.identification.datasets import DATA, Dataset
 from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.drive_terms import DriveTerms
@@ -49,6 +51,7 @@ def identify(
     friction: bool | None = None,
     offset: bool | None = None,
     rotor_inertia: bool | None = None,
+    coupling: Given = None,
     transition: float = 0.01,
     regularisation: float = 0.3,
 ) -> IdentifiedDynamics:
@@ -68,6 +71,9 @@ def identify(
         offset: Find a constant torque of every joint, or of none; None of those whose data show one.
         rotor_inertia: Find the rotor inertia of every joint, or of none; None does so if the robot has any
             (`Robot.armature`), otherwise of joints whose data show one.
+        coupling: N of drives that are coupled, row k for how motor k turns with every joint; the result is then of
+            `CoupledDynamics`. None looks for neighbours that are, and warns if there are some; False is none. Data with
+            the torques of the motors are converted to those of the joints.
         transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
         regularisation: γ, the number of measurements that the prior is worth: homogeneous balls along the links,
             lighter towards the tip, with masses that give torques of the recorded size; it matters if data are scarce.
@@ -89,6 +95,13 @@ def identify(
     fault = sign_fault(data, robot)
     if fault:
         raise ArgumentError(f"{in_words(data, 'the data')}: {fault}.")
+    data, coupled = settled(data, robot, coupling, wanted)
+    if coupled is not None:
+        moved, geometry = coupled.of_motors(data), CoupledGeometry(RobotGeometry(robot), coupled.matrix)
+        bodies = explain(geometry, moved, wanted, regularisation)
+        parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
+        drag = bodies.terms.friction(bodies.scalars, coupled.matrix)
+        return CoupledDynamics(robot, parameters, coupled.matrix, drag, bodies.rotors, bodies.report)
     bodies = explain(RobotGeometry(robot), data, wanted, regularisation)
     parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
     return IdentifiedDynamics(robot, parameters, bodies.friction, bodies.rotors, bodies.report)

@@ -189,6 +189,7 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "NeuralBackstepping.losses": {"e": s.law.errors(Q, V, Z, Z, Z)},
         "SlotineLi.losses": {"e": s.law.errors(Q, V, Z, Z, Z)},
         "SlidingMode.losses": {"e": s.law.errors(Q, V, Z, Z, Z)},
+        "CoupledDynamics": {"parameters": s.identified.parameters, "coupling": [[1.0, 0.0], [1.0, 1.0]]},
         "IdentifiedDynamics": {"parameters": s.identified.parameters},
         "IdentifiedDynamics.write_urdf": {"path": s.folder / "written.urdf"},
         "LagrangianDynamics": {"network": s.learned.network},

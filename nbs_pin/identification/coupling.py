@@ -1,0 +1,210 @@
+"""Drives that are coupled: motors that turn with several joints, given or found in data.
+
+Motor k turns by φ_k = Σ_j N_kj q_j, in angles of the joint side, so that the torques of the joints are Nᵀ times those
+of the motors. In coordinates of the motors the equations are those of an arm without coupling: the torque of motor k is
+row k of N⁻ᵀ Y(q, v, v̇) π and its own friction, offset and rotor inertia, functions of N v and N v̇ (`explain`). A log
+may hold the torques of the joints, or those of the motors.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+
+from nbs_pin.base.doors import where_printed
+from nbs_pin.dynamics.friction import coupling_of
+from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.drive_choice import Wanted
+from nbs_pin.identification.regressor import (
+    Geometry,
+    RobotGeometry,
+    equation_rows,
+    of_all_joints,
+    torque_size,
+    triangle,
+)
+from nbs_pin.robots.robot import Robot
+
+_SOME = 3_000
+"""Samples by which couplings are compared."""
+_LEFT = 0.01
+"""Unexplained share of the torque's variance of a joint from which on couplings are looked for."""
+_BETTER = 0.3
+"""Least decrease of Σ_k log σ_k, the residuals' deviations, that makes a coupling: two of 14 % each, one of 26 %."""
+_TRIED = (1.0, -1.0)
+"""Entries of N that are tried first, between neighbours."""
+_NEAR = 0.6
+"""How far from these an entry may be."""
+
+
+class Coupling(NamedTuple):
+    """How motors turn with joints."""
+
+    matrix: Float[np.ndarray, "n n"]
+    """N."""
+    at_motors: bool
+    """Whether the torques of the data are those of the motors."""
+
+    def of_joints(self, data: Dataset) -> Dataset:
+        """The data with the torques of the joints."""
+        return replace(data, tau=data.tau @ self.matrix) if self.at_motors else data
+
+    def of_motors(self, data: Dataset) -> Dataset:
+        """Data with the torques of the joints in coordinates of the motors, but for q."""
+        n = self.matrix
+        return replace(data, v=data.v @ n.T, a=data.a @ n.T, tau=data.tau @ np.linalg.inv(n))
+
+    def said(self, joints: Sequence[str]) -> str:
+        """The coupling in words, without a full stop."""
+        off = self.matrix - np.eye(len(self.matrix))
+        turns = [f"the motor of {joints[k]} also turns {x:.3g} times with {joints[j]}" for k, j, x in _entries(off)]
+        where = "the motors" if self.at_motors else "the joints"
+        return f"{' and '.join(turns)}, and the torques of the log are those of {where}"
+
+
+Given: TypeAlias = "Coupling | np.ndarray | Sequence[Sequence[float]] | bool | None"
+"""What `settled` takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class CoupledGeometry:
+    """The geometry of an arm in coordinates of its motors, as a `regressor.Geometry`."""
+
+    inner: Geometry
+    matrix: Float[np.ndarray, "n n"]
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Joint names."""
+        return self.inner.names
+
+    @property
+    def places(self) -> tuple[Sequence[int], Float[np.ndarray, "n 3"]]:
+        """Parents and positions [m]."""
+        return self.inner.places
+
+    def regressor(
+        self, q: Float[np.ndarray, "rows n"], v: Float[np.ndarray, "rows n"], a: Float[np.ndarray, "rows n"]
+    ) -> Float[np.ndarray, "rows n unknowns"]:
+        """Derivatives of the motors' torques, for speeds and accelerations of the motors."""
+        back = np.linalg.inv(self.matrix)
+        return np.einsum("jk,rju->rku", back, self.inner.regressor(q, v @ back.T, a @ back.T))
+
+
+def find_coupling(geometry: Geometry, data: Dataset, wanted: Wanted) -> Coupling | None:
+    """The coupling of neighbouring joints that explains the torques much better than none; None if there is none.
+
+    One entry of N after the other is added, as long as each lowers Σ_k log σ_k by `_BETTER`, with the torques taken as
+    those of the joints and of the motors. det N = 1 for such matrices, so that this compares likelihoods.
+    """
+    some, n = data.thinned(_SOME), data.nv
+    none = Coupling(np.eye(n), at_motors=False)
+    deviation = _deviations(geometry, some, wanted, none)
+    suspect = deviation > np.sqrt(_LEFT) * np.maximum(some.tau.std(axis=0), 1e-300)
+    if n < 2 or not suspect.any():
+        return None
+    best, least = none, float(np.log(deviation).sum())
+    sides: tuple[bool, ...] = (False, True)
+    while True:
+        found, lower = best, least
+        for k, j in [(i, i + 1) for i in range(n - 1)] + [(i + 1, i) for i in range(n - 1)]:
+            if best.matrix[k, j] or best.matrix[j, k] or not (suspect[k] or suspect[j]):
+                continue
+            for at_motors in sides:
+                for first in _TRIED:
+                    tried, value = _fitted(geometry, some, wanted, best, (k, j), first, at_motors)
+                    if value < lower:
+                        found, lower = tried, value
+        if lower > least - _BETTER:
+            return None if best is none else best
+        best, least, sides = found, lower, (found.at_motors,)
+
+
+def settled(
+    data: Dataset, robot: Robot, given: "Given", wanted: Wanted, stacklevel: int = 3
+) -> tuple[Dataset, "Coupling | None"]:
+    """The data with the torques of the joints, and the coupling of the drives, None without.
+
+    given: None looks for one, and warns of one that is found. False is none. A matrix N is one; whether the torques are
+        those of the joints or the motors is then found. A `Coupling` is known, and the data have the joints' torques.
+    """
+    if given is False or isinstance(given, Coupling):
+        return data, given or None
+    geometry = RobotGeometry(robot)
+    if given is None:
+        found = find_coupling(geometry, data, wanted)
+        if found is not None:
+            warnings.warn(f"{found.said(robot.joint_names)}; give {_none()} if that cannot be.", stacklevel=stacklevel)
+    else:
+        matrix, some = coupling_of(given, data.nv), data.thinned(_SOME)
+        sides = [Coupling(matrix, at_motors) for at_motors in (False, True)]
+        found = min(sides, key=lambda side: _value(geometry, some, wanted, side))
+    return (data, None) if found is None else (found.of_joints(data), Coupling(found.matrix, at_motors=False))
+
+
+def settled_with(
+    data: Dataset, others: Dataset | None, robot: Robot, given: Given, wanted: Wanted, stacklevel: int = 3
+) -> tuple[Dataset, Dataset | None, Coupling | None]:
+    """The same, with `others`, held-out data whose torques are of the same kind."""
+    whole, found = settled(data, robot, given, wanted, stacklevel + 1)
+    if found is not None and others is not None and whole is not data:
+        others = Coupling(found.matrix, at_motors=True).of_joints(others)
+    return whole, others, found
+
+
+def _none() -> str:
+    return where_printed(python="coupling=False", shell="--coupling off")
+
+
+def _fitted(
+    geometry: Geometry,
+    data: Dataset,
+    wanted: Wanted,
+    base: Coupling,
+    at: tuple[int, int],
+    first: float,
+    at_motors: bool,
+) -> tuple[Coupling, float]:
+    """The coupling with one more entry near `first`, and its Σ log σ."""
+
+    def with_entry(x: float) -> Coupling:
+        matrix = base.matrix.copy()
+        matrix[at] = x
+        return Coupling(matrix, at_motors)
+
+    def value(x: float) -> float:
+        return _value(geometry, data, wanted, with_entry(x))
+
+    start = value(first)
+    if start > _value(geometry, data, wanted, base) - 0.5 * _BETTER:
+        return with_entry(first), start
+    found = minimize_scalar(value, bounds=(first - _NEAR, first + _NEAR), method="bounded", options={"xatol": 1e-4})
+    return with_entry(float(found.x)), float(found.fun)
+
+
+def _value(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coupling) -> float:
+    """Σ log σ: less a constant, minus the logarithm of the likelihood per sample."""
+    return float(np.log(_deviations(geometry, data, wanted, coupling)).sum())
+
+
+def _deviations(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coupling) -> np.ndarray:
+    """RMS residuals of the motors' torques [N·m] after a fit of arbitrary bodies and the usual terms of drives."""
+    moved = coupling.of_motors(coupling.of_joints(data))
+    rows = equation_rows(CoupledGeometry(geometry, coupling.matrix), moved, wanted.first(data.nv).factors(moved))
+    triangles = of_all_joints(triangle(rows))
+    size = torque_size(triangles, len(data))
+    noise = size
+    for _ in range(3):
+        weighted = triangle((triangles / noise[:, None, None]).reshape(-1, triangles.shape[-1]))
+        found = np.linalg.lstsq(weighted[:, :-1], weighted[:, -1], rcond=1e-10)[0]
+        left = np.linalg.norm(triangles @ np.append(found, -1.0), axis=1) / np.sqrt(len(data))
+        noise = np.maximum(left, 1e-6 * size)
+    return noise
+
+
+def _entries(off: Float[np.ndarray, "n n"]) -> list[tuple[int, int, float]]:
+    return [(int(k), int(j), float(off[k, j])) for k, j in np.argwhere(np.abs(off) > 1e-12)]
