@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nbs_pin.base.archives import parse_json
-from nbs_pin.base.arguments import SEED, a, check_fields, checked, mapping, number, readable, text, writable
+from nbs_pin.base.arguments import SEED, a, check_fields, checked, count, mapping, number, readable, text, writable
 from nbs_pin.base.checks import LARGEST, floats, is_usual, told
 from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
@@ -122,8 +122,8 @@ class Dataset(Shown):
         """
         groups = recordings(self)
         if len(groups) > 1:
-            count = int(np.clip(round(share * len(groups)), 1, len(groups) - 1))
-            chosen = np.random.default_rng(seed).permutation(len(groups))[:count]
+            many = int(np.clip(round(share * len(groups)), 1, len(groups) - 1))
+            chosen = np.random.default_rng(seed).permutation(len(groups))[:many]
             held_out = np.isin(self.trajectory, np.concatenate([groups[k] for k in chosen]))
             return self.take(~held_out), self.take(held_out)
         begin = _held_from(self, share)
@@ -148,6 +148,7 @@ class Dataset(Shown):
             ) from error
         return replace(self, **{name: getattr(self, name)[index] for name in (*_STATES, "t", "trajectory")})
 
+    @checked(most=count(1))
     def thinned(self, most: int) -> "Dataset":
         """At most that many samples, evenly spaced: neighbours in a fast log say little new."""
         return self if len(self) <= most else self.take(np.linspace(0, len(self) - 1, most).astype(int))
