@@ -9,12 +9,13 @@ from hypothesis import given, settings, strategies as st
 
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.records import Reference
+from nbs_pin.base.records import ROW_ARRAYS, Reference
 from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.bearable import Bearable
 from nbs_pin.controllers.excitation import _UPPER, _WEIGHTS, _row, _to_values
 from nbs_pin.controllers.gains import effective_inertia, sample_configurations
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
+from nbs_pin.controllers.passive_outputs import damping_of, output_of
 from nbs_pin.controllers.unknowns import ADAPTS, Carrier, model_body
 from nbs_pin.dynamics.body_fields import body_fields
 from nbs_pin.dynamics.pinocchio_tree import pack_model
@@ -22,6 +23,7 @@ from nbs_pin.dynamics.rigid_tree import RigidTree
 from nbs_pin.kernels.symmetric4 import FARTHEST
 from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY
 from nbs_pin.robots.places import tool_frame
+from nbs_pin.simulation import loop
 
 ARMS = ["two_link", "panda", str(Path(__file__).parent / "data" / "gantry.urdf")]
 KINDS = [["load"], ["links"], ["friction", "rotors", "offsets"], list(ADAPTS)]
@@ -373,6 +375,39 @@ def test_only_one_motion_of_the_law_says_what_it_has_shown():
     for run in runs:
         with pytest.raises(ArgumentError, match=r"expected one motion of this law, q of shape \(rows, 2\)"):
             law.estimate(run)
+
+
+def test_damping_pays_for_the_mass_in_the_output_of_pd():
+    """ż1ᵀ(K_d − εM)ż1 + εz1ᵀK_p z1 ≥ sᵀΔs for s = ż1 + εz1, with equality where the left is least."""
+    robot = nbs.load_robot("panda")
+    law, rng = nbs.PD.for_robot(robot), np.random.default_rng(12)
+    output, mass = output_of(law), law.dynamics.mass_matrix(rng.uniform(-1.0, 1.0, (5, 7)))
+    rate, damping = output.rate[0], damping_of(law, output, mass)
+    paid, z1, dz1 = np.diag(law.kd) - rate * mass, *rng.normal(size=(2, 5, 7))
+    dz1[0] = np.linalg.solve(paid[0], damping[0] @ dz1[0])
+    z1[0] = damping[0] @ np.linalg.solve(damping[0], paid[0] @ dz1[0]) / law.kp
+    s = dz1 + rate * z1
+    taken = np.einsum("pi,pij,pj->p", dz1, paid, dz1) + rate * (z1**2 * law.kp).sum(axis=1)
+    kept = np.einsum("pi,pij,pj->p", s, damping, s)
+    assert (taken >= kept * (1.0 - 1e-12)).all()
+    assert taken[0] == pytest.approx(kept[0])
+    with pytest.raises(ArgumentError, match=r"output_rate is 1e\+03 1/s.* does not pay for it in every pose"):
+        nbs.AdaptiveLaw(law, ["offsets"], output_rate=np.full(7, 1e3))
+
+
+def test_the_cost_of_a_step_is_the_gain_unless_the_rates_are_others():
+    law = law_for(nbs.load_robot("panda"), ["load", "friction", "rotors"], gain=0.3)
+    assert law.step_cost() == pytest.approx(0.3)
+    assert law_for(law.robot, law.adapts, rates=2.0 * law.rates).step_cost() == pytest.approx(0.6)
+
+
+def test_estimates_count_in_the_size_of_a_run(monkeypatch):
+    law = law_for(nbs.load_robot("two_link"), ["load", "links"])
+    monkeypatch.setattr(loop, "MOST_RECORDED", 101 * (2 * len(ROW_ARRAYS) + 19))
+    plant, still = nbs.DynamicsPlant.for_robot(law.robot), nbs.Hold([0.1, 0.2])
+    nbs.simulate(plant, law.law, still, 0.1, 0.001)
+    with pytest.raises(ArgumentError, match="have more than"):
+        nbs.simulate(plant, law, still, 0.1, 0.001)
 
 
 def test_files_keep_rates_of_a_law_that_was_trained_first(tmp_path, robot):

@@ -1,5 +1,6 @@
 """The transient bound of adaptive laws: its mathematics, simulated arms against it, and what is refused."""
 
+import dataclasses
 import itertools
 import math
 import sys
@@ -12,6 +13,7 @@ from hypothesis import given, settings, strategies as st
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.known_code import foreign_code
+from nbs_pin.certificates.adaptive_bound import _loaded
 from nbs_pin.certificates.worst_load import Divergence, of_number
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
 from nbs_pin.controllers.unknowns import model_body
@@ -172,7 +174,7 @@ def test_labels_follow_the_code():
     assert foreign_code(law) == ""
     bound = nbs.transient_bound(law, 0.5)
     labels = {line.name: str(line.label) for line in bound.lines}
-    assert (str(bound.label), labels["‖z1‖"], labels["gain"]) == ("PROVED", "PROVED", "EMPIRICAL")
+    assert (str(bound.label), labels["‖z1‖"], labels["cost of a step"]) == ("PROVED", "PROVED", "EMPIRICAL")
 
     class Other(nbs.AdaptiveLaw):
         pass
@@ -223,6 +225,19 @@ def test_the_fixed_law_is_told_beside_it():
     assert other.fixed is not None
     assert other.fixed.certificate is not None
     assert (other.fixed.joint_errors <= other.fixed.certificate.joint_errors).all()
+
+
+def test_the_fixed_law_is_simulated_with_the_bodies_of_its_model():
+    robot = nbs.load_robot("panda")
+    first = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), ["links"]).estimate()
+    heavier = dataclasses.replace(first, values=1.1 * first.values).dynamics()
+    law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot, heavier), load_mass=2.0)
+    q, centre = np.random.default_rng(1).uniform(-1.0, 1.0, (4, 7)), np.array([0.01, -0.02, 0.05])
+    loaded = robot.with_payload("panda_hand_tcp", 1.5, com=centre.tolist())
+    own, bare, more = (x.mass_matrix(q) for x in (heavier, nbs.PinocchioDynamics(robot), nbs.PinocchioDynamics(loaded)))
+    found = _loaded(law, "panda_hand_tcp", 1.5, centre).mass_matrix(q)
+    assert np.abs(own - bare).max() > 0.05
+    np.testing.assert_allclose(found, own + more - bare, rtol=0.0, atol=1e-7)
 
 
 @pytest.mark.parametrize("seed", range(10))

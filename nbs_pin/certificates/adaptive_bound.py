@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from nbs_pin.base.arguments import DURATION, a, checked, maybe, number
 from nbs_pin.base.arrays import JointArray
@@ -27,6 +28,8 @@ from nbs_pin.controllers.adaptive_law import AdaptiveLaw
 from nbs_pin.controllers.unknowns import LOAD_AT
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
+from nbs_pin.dynamics.provider import DynamicsProvider
+from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
 from nbs_pin.motions.references import MOTION, DesiredMotion
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
@@ -322,8 +325,8 @@ def _lines(found: TransientBound, base: Certificate, code: Known) -> tuple[Claim
     lasting = "at all times" if math.isinf(found.duration) else f"for {found.duration:g} s"
     why = f"{lasting}; {code.because}"
     sampled = (
-        "share of the damping's work that a sampled step costs at most in usual motions, those sampled for the "
-        "rates; held torques are not in the bounds"
+        "share of the damping's work that a step of the law's period and rates costs at most in usual motions, those "
+        "sampled for the rates; held torques are not in the bounds"
     )
     box = f"largest over all loads of the box, by branch and bound, near {where}; {edge}"
     joints = zip(found.joint_names, found.joint_errors.tolist(), found.joint_units, strict=True)
@@ -337,7 +340,7 @@ def _lines(found: TransientBound, base: Certificate, code: Known) -> tuple[Claim
         Claim("V at all times", always, "J", label, f"V∞ and the largest divergence, {_HERE}", Group.BOUNDS),
         Claim("V_a(0)", total, "J", label, f"V(0) is given; {code.because}", Group.BOUNDS),
         Claim("Σ d(X‖X₀)/γ", found.divergence, "J", Label.PROVED, box, Group.BODIES),
-        Claim("gain", found.law.gain, "", Label.EMPIRICAL, sampled, Group.SAMPLED),
+        Claim("cost of a step", found.law.step_cost(), "", Label.EMPIRICAL, sampled, Group.SAMPLED),
         *base.admissible.claims,
         *base.constants.lines,
         *base.friction.lines,
@@ -357,11 +360,24 @@ def _fixed(
         refused = str(error)
     frame, errors = _frame(law), []
     for mass, centre in {(worst.mass, tuple(worst.centre)), (payload.mass, (0.0, 0.0, 0.0))}:
-        loaded = law.robot.with_payload(frame, mass, com=centre) if mass > 0.0 else law.robot
-        plant = DynamicsPlant(PinocchioDynamics(loaded), friction=inner.friction)
+        plant = DynamicsPlant(_loaded(law, frame, mass, np.array(centre)), friction=inner.friction)
         run = simulate(plant, inner.compile(), reference, math.ceil(length / _PERIOD) * _PERIOD, _PERIOD)
         errors.append(np.abs(inner.dynamics.difference(run.q, run.q_ref)).max(axis=0))
     return FixedLaw(np.max(errors, axis=0), certificate, refused)
+
+
+def _loaded(law: AdaptiveLaw, frame: str, mass: float, centre: Float[np.ndarray, "3"]) -> DynamicsProvider:
+    """The law's model with a point mass [kg] there [m]."""
+    model = law.law.dynamics
+    if mass == 0.0:
+        return model
+    if type(model) is PinocchioDynamics:
+        return PinocchioDynamics(law.robot.with_payload(frame, mass, com=centre.tolist()))
+    first = law.estimate()
+    at = 10 * [body.is_load for body in first.unknowns.bodies].index(True)
+    values, point = first.values.copy(), np.append(centre, 1.0)
+    values[at : at + 10] = inertial_parameters(mass * point[:, None] * point)
+    return replace(first, values=values).dynamics()
 
 
 def _frame(law: AdaptiveLaw) -> str:

@@ -26,7 +26,7 @@ from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.loop import LONGEST_PLANT_STEP
 from nbs_pin.simulation.plant import Plant
 from nbs_pin.simulation.registry import build_plant
-from nbs_pin.simulation.simulate import stream
+from nbs_pin.simulation.simulate import recorded_numbers, stream
 
 _ROWS_OF_ARRAYS = 8  # arrays of a Run with one number per row and joint
 
@@ -81,10 +81,11 @@ def track(
     """
     friction = JointFriction.of(robot) if joint_friction == "keep" else None
     reference = Sinusoid.for_robot(robot) if reference is None else reference
-    _check_size(robot.nv, duration, period)
+    _check_size(_ROWS_OF_ARRAYS * robot.nv, duration, period)
     check_reference(reference, robot, duration, joint_friction=joint_friction)
     if not isinstance(controller, Controller):
         controller = law_of(controller, robot, bandwidth=bandwidth, period=period, friction=friction, seed=seed)
+    _check_size(_ROWS_OF_ARRAYS * robot.nv + recorded_numbers(controller), duration, period)
     if not isinstance(plant, Plant):
         build = partial(
             build_plant, plant, integrator=integrator, joint_friction=joint_friction, joint_stops=joint_stops
@@ -143,8 +144,8 @@ def _joined(blocks: Sequence[Run]) -> Run:
     return replace(blocks[0], **rows)
 
 
-def _check_size(nv: int, duration: float, period: float) -> None:
-    size = _ROWS_OF_ARRAYS * 8.0 * nv * duration / period
+def _check_size(numbers: int, duration: float, period: float) -> None:
+    size = 8.0 * numbers * duration / period
     if size > LARGEST:
         raise ArgumentError(
             f"{duration:g} s at a period of {period:g} s would record {size / 1e9:.3g} GB, at most "

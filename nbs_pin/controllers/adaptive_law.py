@@ -53,7 +53,7 @@ from nbs_pin.controllers.unknowns import (
     unknown_numbers,
     unknown_rotors,
 )
-from nbs_pin.controllers.update_rates import update_rates
+from nbs_pin.controllers.update_rates import UsualMotions, update_rates
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
@@ -264,6 +264,14 @@ class AdaptiveLaw(Controller, nn.Module):
             return update_rates(self.law, self.output, self.unknowns, *self._tree, gain=self.gain, period=self.period)
         count = len(self.unknowns.bodies) + len(self.unknowns.numbers)
         return np.array(numbers(count, least=0.0, unit="1/J")("AdaptiveLaw: rates", rates))
+
+    def step_cost(self) -> float:
+        """The share of the damping's work that a step of `period` with `rates` costs at most in usual motions.
+
+        `gain` where these follow from it and the law was not trained since (docs/theory.md §10).
+        """
+        motions = UsualMotions.of(self.law, self.output, self.unknowns, *self._tree)
+        return self.period * motions.cost(np.asarray(self.rates, dtype=float))
 
     def initial_memory(self, q: Vectors) -> AdaptiveMemory:
         """The first estimates, with the array type and the leading axes of q."""

@@ -20,7 +20,7 @@ from nbs_pin.base.arguments import numbers
 from nbs_pin.base.arrays import Array, JointArray, constant_like
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.computed_torque import ComputedTorque
-from nbs_pin.controllers.gains import largest_inertia
+from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.pd import PD
@@ -61,8 +61,9 @@ def _usual(law: ModelLaw) -> tuple[OutputCode, JointArray]:
         return OutputCode.VELOCITY, np.zeros(law.nv)
     robot = law.dynamics.robot
     if type(law) is PD and robot is not None:
-        inertia = largest_inertia(robot, law.dynamics)
-        slowest = min(float((law.kd / inertia).min()), float((law.kp / law.kd).min()))
+        root = np.sqrt(law.kd)
+        mass = law.dynamics.mass_matrix(sample_configurations(robot)) / (root[:, None] * root)
+        slowest = min(1.0 / float(np.linalg.eigvalsh(mass)[:, -1].max()), float((law.kp / law.kd).min()))
         return OutputCode.FILTERED, np.full(law.nv, 0.5 * slowest)
     if type(law) is ComputedTorque:
         return OutputCode.FILTERED, 0.5 * law.kd
@@ -98,9 +99,21 @@ def feedback_of(law: ModelLaw, q: Array, v: Array, q_ref: Array, v_ref: Array, a
 
 
 def damping_of(law: ModelLaw, output: Output, mass: Float[np.ndarray, "poses n n"]) -> Float[np.ndarray, "poses n n"]:
-    """A matrix Δ with V̇ ≤ −sᵀΔs without a wrong torque, at poses with these mass matrices; for PD without the εM."""
+    """A matrix Δ with V̇ ≤ −sᵀΔs without a wrong torque, at poses with these mass matrices; of PD near the motion.
+
+    Of PD and computed torque V̇ = −ż1ᵀAż1 − z1ᵀεK_pz1 with A = K_d − εM or K_d − λ, so Δ⁻¹ = A⁻¹ + εK_p⁻¹. Raises
+    ArgumentError for an ε with which A is not positive definite.
+    """
     if isinstance(law, LyapunovLaw):
         return np.asarray(law.inertial_rate * mass + law.lyapunov().floor)
     assert isinstance(law, PD | ComputedTorque)
-    kd = law.kd - output.rate if isinstance(law, ComputedTorque) else law.kd
-    return np.broadcast_to(np.diag(1.0 / (1.0 / kd + output.rate / law.kp)), mass.shape)
+    if isinstance(law, ComputedTorque):
+        paid = np.broadcast_to(np.diag(law.kd - output.rate), mass.shape)
+    else:
+        paid = np.diag(law.kd) - 0.5 * (output.rate[:, None] + output.rate) * mass
+    if not np.linalg.eigvalsh(paid)[:, 0].min() > 0.0:
+        raise ArgumentError(
+            f"AdaptiveLaw: output_rate is {output.rate.max():.3g} 1/s, expected less, as the damping k_d of"
+            f" {type(law).__name__} does not pay for it in every pose; give a smaller one, or leave it out."
+        )
+    return np.linalg.inv(np.linalg.inv(paid) + np.diag(output.rate / law.kp))

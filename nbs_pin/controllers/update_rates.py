@@ -1,5 +1,7 @@
 """How fast an adaptive law may learn: rates γ at which a sampled step is stable."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
@@ -14,7 +16,7 @@ from nbs_pin.kernels.layout import NumberCode
 _STATES = 200
 _SPEED, _START = 0.25, 0.5  # share of the velocity limits, and time in which all of it is reached [s]
 _SLOW = 0.02  # share of the velocity limits at which Coulomb friction has its full size
-_DELAY = 2.5  # periods from the output to its effect with the look-ahead of `simulate`, 3 without it
+_DELAY = 3.0  # periods from the output to its effect without look-ahead; the one of `simulate` saves half a period
 _SHARES = {
     NumberCode.VISCOUS: 0.03,
     NumberCode.COULOMB: 0.1,
@@ -24,7 +26,42 @@ _SHARES = {
 }
 """How fast numbers adapt beside bodies: slowly, as each explains an error of its joint at once, rightly or not."""
 _OFFSETS = (NumberCode.OFFSET, NumberCode.ACCELERATION)
-_WELL_DAMPED = 0.15  # of what the delay allows: offsets act at every speed, and so are to be damped well
+_WELL_DAMPED = 0.18  # of what the delay allows: offsets act at every speed, and so are to be damped well
+
+
+class UsualMotions(NamedTuple):
+    """SᵀS of sampled states and every unknown in the metric Δ, (states, unknowns, n, n)."""
+
+    moving: Float[np.ndarray, "states unknowns n n"]
+    """At usual velocities and accelerations."""
+    slow: Float[np.ndarray, "states unknowns n n"]
+    """At little velocity and without acceleration."""
+
+    @classmethod
+    def of(
+        cls, law: ModelLaw, output: Output, unknowns: Unknowns, tree: RigidTree, gravity: np.ndarray
+    ) -> "UsualMotions":
+        """At poses, velocities and accelerations drawn from the arm's ranges."""
+        n, robot, count = law.nv, law.dynamics.robot, len(unknowns.bodies)
+        assert robot is not None
+        rng, q = np.random.default_rng(0), sample_configurations(robot, _STATES)
+        speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, np.pi)
+        v, a = rng.uniform(-_SPEED, _SPEED, q.shape) * speed, rng.uniform(-1.0, 1.0, q.shape) * speed / _START
+        root = np.linalg.cholesky(damping_of(law, output, law.dynamics.mass_matrix(q)))[:, None]
+
+        def forms(v: np.ndarray, a: np.ndarray) -> np.ndarray:
+            now = AdaptingModel.of(unknowns, tree, gravity, np.tile(unknowns.start, (_STATES, 1)), q, v, v, a)
+            units = [now.slopes(np.tile(unit, (_STATES, 1))) for unit in np.eye(n)]
+            bodies = np.stack([unit.bodies.reshape(_STATES, count, 16) for unit in units], axis=-1)
+            rows = np.stack([unit.numbers for unit in units], axis=-1)
+            own = np.concatenate([bodies.swapaxes(-1, -2) @ bodies, rows[..., :, None] * rows[..., None, :]], axis=1)
+            return np.asarray(np.linalg.solve(root, np.linalg.solve(root, own).swapaxes(-1, -2)))
+
+        return cls(forms(v, a), forms(_SLOW * np.sign(v) * speed, 0.0 * a))
+
+    def cost(self, rates: Float[np.ndarray, " unknowns"]) -> float:
+        """The largest Σ γ‖S‖²/8 of V̇ in sᵀΔs per second of period, in usual motions."""
+        return float(np.linalg.eigvalsh(np.einsum("k,skij->sij", rates, self.moving)).max()) / 8.0
 
 
 def update_rates(
@@ -45,35 +82,21 @@ def update_rates(
     accelerations that reach the limits in half a second.
 
     In slow motions S(s) hardly changes: there an estimate is integral action of a stiffness I = Σ γSᵀS/4 at most, and
-    M s̈ + Δ ṡ + I s(t − d) = 0 with the delay d = 2.5h is stable for I d ≺ Δ. So all but loads are slower where I d
+    M s̈ + Δ ṡ + I s(t − d) = 0 with the delay d = 3h is stable for I d ≺ Δ. So all but loads are slower where I d
     would be above `gain`·Δ. A load begins far from the middle of its interval, where the stiffness is a fraction of I.
     """
-    n, robot, count = law.nv, law.dynamics.robot, len(unknowns.bodies)
-    assert robot is not None
-    rng, q = np.random.default_rng(0), sample_configurations(robot, _STATES)
-    speed = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, np.pi)
-    v, a = rng.uniform(-_SPEED, _SPEED, q.shape) * speed, rng.uniform(-1.0, 1.0, q.shape) * speed / _START
-    root = np.linalg.cholesky(damping_of(law, output, law.dynamics.mass_matrix(q)))[:, None]
-
-    def forms(v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """SᵀS of every state and unknown in the metric Δ."""
-        now = AdaptingModel.of(unknowns, tree, gravity, np.tile(unknowns.start, (_STATES, 1)), q, v, v, a)
-        units = [now.slopes(np.tile(unit, (_STATES, 1))) for unit in np.eye(n)]
-        bodies = np.stack([unit.bodies.reshape(_STATES, count, 16) for unit in units], axis=-1)
-        numbers = np.stack([unit.numbers for unit in units], axis=-1)
-        own = np.concatenate([bodies.swapaxes(-1, -2) @ bodies, numbers[..., :, None] * numbers[..., None, :]], axis=1)
-        return np.asarray(np.linalg.solve(root, np.linalg.solve(root, own).swapaxes(-1, -2)))
-
-    moving, slow = forms(v, a), forms(_SLOW * np.sign(v) * speed, 0.0 * a)
+    motions, count = UsualMotions.of(law, output, unknowns, tree, gravity), len(unknowns.bodies)
     shares = np.array([1.0] * count + [_SHARES[number.code] for number in unknowns.numbers])
-    shares = shares / np.linalg.eigvalsh(moving)[..., -1].max(axis=0)
+    shares = shares / np.linalg.eigvalsh(motions.moving)[..., -1].max(axis=0)
     delayed = np.array([not body.is_load for body in unknowns.bodies] + [True] * len(unknowns.numbers))
-    at_most = np.full(len(shares), 8.0 / np.linalg.eigvalsh(np.einsum("k,skij->sij", shares, moving)).max())
-    rest = np.linalg.eigvalsh(np.einsum("k,skij->sij", shares[delayed], slow[:, delayed])).max(initial=0.0)
+    at_most = np.full(len(shares), 1.0 / motions.cost(shares))
+    rest = np.linalg.eigvalsh(np.einsum("k,skij->sij", shares[delayed], motions.slow[:, delayed])).max(initial=0.0)
     if rest > 0.0:
         at_most[delayed] = np.minimum(at_most[delayed], 4.0 / (_DELAY * rest))
     rates = shares * at_most
     for k, number in enumerate(unknowns.numbers, start=count):
         if number.code in _OFFSETS:
-            rates[k] = min(rates[k], _WELL_DAMPED * 4.0 / (_DELAY * float(np.linalg.eigvalsh(slow[:, k])[:, -1].max())))
+            rates[k] = min(
+                rates[k], _WELL_DAMPED * 4.0 / (_DELAY * float(np.linalg.eigvalsh(motions.slow[:, k])[:, -1].max()))
+            )
     return np.asarray(gain / period * rates)

@@ -95,9 +95,12 @@ class Loop:
         desired, target = (at_times(reference, t, self.plant.nv) for t in (times, seen))
         return Schedule(times, seen - times, desired, target)
 
-    def check_size(self, starts: int) -> None:
-        """Raise ArgumentError if the run from so many starts has more than `MOST_RECORDED` numbers."""
-        if len(ROW_ARRAYS) * (self.steps + 1) * starts * self.plant.nv > MOST_RECORDED:
+    def check_size(self, starts: int, estimates: int = 0) -> None:
+        """Raise ArgumentError if the run from so many starts has more than `MOST_RECORDED` numbers.
+
+        estimates: how many numbers the law adds to each row of each start.
+        """
+        if (len(ROW_ARRAYS) * self.plant.nv + estimates) * (self.steps + 1) * starts > MOST_RECORDED:
             raise ArgumentError(
                 f"{starts} motions of {self.steps} periods have more than {MOST_RECORDED} numbers; give a shorter"
                 " duration or fewer starts, or record one motion in blocks (stream)."

@@ -103,7 +103,7 @@ def simulate(
     start = loop.start(reference, q0, v0)
     if check:
         check_loop(loop, controller, reference, start)
-    loop.check_size(math.prod(start[0].shape[:-1]))
+    loop.check_size(math.prod(start[0].shape[:-1]), recorded_numbers(loop.law))
     if workers > 1:
         return _shared(loop, reference, start, workers)
     return _block(loop, reference, 0, loop.steps, start, None, progress)[0]
@@ -231,6 +231,12 @@ def _closed(
     settings = {"plant_step": plant_step, "effort_limit": effort_limit, "lookahead": lookahead}
     loop = Loop.of(plant, controller.nv, duration, period, **settings, most=most)
     return _Closed(**vars(loop), law=_compiled(controller), name=type(controller).__name__, disturbance=disturbance)
+
+
+def recorded_numbers(law: Controller) -> int:
+    """How many numbers a law has recorded of its memory in each row of a run."""
+    seen = law.recorded(law.initial_memory(np.zeros(law.nv)))
+    return 0 if seen is None else int(np.size(seen))
 
 
 def _compiled(controller: Controller) -> Controller:
