@@ -11,6 +11,7 @@ is a fault: the exit code is 1 and the cases are listed.
 """
 
 import argparse
+import gzip
 import io
 import json
 import os
@@ -30,6 +31,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import safetensors.torch
+import scipy.io
 import torch
 from fuzz.guarded import guarded, peak
 
@@ -126,6 +128,8 @@ def samples(folder: Path) -> None:
     np.savez(folder / "motion.npz", t=t, q=q)
     table = np.column_stack([t, q, a])
     np.savetxt(folder / "log.csv", table, delimiter=",", header="t,q1,q2,tau1,tau2", comments="")
+    (folder / "log.csv.gz").write_bytes(gzip.compress((folder / "log.csv").read_bytes()))
+    scipy.io.savemat(folder / "log.mat", {"log": {"t": t, "q": q, "tau": a, "v": v}, "about": "a log"})
     np.savetxt(folder / "motion.csv", table[:, :3], delimiter=",", header="t,q1,q2", comments="")
     nbs.save(nbs.NeuralBackstepping.for_robot(robot, seed=1), folder / "law.nbs")
     nbs.save(nbs.PID.for_robot(robot), folder / "pid.nbs")
@@ -194,6 +198,8 @@ READERS: dict[str, Callable[[Path], Iterator[Any]]] = {
     "data.npz": _data(nbs.load_dataset),
     "log.npz": _data(nbs.load_log),
     "log.csv": _data(nbs.load_log),
+    "log.csv.gz": _data(nbs.load_log),
+    "log.mat": _data(nbs.load_log),
     "motion.npz": _reference,
     "motion.csv": _reference,
     "law.nbs": _controller,

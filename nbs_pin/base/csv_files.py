@@ -5,6 +5,7 @@ import gzip
 import io
 import re
 import warnings
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,7 @@ def read_cells(path: Path) -> list[list[str]]:
         if not mark and len(first.split()) > 1:
             return [line.split() for line in text.splitlines() if line.strip()]
         lines = [line for line in csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=mark or ",") if line]
-    except (UnicodeDecodeError, csv.Error, EOFError, OSError) as error:
+    except (UnicodeDecodeError, csv.Error, EOFError, OSError, zlib.error) as error:
         if isinstance(error, OSError) and not isinstance(error, gzip.BadGzipFile):
             raise
         raise FileFormatError(f"{path}: not a UTF-8 CSV file ({error}); export it again.") from error

@@ -259,7 +259,7 @@ def _upright(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Arrays with one row per time: times of shape (rows, 1) flat, matrices of shape (joints, rows) turned."""
     flat = {name: x.ravel() if name in ("t", "trajectory") and x.size == max(x.shape, default=0) else x for name, x in
             arrays.items()}  # fmt: skip
-    rows = len(flat["t"]) if "t" in flat else 0
+    rows = flat["t"].size if "t" in flat else 0
     return {
         name: x.T if name in QUANTITIES and x.ndim == 2 and x.shape[0] != rows == x.shape[1] else x
         for name, x in flat.items()

@@ -73,7 +73,8 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
     if settings.zero is not None:
         read = read._replace(q=read.q + settings.zero)
     read, absent, blanks = _filled(*_clocked(read))
-    _dataset(path, read._replace(v=read.q, a=read.q), tree, name, {})  # refuses what is no table of numbers
+    stated = {kind: read.q if getattr(read, kind) is None else getattr(read, kind) for kind in "va"}
+    _dataset(path, read._replace(**stated), tree, name, {})  # refuses what is no table of numbers
     spacing, more, limits = _spacing(read), list[str](), None
     if spacing["rows"] > len(np.unique(read.trajectory)):  # not of single states
         read, limits, more = _put_right(path, read, joints, settings.degrees, absent)
