@@ -110,7 +110,7 @@ def test_limits_are_kept_between_the_instants_of_the_search(seed, share, acceler
 @pytest.mark.parametrize("seed", [2])
 def test_the_condition_number_is_that_of_pinocchios_regressor(seed, tmp_path, monkeypatch):
     robot = random_arm(seed, tmp_path, joints=3)
-    options = {"friction": False, "rotor_inertia": False}
+    options = {"friction": False, "offset": False, "rotor_inertia": False}
     units = problem_of(robot, monkeypatch, **options).units
     motion = exciting_motion(robot, **QUICK, **options)
     data = robot.model.createData()

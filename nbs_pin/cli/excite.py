@@ -39,6 +39,8 @@ class Excite(Reported):
     """Do not compare bodies. Surroundings are never known."""
     no_friction: bool = False
     """Joint friction is not to be identified."""
+    no_offset: bool = False
+    """Constant torques of the sensors are not to be identified."""
     no_rotor_inertia: bool = False
     """Rotor inertias are not to be identified."""
     starts: Annotated[int, integer("--starts", least=1, most=10_000)] = 24

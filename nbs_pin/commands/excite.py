@@ -35,6 +35,7 @@ def run(options: Excite, console: Console, notes: Console) -> None:
     given = keywords(options, exciting_motion) | {
         "clearance": None if options.no_clearance else options.clearance,
         "friction": not options.no_friction,
+        "offset": not options.no_offset,
         "rotor_inertia": not options.no_rotor_inertia,
     }
     with results.made() as folder:

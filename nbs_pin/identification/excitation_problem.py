@@ -125,7 +125,8 @@ class Problem:
 
     def _gram(self, regressor: torch.Tensor, v: Rows, a: Rows) -> Float[torch.Tensor, "base base"]:
         terms = self.units.terms
-        factors = {"viscous": v, "coulomb": torch.tanh(v / max(terms.transition, _SMOOTH)), "rotor": a}
+        coulomb = torch.tanh(v / max(terms.transition, _SMOOTH))
+        factors = {"viscous": v, "coulomb": coulomb, "offset": torch.ones_like(v), "rotor": a}
         every = torch.cat([regressor, *(torch.diag_embed(factors[kind]) for kind in terms.kinds)], dim=-1)
         design = (every / self._drive["effort"][:, None]).flatten(0, 1) @ self._columns
         return design.T @ design / len(design)

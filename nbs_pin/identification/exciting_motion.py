@@ -115,6 +115,7 @@ class ExcitingMotion(Shown):
     acceleration=maybe(joints(above=0.0, unit="rad/s²")),
     clearance=maybe(number(least=0.0, most=10.0, unit="m")),
     friction=flag,
+    offset=flag,
     rotor_inertia=flag,
     starts=count(1, 10_000, "starts"),
     seed=SEED,
@@ -129,6 +130,7 @@ def exciting_motion(
     acceleration: PerJoint | None = None,
     clearance: float | None = 0.01,
     friction: bool = True,
+    offset: bool = True,
     rotor_inertia: bool = True,
     starts: int = 24,
     seed: int = 0,
@@ -142,7 +144,7 @@ def exciting_motion(
         W π = τ with rows divided by the effort limits and π in units of the prior of `identify`, on the base parameters
 
     which is what `identify` reports for data whose torque noise is the same share of every joint's effort limit, for
-    unknowns that include friction and rotor inertia if asked for. Random starts are followed with exact gradients
+    unknowns that include friction, offsets and rotor inertia if asked for. The search takes exact gradients
     (docs/theory.md §6). The limits are verified on a grid between whose points none is exceeded, those of the torque
     with the description's joint friction and without. A joint without effort limit gets one as in `collect`.
 
@@ -157,6 +159,7 @@ def exciting_motion(
             in the posture where the arm rests, if that is less; None to leave it out. Bodies are the convex hulls of
             their collision shapes, or of visual ones where there are none. Surroundings are not known.
         friction: Whether viscous and Coulomb friction are to be identified.
+        offset: Whether constant torques of the sensors are, which must be told from weight.
         rotor_inertia: Whether rotor inertias are.
         starts: Random starts; more take longer and may find better.
         seed: Seed of the starts; the same seed finds the same motion.
@@ -181,7 +184,8 @@ def exciting_motion(
     bounds = _bounds(robot, share, acceleration, effort)
     every = None if clearance is None else _distances(robot, clearance)
     near = None if every is None else every.restricted(_random(bounds), _NEAR)
-    names = (("viscous", "coulomb") if friction else ()) + (("rotor",) if rotor_inertia else ())
+    wanted = {"viscous": friction, "coulomb": friction, "offset": offset, "rotor": rotor_inertia}
+    names = [name for name, is_wanted in wanted.items() if is_wanted]
     in_units = _units(robot, DriveTerms.of(robot.nv, *names), bounds, harmonics / duration, effort)
     with one_thread():
         found = search(Problem(robot, in_units, bounds, duration, harmonics, near), every, starts, seed, progress)
