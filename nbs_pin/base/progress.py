@@ -1,6 +1,7 @@
 """Progress display for long work, shown only at a terminal."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,6 +11,9 @@ T = TypeVar("T")
 
 _PATIENCE = 2.0
 _REFRESH = 0.1
+_BEAT = 4.0
+_now: list[str] = []
+"""How far the last loop got that is not drawn."""
 
 
 def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = True) -> Iterator[T]:
@@ -18,7 +22,10 @@ def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = Tru
     A function as `label` is called whenever the bar is drawn.
     """
     if not (show and _is_terminal()):
-        yield from items
+        for done, item in enumerate(items):
+            if show:
+                _now[:] = [f"{_text(label)}, {done} of {len(items)}"]
+            yield item
         return
     from rich.console import Console
     from rich.progress import Progress
@@ -37,6 +44,34 @@ def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = Tru
 def _is_terminal() -> bool:
     """Whether stderr is one; it may be closed."""
     return sys.stderr is not None and sys.stderr.isatty()
+
+
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """A line on stderr every 4 s while the body of the `with` statement runs, if stderr is no terminal.
+
+    It says `what`, for how long, and how far the last loop of `tracked` got. At a terminal its bar says so.
+    """
+    if sys.stderr is None or _is_terminal():
+        yield
+        return
+    ended, start = threading.Event(), time.perf_counter()
+    _now.clear()
+
+    def tell() -> None:
+        while not ended.wait(_BEAT):
+            far = f": {_now[0]}" if _now else ""
+            sys.stderr.write(f"{what}, {time.perf_counter() - start:.0f} s{far}\n")
+            sys.stderr.flush()
+
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        _now.clear()
 
 
 @contextmanager

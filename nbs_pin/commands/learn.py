@@ -12,6 +12,7 @@ from rich.console import Console
 from nbs_pin.base.doors import own_arm
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
+from nbs_pin.base.progress import told
 from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, several, units
 from nbs_pin.cli.learn import Learn
@@ -62,7 +63,8 @@ def run(options: Learn, console: Console, notes: Console) -> None:
     common: dict[str, Any] = {"held_out": held_out, "transition": options.transition, "progress": True} | drives
     common["coupling"] = _matrix(options.coupling, data.nv)
     with results.made() as folder:
-        result = learn(data, options.model, robot, options.seed, **common, **given)
+        with told(f"learning {options.model}"):
+            result = learn(data, options.model, robot, options.seed, **common, **given)
         interrupted = result.report.stopped == "interrupted"
         with notes.status(f"writing into {folder}"):
             found = figures(result)
