@@ -283,3 +283,20 @@ def test_coupled_dynamics_are_those_of_an_arm(tmp_path):
         model.write_urdf(tmp_path / "model.urdf")
     with pytest.raises(ArgumentError, match="invertible 2×2"):
         nbs.CoupledDynamics(TWO, own, [[1.0, 1.0], [1.0, 1.0]])
+
+
+def test_parameters_are_as_uncertain_as_said():
+    """z-scores of the identifiable numbers over independent noise are of one."""
+    clean, rng = moved(TWO), np.random.default_rng(4)
+    clean = replace(clean, tau=clean.tau + nbs.JointFriction([2.0, 1.0], [1.0, 0.5]).torque(clean.v))
+    found, said = [], []
+    for _ in range(30):
+        model = nbs.identify(
+            replace(clean, tau=clean.tau + 0.3 * rng.standard_normal(clean.tau.shape)), TWO, friction=True
+        )
+        found.append([model.parameters[1, 1], *model.friction.viscous, *model.friction.coulomb])
+        deviations, drives = model.report.parameter_deviations, model.report.drive_deviations
+        said.append([deviations[1, 1], *drives["viscous"], *drives["coulomb"]])
+    ratio = np.std(found, axis=0) / np.mean(said, axis=0)
+    assert (ratio > 0.6).all()
+    assert (ratio < 1.5).all()

@@ -55,7 +55,7 @@ def network(path, tmp_path_factory):
 
 
 def test_the_files_are_a_model_and_how_it_came_about(path, network):
-    assert sorted(file.name for file in network.iterdir()) == sorted(learning.FILES)
+    assert {file.name for file in network.iterdir()} == set(learning.FILES) - set(learning.IDENTIFIED)
     said, model = summary(network), nbs.load(network / "model.nbs")
     assert said["settings"]["model"] == "cholesky"
     assert said["robot_sha256"] == ROBOT.sha256 == model.robot.sha256
@@ -74,6 +74,11 @@ def test_the_arm_is_the_one_of_the_data_and_inertias_are_found(path, tmp_path, c
     model, said = nbs.load(tmp_path / "model.nbs"), capsys.readouterr().out
     q = np.array([0.3, -1.1])
     assert np.abs(model.mass_matrix(q) - nbs.PinocchioDynamics(ROBOT).mass_matrix(q)).max() < 1e-8
+    arm = nbs.load_robot(tmp_path / "model.urdf", gravity=9.8)
+    assert np.abs(model.mass_matrix(q) - nbs.PinocchioDynamics(arm).mass_matrix(q)).max() < 1e-8
+    head, *rows = (tmp_path / "parameters.csv").read_text().splitlines()
+    assert head == "joint,parameter,value,standard deviation,urdf"
+    assert [row.split(",")[:2] for row in rows[:2]] == [["joint1", "m"], ["joint1", "mx"]]
     assert summary(tmp_path)["figures"]["viscous_friction"] == pytest.approx([0.0, 0.0], abs=1e-6)
     for word in ("two_link, identified", "joint2", "held out", "model.nbs", "learning.png"):
         assert word in said

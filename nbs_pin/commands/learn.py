@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.doors import own_arm
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
@@ -20,7 +21,9 @@ from nbs_pin.cli.log_options import numbers_of
 from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.learned_tables import print_learned
 from nbs_pin.commands.results import Results, drawing, sha256_of
+from nbs_pin.dynamics.coupled import CoupledDynamics
 from nbs_pin.dynamics.friction import DriveFriction, JointFriction
+from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.coupling import settled_with
 from nbs_pin.identification.datasets import Dataset
@@ -35,7 +38,9 @@ from nbs_pin.robots.named import load_named
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.storage.checkpoints import save
 
-FILES = ("model.nbs", "learning.png", SUMMARY)
+IDENTIFIED = ("parameters.csv", "model.urdf")
+"""The files that are written for identified bodies alone; a URDF cannot hold coupled drives."""
+FILES = ("model.nbs", "learning.png", *IDENTIFIED, SUMMARY)
 """The files that are written."""
 _ASKED = {"auto": None, "on": True, "off": False}
 
@@ -69,6 +74,7 @@ def run(options: Learn, console: Console, notes: Console) -> None:
         with notes.status(f"writing into {folder}"):
             found = figures(result)
             with results.replaced(FILES, found, interrupted=interrupted) as draft:
+                _write_bodies(result.model, draft)
                 save(result.model, draft / FILES[0], info={"learned": results.facts | {"interrupted": interrupted}})
             with drawing(folder / FILES[1]) as path:
                 settings = chosen(results.facts["settings"], "loss", "optimiser", "held_out", "seed")
@@ -111,6 +117,16 @@ def arm_of(data: Dataset) -> Robot | None:
             f"the data: the description {said['source']} has changed since; give the arm of then as {own_arm()}."
         )
     return robot
+
+
+def _write_bodies(model: DynamicsProvider, folder: Path) -> None:
+    """Identified bodies and drives with their standard deviations, beside the URDF's, and a URDF with them."""
+    if isinstance(model, IdentifiedDynamics):
+        head = ("joint", "parameter", "value", "standard deviation", "urdf")
+        rows = [["" if x is None else x for x in row] for row in model.report.details["parameters"]]
+        write_csv(folder / IDENTIFIED[0], head, rows)
+        if not isinstance(model, CoupledDynamics):
+            model.write_urdf(folder / IDENTIFIED[1])
 
 
 def _matrix(typed: str, n: int) -> np.ndarray | bool | None:

@@ -102,10 +102,12 @@ def find_coupling(geometry: Geometry, data: Dataset, wanted: Wanted) -> Coupling
     those of the joints and of the motors. det N = 1 for such matrices, so that this compares likelihoods.
     """
     some, n = data.thinned(_SOME), data.nv
+    if n < 2 or not data.tau.any():
+        return None
     none = Coupling(np.eye(n), at_motors=False)
     deviation = _deviations(geometry, some, wanted, none)
     suspect = deviation > np.sqrt(_LEFT) * np.maximum(some.tau.std(axis=0), 1e-300)
-    if n < 2 or not suspect.any():
+    if not suspect.any():
         return None
     best, least = none, float(np.log(deviation).sum())
     sides: tuple[bool, ...] = (False, True)

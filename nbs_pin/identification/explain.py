@@ -1,18 +1,20 @@
 """Physically consistent bodies, and drives, that explain the torques of an arm of known geometry."""
 
 import time
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import solve_triangular
 from threadpoolctl import threadpool_limits
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.shown import mixture
 from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, PARAMETERS_OF_COORDINATES, coordinates
+from nbs_pin.dynamics.pseudo_inertia import BASIS, PARAMETER_NAMES, PARAMETERS_OF_COORDINATES, coordinates
 from nbs_pin.identification.consistent_fit import ConsistentFit, consistent_fit, in_factors
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Candidates, Wanted, climb, parts_of, triangles_of
@@ -71,6 +73,11 @@ class IdentificationReport:
     """Number of Newton steps."""
     converged: bool = True
     """Whether these ended at the minimum."""
+    parameter_deviations: Float[np.ndarray, "n 10"] | None = None
+    """Standard deviations of the inertial parameters of `IdentifiedDynamics`, in its units, with the prior as knowledge
+    and as if samples were independent: those of a fast log are not, and its true deviations are larger."""
+    drive_deviations: Mapping[str, JointArray] = field(default_factory=dict)
+    """The same of the numbers of the drives, by term; zero where a joint lacks it."""
     drive_numbers: int = 0
     """Numbers of friction, offsets and rotor inertias that were fitted."""
     outliers: int = 0
@@ -138,6 +145,7 @@ def _explain(
         unidentifiable=tuple(_direction(x, expected, names) for x in weak),
         steps=fit.steps,
         converged=fit.converged,
+        **_deviations(design, fit, expected, regularisation, terms),
         drive_numbers=terms.count,
         outliers=outliers,
     )
@@ -292,6 +300,23 @@ def _direction(direction: np.ndarray, expected: Expected, names: list[str]) -> s
     spread = np.square(expected.bodies[:, :3]).sum(axis=(1, 2))
     units = np.column_stack([mass, *[np.sqrt(mass * spread)] * 3, *[spread] * 6])
     return mixture(np.concatenate([(moved / units).ravel(), direction[10 * n :]]), names)
+
+
+def _deviations(
+    design: np.ndarray, fit: ConsistentFit, expected: Expected, strength: float, terms: DriveTerms
+) -> dict[str, Any]:
+    """Standard deviations, from the Hessian of the objective in the steps of `consistent_fit`."""
+    n = len(fit.factors)
+    scale = np.where(terms.signed.ravel(), 1.0, fit.scalars)
+    local = np.hstack([in_factors(design[:, : 10 * n], fit.factors), design[:, 10 * n :] * scale])
+    R = np.linalg.qr(np.vstack([local, np.sqrt(strength) * np.eye(local.shape[1])]), mode="r")
+    root = solve_triangular(R, np.eye(len(R)))  # of the covariance
+    factors = expected.bodies @ fit.factors
+    moves = np.einsum("nij,kjl,nml->nkim", factors, BASIS, factors)  # of a step along each of BASIS
+    maps = PARAMETERS_OF_COORDINATES @ coordinates(moves).swapaxes(1, 2)
+    bodies = np.linalg.norm(maps @ root[: 10 * n].reshape(n, 10, -1), axis=-1)
+    drives = expected.scalars * scale * np.linalg.norm(root[10 * n :], axis=-1)
+    return {"parameter_deviations": bodies, "drive_deviations": terms.numbers(drives.reshape(-1, n))}
 
 
 def nmse(equations: np.ndarray, fit: ConsistentFit, data: Dataset) -> float:
