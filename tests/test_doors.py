@@ -105,9 +105,9 @@ def test_a_run_in_a_folder_is_named_by_the_option_of_the_folder(capsys, tmp_path
         ("learn still.npz --model cholesky", "use --loss acceleration"),
         (
             "learn still.npz --model residual --robot two_link --loss acceleration",
-            "takes no --loss acceleration; it takes --optimiser, --iterations.",
+            "takes no --loss acceleration; it takes --optimiser, --iterations, --transition.",
         ),
-        ("learn data.npz --model chain --iterations 3", "takes no --iterations 3; it takes none"),
+        ("learn data.npz --model chain --iterations 3", "takes no --iterations 3; it takes --transition"),
         ("train two_link --controller pd-plus --fixed-gains", "has nothing to train besides its gains"),
         ("track two_link --disturbance constant:1e12 --no-effort-limit", "after t = 0 s: the plant: Nan"),
     ],
