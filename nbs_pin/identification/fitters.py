@@ -1,7 +1,7 @@
 """The fitters of each kind of model; `registry.py` names them."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -27,6 +27,8 @@ from nbs_pin.identification.network_fit import NetworkFit, fit_network
 from nbs_pin.identification.unidentifiable import unidentifiable
 from nbs_pin.robots.robot import Robot
 
+_MOST, _LONG = 3_000, 100
+"""Most samples of long trajectories that a network is fitted to, and how many make a trajectory long."""
 LearnedDynamics: TypeAlias = LagrangianDynamics | IdentifiedDynamics
 """What `fit` makes: a model with its `friction` and its `report`."""
 
@@ -45,6 +47,11 @@ class FitTask:
     progress: bool
     settings: Mapping[str, Any]
     """Further keyword arguments of `fit`, not yet checked."""
+
+    def of_network(self) -> "FitTask":
+        """The same with fewer samples of long trajectories, of which neighbours say little new."""
+        held_out = None if self.held_out is None else _few(self.held_out)
+        return replace(self, data=_few(self.data), held_out=held_out)
 
     def wanted(self) -> dict[str, Any]:
         """The terms of the drives as keyword arguments."""
@@ -84,8 +91,14 @@ class Fitted:
         return {name: getattr(self, name) for name in names}
 
 
+def _few(data: Dataset) -> Dataset:
+    """The data, thinned where its trajectories are long."""
+    return data.thinned(_MOST) if len(data) > _LONG * data.trajectories else data
+
+
 def fit_family(task: FitTask) -> Fitted:
     """Fit a network family (`dynamics/registry.py`), scaled to the magnitudes of the data."""
+    task = task.of_network()
     settings = task.known("loss", "optimiser", "iterations", "transition", "widths", "epsilon")
     wanted = task.beside(settings)
     options: dict[str, Any] = {name: settings.pop(name) for name in ("widths", "epsilon") if name in settings}
@@ -132,6 +145,7 @@ def fit_rigid_tree(task: FitTask) -> Fitted:
 
 def fit_residual(task: FitTask) -> Fitted:
     """Fit a network that corrects the arm's nominal model."""
+    task = task.of_network()
     settings = task.known("optimiser", "iterations", "transition", "widths", "share")
     options: dict[str, Any] = {"widths": ResidualNetwork.fit_widths}
     options |= {name: settings.pop(name) for name in ("widths", "share") if name in settings}
@@ -179,6 +193,7 @@ def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport 
         evaluations=found.evaluations,
         stopped=found.stopped,
         unidentifiable=unidentifiable(found.network, task.data, friction=found.friction, loss=loss, names=names),
+        details={"fitted_samples": len(task.data)},
     )
 
 
