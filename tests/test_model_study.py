@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nbs_pin.accuracy.compare import compare
+from nbs_pin.base.torch_threads import one_thread
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.identification.collect import collect
@@ -15,7 +16,6 @@ from nbs_pin.reproduction.inverse_mlp import fit_mlp
 from nbs_pin.reproduction.model_noise import Noisy, _medians, _ranking, _ratios, friction_of, noise_section
 from nbs_pin.reproduction.model_structure import structure_section
 from nbs_pin.reproduction.model_trials import MLP, SPEED, Judge, Trial, attempt, chosen, column
-from nbs_pin.reproduction.paper import _one_thread
 from nbs_pin.robots.robot import load_robot
 from tests.test_plotting import png_size
 
@@ -51,8 +51,8 @@ def rough(arm):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    with _one_thread():
+def thread():
+    with one_thread():
         yield
 
 

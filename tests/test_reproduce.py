@@ -10,6 +10,7 @@ import torch
 
 from nbs_pin.base.arrays import matvec
 from nbs_pin.base.plain import plain
+from nbs_pin.base.torch_threads import one_thread
 from nbs_pin.cli import main
 from nbs_pin.commands import reproduce
 from nbs_pin.dynamics.analytic import AnalyticDynamics
@@ -35,8 +36,8 @@ def small(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    with paper._one_thread():
+def thread():
+    with one_thread():
         yield
 
 
