@@ -146,7 +146,7 @@ def test_what_is_left_out_is_named(effect, argument, change):
     assert "joint2" in said
     assert "joint1" not in said
     assert f"leave out {argument}=False" in said
-    assert "behaves otherwise" in next_try(found, TWO.joint_names, {argument: None})
+    assert "which was learned" in next_try(found, TWO.joint_names, {argument: None})
 
 
 def test_a_delay_is_named_with_its_time():

@@ -22,12 +22,12 @@ _SHIFTS = (-20, -10, -5, -3, -2, -1, 1, 2, 3, 5, 10, 20)
 _LEFT, _MUCH = 0.01, 0.2
 """Share of the torque's variance that is worth an explanation, and share of what is left that one effect explains."""
 _TRIES = {
-    "constant": ("offset", "the torque of {joints} has an offset"),
-    "v": ("friction", "{joints} has viscous friction"),
-    "sign v": ("friction", "{joints} has Coulomb friction"),
-    "√|v| sign v": ("friction", "{joints} has friction that bends with speed"),
-    "a": ("rotor_inertia", "{joints} has a rotor inertia"),
-    "|τ| sign v": ("friction", "{joints} has friction that grows with the load"),
+    "constant": ("offset", "an offset of the torque of {joints}"),
+    "v": ("friction", "viscous friction of {joints}"),
+    "sign v": ("friction", "Coulomb friction of {joints}"),
+    "√|v| sign v": ("friction", "friction of {joints} that is not linear in speed"),
+    "a": ("rotor_inertia", "rotor inertia of {joints}"),
+    "|τ| sign v": ("friction", "friction of {joints} that grows with the load"),
 }
 """Per effect the argument of `fit` that learns it, and what it means."""
 
@@ -123,12 +123,10 @@ def next_try(found: Remainder, joints: tuple[str, ...], asked: Mapping[str, bool
     argument, said = _TRIES[name]
     meaning = said.format(joints=which)
     if asked.get(argument) is not False:
-        return (
-            f"{share} would be explained by {name}, though that is learned: {which} behaves otherwise than in training"
-        )
+        return f"{share} would be explained by {meaning}, which was learned: these data are unlike those of the fit"
     flag = {"rotor_inertia": "--rotors"}.get(argument, f"--{argument}")
     remedy = where_printed(python=f"leave out {argument}=False", shell=f"leave out {flag} off")
-    return f"{share} would be explained by {name}, as if {meaning}; {remedy} to learn it"
+    return f"{share} would be explained by {meaning}; {remedy} to learn it"
 
 
 def _share(left: Float[np.ndarray, "samples n"], effect: Float[np.ndarray, "samples n"]) -> JointArray:

@@ -121,7 +121,7 @@ def attempt(
         mlp = fit_mlp(data, seed, transition=0.01 if friction else None, **settings)
         return Trial(*case, time.perf_counter() - began, **judge.torque_errors(mlp.torque))
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*friction would explain")  # leaving it out is what is studied
+        warnings.filterwarnings("ignore", message=".*leave out friction=False")  # leaving it out is what is studied
         found = fit(data, model, seed, robot=robot, friction=friction, **settings)
     if found.report.stopped == "interrupted":
         raise KeyboardInterrupt
