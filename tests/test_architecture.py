@@ -48,7 +48,7 @@ HOMES = {
     "coal": {"robots.collisions"},
     "flint": {"verification.balls"},
     "jsonschema": {"verification.document"},
-    "threadpoolctl": {"identification.chain_fit", "identification.explain"},
+    "threadpoolctl": {"identification.chain_fit", "identification.coupling", "identification.explain"},
     "xacro": {"robots.xacro_source"},
     "rosbags": {"identification.log_bags"},
     "numba": {"kernels", "benchmarks.bench"},

@@ -1,6 +1,7 @@
 """`nbs-pin learn`: a model of an arm from data, and its error on held-out motions."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.fit import fit, split_data
 from nbs_pin.identification.fit_report import FitReport, torque_errors
+from nbs_pin.identification.identify import rotors_wanted
 from nbs_pin.identification.logs import load_log
 from nbs_pin.reports.captions import chosen
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, Heading, picture
@@ -126,7 +128,9 @@ def _write_bodies(model: DynamicsProvider, folder: Path) -> None:
         rows = [["" if x is None else x for x in row] for row in model.report.details["parameters"]]
         write_csv(folder / IDENTIFIED[0], head, rows)
         if not isinstance(model, CoupledDynamics):
-            model.write_urdf(folder / IDENTIFIED[1])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that URDF has fewer terms of friction; parameters.csv has them all
+                model.write_urdf(folder / IDENTIFIED[1])
 
 
 def _matrix(typed: str, n: int) -> np.ndarray | bool | None:
@@ -172,7 +176,8 @@ def learn(data: Dataset, model: str, robot: Robot | None, seed: int = 0, **setti
     """The model that `fit` learns from the data, with its settings and errors, and the data held out as a test."""
     train, test = split_data(data, settings.pop("held_out", None), seed)
     if model == "identified" and robot is not None:
-        wanted = Wanted(settings.get("friction"), settings.get("offset"), settings.get("rotor_inertia"))
+        rotors = rotors_wanted(settings.get("rotor_inertia"), robot)
+        wanted = Wanted(settings.get("friction"), settings.get("offset"), rotors, settings.get("transition", 0.01))
         train, test, coupled = settled_with(train, test, robot, settings.get("coupling"), wanted)
         settings["coupling"] = coupled or False
     found = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
@@ -202,6 +207,7 @@ def figures(result: Learned) -> dict[str, Any]:
             "viscous_friction": None if friction is None else friction.viscous,
             "coulomb_friction_Nm": None if friction is None else friction.coulomb,
             "rotor_inertia": _rotors(result.model),
+            "coupling": getattr(result.model, "coupling", None),
             **_others(friction),
             "curves": curves,
         }
@@ -224,7 +230,7 @@ def _others(friction: JointFriction | None) -> dict[str, Any]:
 
 def _rotors(model: DynamicsProvider) -> np.ndarray | None:
     """The rotor inertias that were learned beside bodies, None where they are part of M."""
-    found = getattr(model, "rotor_inertia", None)
+    found = getattr(model, "motor_inertia", getattr(model, "rotor_inertia", None))
     network = getattr(model, "network", None)
     if found is None and network is not None and hasattr(network, "rotors"):
         found = network.rotors.detach().numpy(force=True) ** 2

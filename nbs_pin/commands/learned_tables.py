@@ -106,5 +106,5 @@ def _masses(details: dict[str, Any]) -> list[str]:
     """The mass that was found beside that of the URDF, and outliers."""
     found, stated, outliers = (details.get(name) for name in ("mass_kg", "stated_mass_kg", "outliers"))
     beside = "" if stated is None else f", {stated:.3g} kg in the URDF"
-    mass = [f"mass {found:.3g} kg{beside}; of it, torques do not show what the base carries"] if found else []
+    mass = [f"masses add up to {found:.3g} kg{beside}; what torques do not show is a guess"] if found else []
     return mass + ([f"{outliers} torques are far from all others, and count little"] if outliers else [])

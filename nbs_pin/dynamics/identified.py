@@ -1,5 +1,6 @@
 """Rigid-body dynamics with the geometry of a URDF and identified inertial parameters."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from nbs_pin.base.checks import floats
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import defines, known_code
 from nbs_pin.base.storable import storable
-from nbs_pin.dynamics.friction import JointFriction, friction_of_size
+from nbs_pin.dynamics.friction import DriveFriction, JointFriction, friction_of_size
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
@@ -88,8 +89,9 @@ class IdentifiedDynamics(PinocchioDynamics):
 
         `load_robot(path)` gives an arm whose M, C and G are those of this model. All that is fixed to the link behind a
         joint, as a payload is, becomes part of that link's body. Friction that this model does not know stays as the
-        arm's; the speed `transition` of Coulomb friction has no place in URDF, as gravity has none: give `load_robot`
-        the arm's if it is not 9.81 m/s² downward. Meshes keep the addresses that they have in the arm's description.
+        arm's; offsets and terms other than viscous and Coulomb friction are left out, with a warning. The speed
+        `transition` of Coulomb friction has no place in URDF, as gravity has none: give `load_robot` the arm's if it is
+        not 9.81 m/s² downward. Meshes keep the addresses that they have in the arm's description.
 
         Raises:
             OSError: If it cannot be written.
@@ -104,6 +106,9 @@ class IdentifiedDynamics(PinocchioDynamics):
             Robot('two_link', 2 joints, 2 kg, effort 100 N·m)
         """
         arm, friction = self.robot, self.friction
+        if isinstance(friction, DriveFriction):
+            text = "URDF has viscous and Coulomb friction alone; offsets and other terms of the friction are left out"
+            warnings.warn(f"{text} of {path}.", stacklevel=2)
         viscous, coulomb = (arm.damping, arm.friction) if friction is None else (friction.viscous, friction.coulomb)
         numbers = zip(viscous.tolist(), coulomb.tolist(), self.rotor_inertia.tolist(), strict=True)
         drives = {name: Drive(*own) for name, own in zip(arm.joint_names, numbers, strict=True)}

@@ -25,6 +25,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.chain import Chain, random_tree
 from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.pseudo_inertia import coordinates
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.drive_terms import DriveTerms
@@ -133,7 +134,7 @@ def fit_chain(
         for descent in sorted(descents, key=_cost)[:_TRIES]:
             polished = _polished(descent.at, scaled)
             bodies = explain(TreeGeometry(polished.at), data, wanted, regularisation, others=_AXIS * data.nv)
-            chosen = _measured(data, bodies.terms, _needed(polished.at, bodies, scaled))
+            chosen = _measured(data, bodies.terms, _needed(polished.at, bodies, data))
             physical = _physical(polished.at, bodies, chosen, regularisation, right_angles)
             cost = physical.whole().cost(chosen)
             tries.append(_Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(scaled) + _EXACT))
@@ -189,11 +190,11 @@ class TreeGeometry:
         return self.guess.regressor(q, v, a)
 
 
-def _needed(guess: TreeEstimate, bodies: Bodies, data: Measurements) -> Float[np.ndarray, "samples n"]:
-    """The torque of the bodies alone [N·m], at these states."""
-    factors, none = bodies.factors, np.zeros((len(data.kinds), data.q.shape[1]))
-    still = replace(data, tau=np.zeros_like(data.tau))
-    return -replace(guess, bodies=factors @ factors.swapaxes(1, 2), drag=none).residual(still)
+def _needed(guess: TreeEstimate, bodies: Bodies, data: Dataset) -> Float[np.ndarray, "samples n"]:
+    """The torque that bodies and rotors need [N·m]."""
+    own = coordinates(bodies.factors @ bodies.factors.swapaxes(1, 2)).ravel()
+    needed = TreeGeometry(guess).regressor(data.q, data.v, data.a) @ own
+    return needed if bodies.rotors is None else needed + bodies.rotors * data.a
 
 
 def _measured(data: Dataset, terms: DriveTerms, needed: np.ndarray | None = None) -> Measurements:

@@ -14,11 +14,13 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
+from threadpoolctl import threadpool_limits
 
 from nbs_pin.base.doors import where_printed
 from nbs_pin.dynamics.friction import coupling_of
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted
+from nbs_pin.identification.explain import robust
 from nbs_pin.identification.regressor import (
     Geometry,
     RobotGeometry,
@@ -35,6 +37,8 @@ _LEFT = 0.01
 """Unexplained share of the torque's variance of a joint from which on couplings are looked for."""
 _BETTER = 0.3
 """Least decrease of Σ_k log σ_k, the residuals' deviations, that makes a coupling: two of 14 % each, one of 26 %."""
+_WELL = 0.05
+"""Unexplained share of the variance of the motors concerned beyond which a coupling is not believed."""
 _TRIED = (1.0, -1.0)
 """Entries of N that are tried first, between neighbours."""
 _NEAR = 0.6
@@ -102,7 +106,7 @@ def find_coupling(geometry: Geometry, data: Dataset, wanted: Wanted) -> Coupling
     those of the joints and of the motors. det N = 1 for such matrices, so that this compares likelihoods.
     """
     some, n = data.thinned(_SOME), data.nv
-    if n < 2 or not data.tau.any():
+    if n < 2 or not data.tau.any() or data.about.get("doubts"):
         return None
     none = Coupling(np.eye(n), at_motors=False)
     deviation = _deviations(geometry, some, wanted, none)
@@ -118,10 +122,10 @@ def find_coupling(geometry: Geometry, data: Dataset, wanted: Wanted) -> Coupling
                 continue
             for at_motors in sides:
                 for first in _TRIED:
-                    tried, value = _fitted(geometry, some, wanted, best, (k, j), first, at_motors)
+                    tried, value = _fitted(geometry, some, wanted, best, least, (k, j), first, at_motors)
                     if value < lower:
                         found, lower = tried, value
-        if lower > least - _BETTER:
+        if lower > least - _BETTER or not _explained(geometry, some, wanted, found):
             return None if best is none else best
         best, least, sides = found, lower, (found.at_motors,)
 
@@ -136,16 +140,21 @@ def settled(
     """
     if given is False or isinstance(given, Coupling):
         return data, given or None
+    with threadpool_limits(1, "blas"):  # as in `explain`
+        found = _settle(data, robot, given, wanted)
+    if given is None and found is not None:
+        warnings.warn(f"{found.said(robot.joint_names)}; give {_none()} if that cannot be.", stacklevel=stacklevel)
+    return (data, None) if found is None else (found.of_joints(data), Coupling(found.matrix, at_motors=False))
+
+
+def _settle(data: Dataset, robot: Robot, given: Given, wanted: Wanted) -> Coupling | None:
+    """The coupling looked for, or which torques the data hold for a given one."""
     geometry = RobotGeometry(robot)
     if given is None:
-        found = find_coupling(geometry, data, wanted)
-        if found is not None:
-            warnings.warn(f"{found.said(robot.joint_names)}; give {_none()} if that cannot be.", stacklevel=stacklevel)
-    else:
-        matrix, some = coupling_of(given, data.nv), data.thinned(_SOME)
-        sides = [Coupling(matrix, at_motors) for at_motors in (False, True)]
-        found = min(sides, key=lambda side: _value(geometry, some, wanted, side))
-    return (data, None) if found is None else (found.of_joints(data), Coupling(found.matrix, at_motors=False))
+        return find_coupling(geometry, data, wanted)
+    matrix, some = coupling_of(given, data.nv), data.thinned(_SOME)
+    sides = [Coupling(matrix, at_motors) for at_motors in (False, True)]
+    return min(sides, key=lambda side: _value(geometry, some, wanted, side))
 
 
 def settled_with(
@@ -167,6 +176,7 @@ def _fitted(
     data: Dataset,
     wanted: Wanted,
     base: Coupling,
+    before: float,
     at: tuple[int, int],
     first: float,
     at_motors: bool,
@@ -182,21 +192,37 @@ def _fitted(
         return _value(geometry, data, wanted, with_entry(x))
 
     start = value(first)
-    if start > _value(geometry, data, wanted, base) - 0.5 * _BETTER:
+    if start > before - 0.5 * _BETTER:
         return with_entry(first), start
     found = minimize_scalar(value, bounds=(first - _NEAR, first + _NEAR), method="bounded", options={"xatol": 1e-4})
     return with_entry(float(found.x)), float(found.fun)
 
 
+def _explained(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coupling) -> bool:
+    """Whether the torques of the motors concerned are well explained, and no entry is at the bound of its search."""
+    off = coupling.matrix - np.eye(data.nv)
+    entries = np.abs(off[off != 0.0])
+    if ((np.abs(entries - 1.0) > 0.98 * _NEAR) & (np.abs(entries + 1.0) > 0.98 * _NEAR)).any():
+        return False
+    moved = coupling.of_motors(coupling.of_joints(data))
+    share = np.square(_deviations(geometry, data, wanted, coupling)) / np.maximum(moved.tau.var(axis=0), 1e-300)
+    concerned = (off != 0.0).any(axis=0) | (off != 0.0).any(axis=1)
+    return bool((share[concerned] < _WELL).all())
+
+
 def _value(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coupling) -> float:
-    """Σ log σ: less a constant, minus the logarithm of the likelihood per sample."""
-    return float(np.log(_deviations(geometry, data, wanted, coupling)).sum())
+    """Less a constant, minus the logarithm of the likelihood per sample: Σ log σ of the motors' torques, and of the
+    change of variables from those of the joints.
+    """
+    change = 0.0 if coupling.at_motors else float(np.linalg.slogdet(coupling.matrix)[1])
+    return float(np.log(_deviations(geometry, data, wanted, coupling)).sum()) + change
 
 
 def _deviations(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coupling) -> np.ndarray:
     """RMS residuals of the motors' torques [N·m] after a fit of arbitrary bodies and the usual terms of drives."""
     moved = coupling.of_motors(coupling.of_joints(data))
-    rows = equation_rows(CoupledGeometry(geometry, coupling.matrix), moved, wanted.first(data.nv).factors(moved))
+    factors = wanted.first(data.nv).factors(moved)
+    rows, _ = robust(equation_rows(CoupledGeometry(geometry, coupling.matrix), moved, factors))
     triangles = of_all_joints(triangle(rows))
     size = torque_size(triangles, len(data))
     noise = size

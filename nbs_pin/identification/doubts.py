@@ -38,7 +38,7 @@ def doubts(
     some = data.take(np.sort(np.random.default_rng(0).permutation(len(data))[:_SOME]))
     found = (
         "" if robot is None or not robot.has_bodies or data.about.get("doubts") else _unit(some, robot),
-        _missing(model, some, friction, asked),
+        _missing(model, some, friction, asked, robot),
     )
     return tuple(text for text in found if text)
 
@@ -66,13 +66,17 @@ def _unit(data: Dataset, robot: Robot) -> str:
 
 
 def _missing(
-    model: DynamicsProvider, data: Dataset, friction: JointFriction | None, asked: Mapping[str, bool | None]
+    model: DynamicsProvider,
+    data: Dataset,
+    friction: JointFriction | None,
+    asked: Mapping[str, bool | None],
+    robot: Robot | None,
 ) -> str:
     """Drives that were not to be learned and would explain much of what is left."""
     if not data.tau.std(axis=0).any():
         return ""
     found = remainder(model, data, friction)
-    names = tuple(f"joint {i + 1}" for i in range(data.nv))
+    names = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
     left_out = asked.get(found.cause, True) is False
     return next_try(found, names, asked) if left_out and found.unexplained >= _NOTICED else ""
 

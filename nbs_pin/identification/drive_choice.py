@@ -29,6 +29,8 @@ _FEW = 2
 """Samples of a part per candidate below which nothing can be told."""
 _EXACT, _SEEN = 1e-6, 1e-5
 """Shares of the torque: the least noise that is assumed, and the residual below which a term is not looked for."""
+_LARGEST_LOAD = 0.5
+"""Share of the load beyond which its friction is none of a gear."""
 _SPEEDS = (0.02, 0.05, 0.1, 0.2, 0.4)
 """Stribeck speeds that are tried, as shares of the joint's largest speed."""
 _PRIOR, _RIDGE = 0.3, 1e-12
@@ -136,6 +138,7 @@ def climb(
     samples: Int[np.ndarray, " parts"],
     noise: JointArray,
     bodies: int,
+    unit: Float[np.ndarray, "kinds n"],
 ) -> Bool[np.ndarray, "kinds n"]:
     """Which candidates each joint uses.
 
@@ -146,12 +149,14 @@ def climb(
         samples: Samples of each part.
         noise: Residual by which a joint is weighted [N·m].
         bodies: Columns of bodies.
+        unit: Unit of the number of every candidate.
     """
     names, terms = np.array(candidates.names), candidates.wanted.terms()
     few = samples.min() < _FEW * len(names) or len(samples) < _PARTS
     size = np.sqrt(np.square(triangles[..., -1]).sum(axis=(0, 2)) / samples.sum())
     used = np.array([[terms[name] is True] * len(size) for name in names], dtype=bool).reshape(-1, len(size))
-    judge = _Judge(triangles, samples, np.maximum(noise, _EXACT * np.maximum(size, 1e-300)), bodies)
+    least = _EXACT * np.maximum(size, _EXACT * size.max())
+    judge = _Judge(triangles, samples, np.maximum(noise, least), bodies)
     left, _ = judge.left(used)
     for name in _LADDER:
         if few or terms[name] is not None:
@@ -163,7 +168,8 @@ def climb(
             more[k] = True
             rest, numbers = judge.left(more)
             found.append(rest)
-            right = (numbers[:, k].mean(axis=0) > 0.0) | (name in SIGNED)
+            mean = numbers[:, k].mean(axis=0) * unit[k]
+            right = (mean > 0.0) & (mean < (_LARGEST_LOAD if name == "load" else np.inf)) | (name in SIGNED)
             means[row, right] = rest.mean(axis=0)[right]
         for j, row in enumerate(np.argmin(means, axis=0)):
             before, gain = left[:, j].mean(), left[:, j] - found[row][:, j]
@@ -243,7 +249,7 @@ def terms_of_rest(
     candidates = Candidates.of(wanted, data, needed)
     rows = np.concatenate([candidates.factors.transpose(2, 1, 0), left.T[..., None]], axis=-1)
     triangles, samples = triangles_of(rows, parts)
-    noise = np.maximum(left.std(axis=0), 1e-300)
-    used = climb(candidates, triangles, samples, noise, 0)
+    noise = left.std(axis=0)
+    used = climb(candidates, triangles, samples, noise, 0, np.ones((len(candidates.names), data.nv)))
     terms, _ = candidates.chosen(used)
     return terms, terms.solved(terms.factors(data, needed), left)

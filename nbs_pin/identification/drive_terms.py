@@ -1,9 +1,9 @@
 """What the drive of a joint adds to the torque of its bodies, linear in its unknowns.
 
     τ = Y(q, v, v̇) π + viscous·v + coulomb·tanh(v/ε) + offset + asymmetry·|v| + stribeck·exp(−(v/v_s)²)·tanh(v/ε)
-        + load·|Yπ|·tanh(v/ε) + rotor·v̇
+        + load·|Yπ + rotor·v̇|·tanh(v/ε) + rotor·v̇
 
-In the last but one Yπ is taken from a fit without it.
+The load is taken from a fit without this term.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,6 +19,8 @@ from nbs_pin.identification.datasets import Dataset
 
 TERMS = ("viscous", "coulomb", "offset", "asymmetry", "stribeck", "load", "rotor")
 """All terms, the rotor inertia last."""
+_MOST_LOAD = 0.9
+"""Largest share of the load that friction takes: with all of it, no torque would move the joint."""
 SIGNED = ("offset", "asymmetry")
 """Terms of any sign; the others are ≥ 0."""
 
@@ -67,7 +69,7 @@ class DriveTerms:
     ) -> Float[np.ndarray, "kinds samples n"]:
         """Derivative of each joint's torque by its own numbers; zero where a joint lacks the term.
 
-        needed: Yπ [N·m], for load-dependent friction; None takes the measured torque for it.
+        needed: Yπ + rotor·v̇ [N·m], for load-dependent friction; None takes the measured torque for it.
         """
         rows = [self.factor(name, data, needed) * self.used[TERMS.index(name)] for name in self.kinds]
         return np.array(rows).reshape(-1, *data.v.shape)
@@ -136,7 +138,7 @@ class DriveTerms:
             numbers["asymmetry"],
             numbers["stribeck"],
             self.stribeck_speed,
-            numbers["load"],
+            np.minimum(numbers["load"], _MOST_LOAD),
             coupling,
         )
 

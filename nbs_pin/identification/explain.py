@@ -81,7 +81,7 @@ class IdentificationReport:
     drive_numbers: int = 0
     """Numbers of friction, offsets and rotor inertias that were fitted."""
     outliers: int = 0
-    """Torques far from all others, of single joints and samples, which count little."""
+    """Torques far from all others, of single joints and samples, which count little, in `train_nmse` too."""
 
 
 class Bodies(NamedTuple):
@@ -159,12 +159,12 @@ def _equations(
     """The terms of the drives, their factors, R of each joint's equations with them, and the number of outliers."""
     if isinstance(wanted, DriveTerms):
         factors = wanted.factors(data)
-        rows, outliers = _robust(equation_rows(geometry, data, factors))
+        rows, outliers = robust(equation_rows(geometry, data, factors))
         return wanted, factors, of_all_joints(triangle(rows)), outliers
     n, parts = data.nv, parts_of(data)
     needed = _needed(geometry, data, wanted)
     candidates = Candidates.of(wanted, data, needed)
-    rows, outliers = _robust(equation_rows(geometry, data, candidates.factors))
+    rows, outliers = robust(equation_rows(geometry, data, candidates.factors))
     triangles, samples = triangles_of(rows, parts)
     whole = triangle(np.concatenate(list(triangles), axis=1))
     expected = expectation(geometry, len(data), candidates.factors, of_all_joints(whole))
@@ -174,10 +174,10 @@ def _equations(
             in_factors(r[:, :, : 10 * n].reshape(-1, 10 * n), expected.bodies).reshape(*r.shape[:2], -1)
             for r in triangles
         ]
-        usual = expected.scalars.reshape(-1, n).T[:, None]
-        own = triangles[..., 10 * n : -1] * usual
+        usual = expected.scalars.reshape(-1, n)
+        own = triangles[..., 10 * n : -1] * usual.T[:, None]
         given = np.concatenate([np.array(unit), own, triangles[..., -1:]], axis=-1)
-        used = climb(candidates, given, samples, _left(whole) / np.sqrt(len(data)), 10 * n)
+        used = climb(candidates, given, samples, _left(whole) / np.sqrt(len(data)), 10 * n, usual)
     terms, which = candidates.chosen(used)
     columns = np.concatenate(
         [whole[:, :, : 10 * n], np.zeros((*whole.shape[:2], len(which))), whole[:, :, -1:]], axis=-1
@@ -188,12 +188,15 @@ def _equations(
 
 
 def _needed(geometry: Geometry, data: Dataset, wanted: Wanted) -> Float[np.ndarray, "samples n"]:
-    """The torque of bodies alone [N·m], from a fit of all joints with the first terms of the drives."""
-    rows, _ = _robust(equation_rows(geometry, data, wanted.first(data.nv).factors(data)))
+    """The torque that bodies and rotors need [N·m], from a fit of all joints with the first terms of the drives."""
+    terms, n = wanted.first(data.nv), data.nv
+    rows, _ = robust(equation_rows(geometry, data, terms.factors(data)))
     triangles = of_all_joints(triangle(rows))
     design, target = weighted(triangles, torque_size(triangles, len(data)))
-    found = np.linalg.lstsq(design, target, rcond=1e-10)[0][: 10 * data.nv]
-    return np.asarray((rows[:, :, : 10 * data.nv] @ found).T)
+    found = np.linalg.lstsq(design, target, rcond=1e-10)[0]
+    rotors = terms.rotors(found[10 * n :].reshape(-1, n))
+    bodies = np.asarray((rows[:, :, : 10 * n] @ found[: 10 * n]).T)
+    return bodies if rotors is None else bodies + rotors * data.a
 
 
 def _left(rows: Float[np.ndarray, "n rows columns"]) -> JointArray:
@@ -202,7 +205,7 @@ def _left(rows: Float[np.ndarray, "n rows columns"]) -> JointArray:
     return np.array([np.linalg.norm(row[:, :-1] @ x - row[:, -1]) for row, x in zip(rows, found, strict=True)])
 
 
-def _robust(rows: Float[np.ndarray, "n samples columns"]) -> tuple[np.ndarray, int]:
+def robust(rows: Float[np.ndarray, "n samples columns"]) -> tuple[np.ndarray, int]:
     """The equations, weighted after Huber if some residuals are far from all others, and how many are.
 
     The residual of every joint is that of a fit to its own equations.

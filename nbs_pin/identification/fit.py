@@ -86,13 +86,12 @@ def fit(
         True
     """
     fitter = entry("model", model, MODELS).load()
-    fault = "" if robot is None else arm_fault(data, robot) or (sign_fault(data, robot) if data.tau.any() else "")
-    if fault:
-        raise ArgumentError(f"{fault}.")
+    _check(data, robot)
     start = time.perf_counter()
     train, test = split_data(data, held_out, seed)
     rotors = rotors_wanted(rotor_inertia, robot)
-    train, test, coupled = _uncoupled(model, train, test, robot, coupling, Wanted(friction, offset, rotors))
+    wanted = Wanted(friction, offset, rotors, settings.get("transition", 0.01))
+    train, test, coupled = _uncoupled(model, train, test, robot, coupling, wanted)
     settings |= {"coupling": coupled or False} if model == "identified" else {}
     fitted = fitter(FitTask(model, train, test, seed, robot, (friction, offset, rotors), progress, settings))
     bare, asked = fitted.assemble(None), {"friction": friction, "offset": offset, "rotor_inertia": rotors}
@@ -114,6 +113,13 @@ def fit(
     for doubt in (*doubts(bare, train, fitted.friction, robot, asked), *doubts_of_report(report)):
         warnings.warn(f"{doubt}.", stacklevel=2)
     return fitted.assemble(report)
+
+
+def _check(data: Dataset, robot: Robot | None) -> None:
+    """Raise ArgumentError for data of another arm, or with torques of the wrong sign."""
+    fault = "" if robot is None else arm_fault(data, robot) or (sign_fault(data, robot) if data.tau.any() else "")
+    if fault:
+        raise ArgumentError(f"{fault}.")
 
 
 def _uncoupled(
@@ -140,8 +146,12 @@ def split_data(data: Dataset, held_out: Dataset | float | None = None, seed: int
 
 def _ended(stopped: str, model: DynamicsProvider, data: Dataset, friction: JointFriction | None) -> str:
     """Why the fit ended, unless no torque at all predicts the data as well."""
-    worthless = data.tau.any() and torque_nmse(model, data, friction) >= zero_torque_nmse(data)
-    return "no better than zero torque" if worthless and stopped != "interrupted" else stopped
+    if stopped == "interrupted" or not data.tau.any():
+        return stopped
+    left = torque_nmse(model, data, friction)
+    if left >= zero_torque_nmse(data):
+        return "no better than zero torque"
+    return "no better than a constant torque" if left >= 1.0 else stopped
 
 
 def _useless(model: DynamicsProvider, data: Dataset, friction: JointFriction | None) -> tuple[str, ...]:

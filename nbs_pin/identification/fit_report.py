@@ -39,8 +39,8 @@ class FitReport:
     """Why it ended: "converged", "iterations", "held out" (no improvement there), "interrupted", or, for a chain,
     "starts": no other random tree found the best minimum, or no physical bodies reach it; give more data or starts.
     For a network, "no better than the start" if no iterate predicts the held-out data, or without these the training
-    data, better than the untrained network with friction. However it ended, "no better than zero torque" if that
-    predicts the data as well."""
+    data, better than the untrained network with friction. However it ended, "no better than zero torque", or
+    than "a constant torque", if that predicts the data as well."""
     unidentifiable: tuple[str, ...]
     """What the data do not determine, the worst first."""
     left: Mapping[str, Any] = field(default_factory=dict)

@@ -78,6 +78,8 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
     spacing, more, limits = _spacing(read), list[str](), None
     if spacing["rows"] > len(np.unique(read.trajectory)):  # not of single states
         read, limits, more = _put_right(path, read, joints, settings.degrees, absent)
+    elif absent.any():
+        read = read.take(~absent)
     read = _advanced(read, settings.delay) if settings.delay else read
     lowpass = 0.0 if settings.lowpass is None and settings.window is not None else settings.lowpass
     even = evenly(path, read, settings.resample, lowpass)
@@ -104,7 +106,8 @@ def _read(
         return columns_of_table(path, names, chosen, rate)
     if ending in BAGS:
         bag = read_bag(path, chosen.get("topic"))
-        return columns_of_arrays(path, bag.arrays, names, {}, rate)[0], bag.notes
+        own = {kind: name for kind, name in chosen.items() if kind != "topic"}
+        return columns_of_arrays(path, bag.arrays, names, own, rate)[0], bag.notes
     if ending not in (".npz", ".mat"):
         known = ", ".join((".csv", ".csv.gz", ".txt", ".npz", ".mat", *BAGS))
         raise FileFormatError(f"{path}: a '{path.suffix}' file, expected one of {known}; convert it.")

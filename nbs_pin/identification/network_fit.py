@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, cast, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Int
 
@@ -175,7 +176,7 @@ def fit_network(
     equation = found.equations.equation
     equation.requires_grad_(False)
     friction = _friction(found, wanted, data) if first is not None else None
-    numbers = 0 if friction is None else DriveTerms.of_friction(friction)[0].count
+    numbers = 0 if friction is None else int(np.count_nonzero(DriveTerms.of_friction(friction)[1]))
     count, work = sum(p.numel() for p in equation.network.parameters()) + numbers, round(found.work)
     if found.is_untrained and stopped != "interrupted":
         stopped = "no better than the start"
@@ -192,7 +193,7 @@ def _friction(found: _Search, wanted: Wanted, data: Dataset) -> JointFriction | 
     chosen = terms.friction(numbers)
     judged = found.equations if found.held_out is None else found.held_out
     costs = [judged.torque_cost(friction) for friction in (chosen, fitted)]
-    return chosen if costs[0] <= _AS_GOOD * costs[1] else fitted
+    return chosen if costs[0] <= (1.0 if found.is_untrained else _AS_GOOD) * costs[1] else fitted
 
 
 def _marquardt_starts(

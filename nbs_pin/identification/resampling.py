@@ -158,6 +158,12 @@ def _interpolated(path: Path, columns: Columns, rows: slice, step: float) -> Col
 
 def lowpassed(columns: Columns, step: float, cutoff: float) -> Columns:
     """The columns through one Butterworth filter, forwards and backwards, which delays nothing."""
+    if not 2.0 * step * cutoff < 1.0:
+        most = float(f"{0.49 / step:.3g}")
+        raise ArgumentError(
+            f"lowpass is {cutoff:g} Hz, expected less than half the {1.0 / step:.4g} rows per second; give "
+            f"{option('lowpass', most)} at most, or {option('lowpass', 0.0)} for none."
+        )
     stages = butter(_STAGES, 2.0 * step * cutoff, output="sos")
     found: dict[str, Any] = {}
     for name in ("q", "v", "a", "tau"):
