@@ -16,7 +16,9 @@ from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.identification.datasets import recordings
 from nbs_pin.identification.fit import split_data
 from nbs_pin.identification.log_files import Columns
+from nbs_pin.identification.repairs import _cut
 from nbs_pin.identification.resampling import lowpassed
+from nbs_pin.motions.recordings import Joints
 from tests.commands import refusal
 
 ARM = nbs.load_robot("ur5")
@@ -369,6 +371,10 @@ def test_single_states_need_no_time_but_all_derivatives(tmp_path):
     data = nbs.load_log(tmp_path / "states.npz", robot=ARM, rate=0)
     assert_array_equal(data.q, q[some])
     assert data.trajectories == len(data) == 300
+    tau[some[7], 0] = np.nan
+    np.savez(tmp_path / "holed.npz", q=q[some], v=v[some], a=a[some], tau=tau[some])
+    with pytest.warns(UserWarning, match="1 rows with entries that are missing were left out, first row 8"):
+        assert_array_equal(nbs.load_log(tmp_path / "holed.npz", robot=ARM, rate=0).q, np.delete(q[some], 7, axis=0))
     with pytest.raises(FileFormatError, match="rows without times need v and a"):
         nbs.load_log(tmp_path / "states.npz", robot=ARM, rate=0, columns={"a": "-"})
 
@@ -462,3 +468,17 @@ def test_what_no_log_is_is_refused_with_a_remedy(tmp_path):
     np.savetxt(tmp_path / "log.csv", np.ones((9, 13)), delimiter=",", header=",".join(["x", *"abcdefghijkl"]))
     with pytest.raises(FileFormatError, match=r"no column 'tau_1'.* name them with columns=\{'tau': 'NAME_\*'\}"):
         nbs.load_log(tmp_path / "log.csv")
+
+
+def test_a_smooth_peak_in_coarse_steps_is_no_limit():
+    t = np.arange(0.0, 10.0, 0.002)
+    joints = Joints(["joint 1"], np.array([False]), np.array([False]))
+    smooth = 0.02 * np.round(10.0 * np.sin(2.0 * np.pi * 0.3 * t)[:, None] / 0.02)
+    every = np.ones(len(t), dtype=bool)
+    assert np.isinf(_cut(smooth, every, joints)[0]).all()
+    assert _cut(np.clip(smooth, -np.inf, 7.0), every, joints)[0][1, 0] == 7.0
+
+
+def test_a_filter_faster_than_the_rows_is_refused(tmp_path):
+    with pytest.raises(ArgumentError, match=r"lowpass is 400 Hz, expected less than half the .* give lowpass="):
+        read(tmp_path, measured(), lowpass=400.0)

@@ -185,7 +185,9 @@ def _clocked(columns: Columns) -> tuple[Columns, np.ndarray, list[str]]:
     if len(back):
         more = f", and {len(back) - 1} more times" if len(back) > 1 else ""
         notes.append(f"time goes back between rows {back[0]} and {back[0] + 1}{more}: another recording begins there")
-        numbers = np.unique(numbers, return_inverse=True)[1] + np.searchsorted(back, np.arange(len(t)), side="right")
+        begins = ~same
+        begins[back - 1] = True
+        numbers = np.append(0, np.cumsum(begins))
     if stopped.any():
         many = f"{np.count_nonzero(stopped)} rows with the time of the row before were left out"
         notes.append(f"{many}, first row {int(np.argmax(stopped)) + 1}")

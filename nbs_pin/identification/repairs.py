@@ -33,6 +33,8 @@ _FRESH = 1.6
 """Step after an angle stood still, in the steps around: two or more are made up for."""
 _CUT_ROWS, _CUT_SHARE = 3, 5e-4
 """A largest torque is a limit if it lasts so many rows in succession, and is that share of all rows."""
+_QUANTA = 8.0
+"""Least way into a limit, in units of the smallest step of the torque."""
 _NEAR_LIMIT, _MOST_CUT = 0.03, 0.8
 """Distance from a limit, as a share of it, at which rows are left out; largest share of all rows that are."""
 
@@ -206,13 +208,25 @@ def _cut(
         unit = units("torque", joints.prismatic)[i]
         for side, value in enumerate((float(tau[:, i].min()), float(tau[:, i].max()))):
             at = (tau[:, i] == value) & fresh
-            if _long(at, _CUT_ROWS - 1).any() and _CUT_SHARE < at.mean() < 0.5 and np.ptp(tau[:, i]) > 0.0:
+            if _long(at, _CUT_ROWS - 1).any() and _CUT_SHARE < at.mean() < 0.5 and _runs_into(tau[:, i], at):
                 limits[side, i] = value
                 notes.append(
                     f"tau of {name} is cut off at {value:.6g} {unit}, which it has in {_rows(at)}, first row "
                     f"{_first(at)}: a limit of the motor or of the recording; rows near it were left out"
                 )
     return limits, notes
+
+
+def _runs_into(tau: Float[np.ndarray, " rows"], at: Bool[np.ndarray, " rows"]) -> bool:
+    """Whether the torque runs into the value that it has in these rows, where a smooth peak creeps up to it.
+
+    Before a plateau as long as the rounding of a parabola makes it, that one moves by four steps of the rounding in
+    the same time.
+    """
+    steps = np.abs(np.diff(tau))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int))).reshape(-1, 2)
+    moved = [abs(tau[begin] - tau[max(2 * begin - end, 0)]) for begin, end in edges]
+    return bool((steps > 0.0).any() and np.median(moved) > _QUANTA * steps[steps > 0.0].min())
 
 
 def beyond(tau: Float[np.ndarray, "rows n"], limits: Float[np.ndarray, "2 n"]) -> Bool[np.ndarray, " rows"]:

@@ -16,6 +16,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.signal import butter, periodogram, sosfiltfilt
 
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.identification.datasets import trajectory_slices
 from nbs_pin.identification.log_files import Columns
