@@ -5,6 +5,7 @@ import warnings
 from dataclasses import replace
 from functools import cache
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -341,3 +342,24 @@ def test_torque_that_is_a_constant_and_noise_is_not_learned():
         warnings.simplefilter("ignore")
         report = nbs.fit(replace(data, tau=5.0 + rng.standard_normal(data.tau.shape)), "identified", robot=TWO).report
     assert report.stopped == ("no better than a constant torque" if report.test_nmse >= 1.0 else "converged")
+
+
+def test_identified_arms_come_out_as_mjcf_too(tmp_path):
+    own = np.stack([body.toDynamicParameters() for body in list(TWO.model.inertias)[1:]])
+    friction = nbs.JointFriction([0.5, 0.2], [1.0, 0.3])
+    model = nbs.IdentifiedDynamics(TWO, own, friction, [0.4, 0.1])
+    arm = nbs.load_robot(model.write_urdf(tmp_path / "arm.urdf"), gravity=9.8)
+    path = nbs.MujocoPlant(arm, joint_friction="keep").write_mjcf(tmp_path / "arm.xml")
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    assert_allclose(theirs.dof_damping, friction.viscous)
+    assert_allclose(theirs.dof_frictionloss, friction.coulomb)
+    assert_allclose(theirs.actuator_ctrlrange[:, 1], TWO.effort_limit)
+    data, mass = mujoco.MjData(theirs), np.zeros((2, 2))
+    data.qpos[:] = q = np.array([0.4, -0.7])
+    mujoco.mj_forward(theirs, data)
+    for unit, column in zip(np.eye(2), mass, strict=True):
+        mujoco.mj_mulM(theirs, data, column, unit)
+    assert_allclose(mass, model.mass_matrix(q), rtol=1e-5)
+    again = nbs.load_robot(path)
+    assert_allclose(again.armature, [0.4, 0.1])
+    assert_allclose(nbs.PinocchioDynamics(again).gravity(q), model.gravity(q), rtol=1e-5)

@@ -38,10 +38,11 @@ from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, Heading, p
 from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.named import load_named
 from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.simulation.mujoco_plant import MujocoPlant
 from nbs_pin.storage.checkpoints import save
 
-IDENTIFIED = ("parameters.csv", "model.urdf")
-"""The files that are written for identified bodies alone; a URDF cannot hold coupled drives."""
+IDENTIFIED = ("parameters.csv", "model.urdf", "model.xml")
+"""The files that are written for identified bodies alone; URDF and MJCF cannot hold coupled drives."""
 FILES = ("model.nbs", "learning.png", *IDENTIFIED, SUMMARY)
 """The files that are written."""
 _ASKED = {"auto": None, "on": True, "off": False}
@@ -122,7 +123,7 @@ def arm_of(data: Dataset) -> Robot | None:
 
 
 def _write_bodies(model: DynamicsProvider, folder: Path) -> None:
-    """Identified bodies and drives with their standard deviations, beside the URDF's, and a URDF with them."""
+    """Identified bodies and drives with their standard deviations, beside the URDF's, and URDF and MJCF with them."""
     if isinstance(model, IdentifiedDynamics):
         head = ("joint", "parameter", "value", "standard deviation", "urdf")
         rows = [["" if x is None else x for x in row] for row in model.report.details["parameters"]]
@@ -130,7 +131,9 @@ def _write_bodies(model: DynamicsProvider, folder: Path) -> None:
         if not isinstance(model, CoupledDynamics):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that URDF has fewer terms of friction; parameters.csv has them all
-                model.write_urdf(folder / IDENTIFIED[1])
+                urdf, gravity = model.write_urdf(folder / IDENTIFIED[1]), model.robot.gravity_vector.tolist()
+                arm = load_robot(urdf, gravity=gravity, zero_limits="unlimited")
+                MujocoPlant(arm, joint_friction="keep").write_mjcf(folder / IDENTIFIED[2])
 
 
 def _matrix(typed: str, n: int) -> np.ndarray | bool | None:

@@ -5,16 +5,18 @@ import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import mujoco
 import numpy as np
 
-from nbs_pin.base.arguments import DURATION, checked, choice, either, maybe
+from nbs_pin.base.arguments import DURATION, checked, choice, either, maybe, writable
 from nbs_pin.base.arrays import Matrices, Vectors, as_vectors, finite_result
 from nbs_pin.base.checks import all_finite
 from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError, RobotError, SimulationDiverged
+from nbs_pin.base.files import write_whole
 from nbs_pin.dynamics.friction import FRICTION, JointFriction, friction_of_size, has_viscous_and_coulomb_only
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.simulation.massless import gather_joints
@@ -93,7 +95,7 @@ class MujocoPlant(Plant):
         self._robot, self._nv = robot, robot.nv
         self.integrator = integrator
         self.joint_friction, self.joint_stops = joint_friction, joint_stops
-        self.model = build_model(robot, integrator, joint_friction, joint_stops)
+        _, self.model = build_model(robot, integrator, joint_friction, joint_stops)
         ids = [self.model.joint(name).id for name in robot.joint_names]
         self._at_q = _in_order(self.model.jnt_qposadr[ids])
         self._at_v = _in_order(self.model.jnt_dofadr[ids])
@@ -128,6 +130,31 @@ class MujocoPlant(Plant):
     def robot(self) -> Robot:
         """The arm."""
         return self._robot
+
+    @checked(path=writable)
+    def write_mjcf(self, path: str | Path) -> Path:
+        """Write the arm as MJCF, with its bodies, rotor inertias and the friction of this plant; returns its path.
+
+        MuJoCo writes six digits, without shapes. A motor of unit gear drives every joint within its effort limit.
+
+        Raises:
+            OSError: If it cannot be written.
+
+        Example:
+            >>> import tempfile
+            >>> import nbs_pin as nbs
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     path = nbs.MujocoPlant(nbs.load_robot("two_link")).write_mjcf(f"{folder}/two_link.xml")
+            ...     nbs.load_robot(path)
+            Robot('two_link', 2 joints, 2 kg, effort 100 N·m)
+        """
+        spec, _ = build_model(self._robot, self.integrator, self.joint_friction, self.joint_stops)
+        for name, effort in zip(self._robot.joint_names, self._robot.effort_limit.tolist(), strict=True):
+            motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            if np.isfinite(effort):
+                motor.ctrllimited, motor.ctrlrange = True, np.array([-effort, effort])
+        spec.compile()
+        return write_whole(path, spec.to_xml().encode())
 
     def step(self, q: Vectors, v: Vectors, tau: Vectors, duration: float) -> tuple[Vectors, Vectors]:
         """State (q, v) after one MuJoCo step of `duration` [s] with τ [N·m] held.
@@ -223,8 +250,8 @@ _DURATION = partial(DURATION, "duration")
 
 def build_model(
     robot: Robot, integrator: MujocoIntegrator, joint_friction: JointFrictionChoice, joint_stops: str = "drop"
-) -> mujoco.MjModel:
-    """MuJoCo's model of the arm, from its URDF without shapes; raises RobotError if it cannot be built.
+) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """MuJoCo's description and model of the arm, from its URDF without shapes; raises RobotError if there is none.
 
     It is built with `MjSpec`, as MuJoCo's XML writer keeps only six digits.
     """
@@ -250,7 +277,7 @@ def build_model(
         if joint_friction == joint_stops == "drop":
             off = _OFF.mjDSBL_CONSTRAINT
         spec.option.disableflags = _ALWAYS_OFF | off
-        return spec.compile()
+        return spec, spec.compile()
     except ValueError as error:
         raise RobotError(
             f"{robot.source}: MuJoCo cannot build this arm ({error}); correct that link or joint."

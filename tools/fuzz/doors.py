@@ -193,6 +193,8 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "CoupledDynamics": {"parameters": s.identified.parameters, "coupling": [[1.0, 0.0], [1.0, 1.0]]},
         "IdentifiedDynamics": {"parameters": s.identified.parameters},
         "IdentifiedDynamics.write_urdf": {"path": s.folder / "written.urdf"},
+        "MujocoPlant.write_mjcf": {"path": s.folder / "written.xml"},
+        "CoupledDynamics.write_urdf": {"path": s.folder / "coupled.urdf"},
         "LagrangianDynamics": {"network": s.learned.network},
         "ResidualDynamics": {"network": s.residual.network},
         "DriveFriction": {"viscous": Z, "coulomb": Z, "transition": 0.01, "offset": 0.1},
