@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
 
-from nbs_pin.base.checks import positive
+from nbs_pin.base.checks import positive, told
 from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
@@ -118,7 +118,7 @@ def fit_chain(
     positive("transition", transition, "rad/s")
     positive("regularisation", regularisation, "measurements")
     if not (isinstance(starts, int) and starts >= 1):
-        raise ArgumentError(f"starts is {starts}, expected a whole number ≥ 1 of random trees; 64 is usual.")
+        raise ArgumentError(f"starts is {told(starts)}, expected a whole number ≥ 1 of random trees; 64 is usual.")
     if not data.tau.any():
         raise ArgumentError(
             f"{in_words(data, 'the data')} has no torque: arms of every scale move alike; record one with motors on."
