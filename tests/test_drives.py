@@ -21,14 +21,18 @@ from nbs_pin.identification.remainder import EFFECTS, next_try, remainder
 
 UR5, TWO = nbs.load_robot("ur5"), nbs.load_robot("two_link")
 REAL = nbs.Noise(encoder=2**-16, torque=0.2)
-DRIVES = nbs.DriveFriction(
-    [8.0, 6.0, 0.0, 1.0, 0.0, 0.0],
-    [5.0, 4.0, 3.0, 0.0, 0.0, 0.0],
-    offset=[0.0, 0.0, 1.5, 0.0, 0.8, 0.0],
-    stribeck=[6.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-    stribeck_speed=0.2,
-    load=[0.0, 0.15, 0.0, 0.0, 0.0, 0.0],
-)
+
+
+@cache
+def drives():
+    return nbs.DriveFriction(
+        [8.0, 6.0, 0.0, 1.0, 0.0, 0.0],
+        [5.0, 4.0, 3.0, 0.0, 0.0, 0.0],
+        offset=[0.0, 0.0, 1.5, 0.0, 0.8, 0.0],
+        stribeck=[6.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        stribeck_speed=0.2,
+        load=[0.0, 0.15, 0.0, 0.0, 0.0, 0.0],
+    )
 
 
 @cache
@@ -45,11 +49,11 @@ def driven(data, drives, rotors=0.0):
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.lists(st.floats(-50.0, 50.0), min_size=6, max_size=6))
 def test_friction_of_a_torque_is_what_that_torque_was_given_for_it(v, needed):
     v, needed = np.array(v), np.array(needed)
-    fed = DRIVES.feedforward(v, needed)
-    assert_allclose(DRIVES.torque(v, needed + fed), fed, atol=1e-10 + 1e-12 * np.abs(needed).max())
-    bare = replace(DRIVES, load=np.zeros(6))
+    fed = drives().feedforward(v, needed)
+    assert_allclose(drives().torque(v, needed + fed), fed, atol=1e-10 + 1e-12 * np.abs(needed).max())
+    bare = replace(drives(), load=np.zeros(6))
     assert_allclose(bare.torque(v), bare.feedforward(v, needed), atol=1e-12)
-    both = DRIVES.feedforward(torch.from_numpy(v), torch.from_numpy(needed))
+    both = drives().feedforward(torch.from_numpy(v), torch.from_numpy(needed))
     assert_allclose(both.numpy(), fed, atol=1e-12)
 
 
@@ -70,19 +74,19 @@ def test_factors_are_the_derivatives_of_friction():
 def noisy():
     """Motions of ur5 with these drives, rotors and noise, and fresh ones without noise."""
     data = moved(UR5, 1_500, noise=REAL, duration=3.0)
-    return driven(data, DRIVES, 0.4), driven(moved(UR5), DRIVES, 0.4)
+    return driven(data, drives(), 0.4), driven(moved(UR5), drives(), 0.4)
 
 
 def test_each_joint_gets_the_terms_that_it_has(noisy):
     data, fresh = noisy
     model = nbs.identify(data, UR5)
     found = model.friction
-    assert_allclose(found.offset, DRIVES.offset, atol=0.15)
+    assert_allclose(found.offset, drives().offset, atol=0.15)
     assert (found.stribeck[1:] < 0.05).all()  # of 0.2 N·m of noise
     assert found.stribeck[0] > 3.0
-    assert_allclose(found.load, DRIVES.load, atol=0.04)
+    assert_allclose(found.load, drives().load, atol=0.04)
     assert (found.asymmetry == 0.0).all()
-    assert_allclose(found.viscous, DRIVES.viscous, atol=0.5)
+    assert_allclose(found.viscous, drives().viscous, atol=0.5)
     plain = nbs.identify(data, UR5, friction=True, offset=False)
     ours, theirs = (torque_nmse(m, fresh, m.friction) for m in (model, plain))
     assert ours < 0.3 * theirs
@@ -229,17 +233,23 @@ def test_bodies_are_learned_where_the_file_has_geometry_alone(tmp_path, inertial
 
 WRIST = np.eye(6)
 WRIST[5, 4] = 1.0
-GEARS = nbs.DriveFriction([8.0, 7.0, 5.0, 2.0, 1.5, 1.0], [6.0, 5.0, 4.0, 2.0, 1.5, 1.2], offset=0.1, coupling=WRIST)
+
+
 ROTORS = np.array([1.0, 1.0, 0.5, 0.3, 0.2, 0.15])
+
+
+@cache
+def gears():
+    return nbs.DriveFriction([8.0, 7.0, 5.0, 2.0, 1.5, 1.0], [6.0, 5.0, 4.0, 2.0, 1.5, 1.2], offset=0.1, coupling=WRIST)
 
 
 @pytest.fixture(scope="module")
 def wrist():
     """Noisy motions of ur5, of which motor 6 turns q5 + q6, and the same without coupling; fresh ones of both."""
-    alone = replace(GEARS, coupling=None)
+    alone = replace(gears(), coupling=None)
 
     def made(data):
-        joined = driven(data, GEARS)
+        joined = driven(data, gears())
         joined = replace(joined, tau=joined.tau + data.a @ (WRIST.T * ROTORS @ WRIST))
         return joined, driven(data, alone, ROTORS)
 
