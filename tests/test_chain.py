@@ -21,6 +21,7 @@ from nbs_pin.dynamics.pseudo_inertia import coordinates
 from nbs_pin.identification.chain_fit import TreeGeometry, fit_chain
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
+from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.drive_terms import DriveTerms
 from nbs_pin.identification.fit import fit
 from nbs_pin.identification.identify import explain, identify
@@ -323,11 +324,10 @@ def physical_and_data() -> tuple[PhysicalTree, Measurements]:
     """Bodies as `explain` finds them for the geometry of a guess."""
     network = scrambled(*BRANCHED)
     data = dataset(network, 60, noise=1.0, friction=JointFriction(np.full(4, 0.5), np.full(4, 0.5), 0.3))
-    terms = DriveTerms.of(4, "viscous", "coulomb", "offset", transition=0.3)
     guess, _ = guess_and_data(kinds=3)
-    bodies = explain(TreeGeometry(guess), data, terms, 0.3)
-    measured = Measurements(data.q, data.v, data.a, data.tau, bodies.report.noise, terms.factors(data))
-    return PhysicalTree(guess, bodies.factors, bodies.scalars, terms.signed, bodies.expected, 0.3), measured
+    bodies = explain(TreeGeometry(guess), data, Wanted(True, True, False, 0.3), 0.3)
+    measured = Measurements(data.q, data.v, data.a, data.tau, bodies.report.noise, bodies.terms.factors(data))
+    return PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.terms.signed, bodies.expected, 0.3), measured
 
 
 def free_tree() -> PhysicalTree:

@@ -19,6 +19,7 @@ from nbs_pin.identification.explain import explain
 from nbs_pin.identification.fit_report import torque_errors, torque_nmse, zero_torque_nmse
 from nbs_pin.identification.identify import identify, sign_fault
 from nbs_pin.identification.regressor import RobotGeometry
+from nbs_pin.identification.remainder import remainder
 from nbs_pin.robots.robot import load_robot
 from tests.commands import refusal, summary
 
@@ -110,10 +111,11 @@ def test_torques_in_another_unit_are_doubted(name, factor, said):
     data, robot = recorded(name), ARMS[name]
     data = replace(data, tau=factor * data.tau)
     model = identify(data, robot, friction=True)
-    found = doubts(model, data, model.friction, robot, {})
+    left = remainder(model, data, model.friction)
+    found = doubts(data, robot, left, {}, robot.joint_names)
     assert len(found) == said
     assert not said or ("mA, N·mm" in found[0] and "N·m?" in found[0])
-    assert doubts(model, data, model.friction, None, {}) == ()
+    assert doubts(data, None, left, {}, robot.joint_names) == ()
 
 
 @pytest.mark.parametrize("name", ["two_link", "panda"])
@@ -122,7 +124,7 @@ def test_friction_that_was_not_learned_is_missed(name):
     rubbed = replace(data, tau=data.tau + 0.3 * data.tau.std(axis=0) * np.tanh(data.v / 0.01))
     for friction, tau, said in ((False, rubbed, True), (True, rubbed, False), (False, data, False)):
         model = identify(tau, robot, friction=friction)
-        found = doubts(model, tau, model.friction, robot, {"friction": friction})
+        found = doubts(tau, robot, remainder(model, tau, model.friction), {"friction": friction}, robot.joint_names)
         assert len(found) == said
         assert not said or "leave out friction=False to learn it" in found[0]
         if said:

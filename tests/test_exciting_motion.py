@@ -147,7 +147,7 @@ def test_bodies_stay_clear_of_each_other(foldable):
     _, slopes = hull.below(q, np.full(len(hull.pairs), np.inf))
     outside = distances > 1e-3
     slope = (hull(q + 1e-6 * along) - hull(q - 1e-6 * along)) / 2e-6
-    assert np.median(np.abs(slopes @ along - slope)[outside]) < 1e-6
+    assert np.max(np.abs(slopes @ along - slope)[outside]) < 1e-6
     t = np.linspace(0.0, 4.0, 3001)
     free = exciting_motion(foldable, **QUICK, clearance=None, seed=2)
     assert hull(free(t).q).min() < 0.0

@@ -1,6 +1,7 @@
 """Logs of real arms, made here from a simulated one: what is put right, what is doubted, what they may look like."""
 
 import functools
+import re
 import warnings
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from nbs_pin.base.csv_files import joint_columns
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.identification.datasets import recordings
 from nbs_pin.identification.fit import split_data
+from nbs_pin.identification.log_doubts import log_doubts
 from nbs_pin.identification.log_files import Columns
 from nbs_pin.identification.repairs import _cut
 from nbs_pin.identification.resampling import lowpassed
@@ -185,8 +187,7 @@ def test_the_masses_of_the_arm_doubt_units_signs_order_zeros_and_delays(tmp_path
     change, words = DOUBTED[fault]
     data, said = read(tmp_path, measured() | change(measured()))
     (doubt,) = data.about["doubts"]
-    with pytest.warns(UserWarning, match=words):
-        warnings.warn(doubt, stacklevel=1)
+    assert re.search(words, doubt)
     assert any(doubt in text for text in said)
 
 
@@ -203,8 +204,7 @@ def test_what_is_doubted_is_put_right_by_what_is_told_to_give(tmp_path, fault, s
     clean, _ = read(tmp_path, measured())
     data, said = read(tmp_path, measured() | DOUBTED[fault][0](measured()), **settings)
     assert said == []
-    inside = np.isin(data.t.round(6), clean.t.round(6))
-    if inside.all() and len(data) == len(clean):
+    if fault != "late by 30 ms":  # whose rows are others
         assert_allclose(data.tau, clean.tau, atol=0.02 * np.abs(clean.tau).max())
         assert_allclose(data.q, clean.q, atol=1e-9)
     assert nmse(data, clean) < 1.2 * nmse(clean, clean)
@@ -441,7 +441,7 @@ def test_a_log_is_shown_and_written_as_data(tmp_path, shell, capsys):
     assert "exists; give --force to replace it" in refusal(cli.main(again), capsys)
 
 
-def test_the_shell_learns_from_a_log_with_every_option_of_python(tmp_path, shell, capsys):
+def test_the_shell_learns_from_a_log_with_options_of_python(tmp_path, shell, capsys):
     c = measured()
     columns = [c["t"], np.arange(len(c["t"])) // 2000, np.degrees(c["q"]), np.degrees(c["v"]), -c["tau"]]
     np.savetxt(tmp_path / "log.csv", np.column_stack(columns), delimiter=",")
@@ -474,9 +474,101 @@ def test_a_smooth_peak_in_coarse_steps_is_no_limit():
     t = np.arange(0.0, 10.0, 0.002)
     joints = Joints(["joint 1"], np.array([False]), np.array([False]))
     smooth = 0.02 * np.round(10.0 * np.sin(2.0 * np.pi * 0.3 * t)[:, None] / 0.02)
-    every = np.ones(len(t), dtype=bool)
+    every = np.ones((len(t), 1), dtype=bool)
     assert np.isinf(_cut(smooth, every, joints)[0]).all()
     assert _cut(np.clip(smooth, -np.inf, 7.0), every, joints)[0][1, 0] == 7.0
+
+
+def rests():
+    """A pendulum that moves from point to point and rests between, its torque recorded in coarse steps."""
+    points, t = [0.0, 1.2, -0.4, 1.2, 0.3], np.arange(0.0, 12.0, 0.002)
+    share = np.clip(np.mod(t, 3.0) - 1.0, 0.0, 1.0)
+    stage = np.minimum((t // 3.0).astype(int), 3)
+    steps = np.diff(points)[stage]
+    smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    q = np.array(points)[stage] + steps * smooth
+    v, a = np.gradient(q, 0.002), np.gradient(np.gradient(q, 0.002), 0.002)
+    tau = 0.5 * a + 9.81 * np.sin(q)
+    return {"t": t, "q": q[:, None], "v": v[:, None], "a": a[:, None], "tau": 0.01 * np.round(tau / 0.01)[:, None]}
+
+
+def test_a_robot_that_holds_still_is_not_at_its_limit(tmp_path):
+    data, said = read(tmp_path, rests(), robot=None)
+    assert not any("cut off" in text for text in said)
+    assert len(data) == len(rests()["t"])
+
+
+def test_a_trajectory_at_rest_does_not_decide_on_the_filter(tmp_path):
+    """Encoder noise of a hold is no motion; neither is nothing at all."""
+    c, rng = {name: x for name, x in measured().items() if name != "v"}, np.random.default_rng(5)
+    rows = 1_000
+    for noise in (0.0, 1e-5):
+        hold = {
+            "t": c["t"][:rows],
+            "q": c["q"][0] + noise * rng.standard_normal((rows, 6)),
+            "tau": c["tau"][0] + 0.2 * rng.standard_normal((rows, 6)),
+        }
+        both = {name: np.concatenate([x, hold[name]]) for name, x in c.items()}
+        both["trajectory"] = np.repeat([0, 1], [len(c["t"]), rows])
+        assert 0.0 < read(tmp_path, both)[0].about["lowpass_Hz"] < 1.5 * read(tmp_path, c)[0].about["lowpass_Hz"]
+    still = {name: x[:rows] for name, x in hold.items()} | {"q": np.zeros((rows, 6))}
+    assert read(tmp_path, still, robot=None)[0].about["lowpass_Hz"] == 0.0
+
+
+def test_units_of_time_are_seen_where_stamps_repeat_or_clocks_restart(tmp_path):
+    c = {name: x for name, x in measured().items() if name != "v"} | {"t": 1e3 * measured()["t"]}
+    for rows in (np.sort(np.r_[np.arange(len(c["t"])), 1000]), np.r_[np.arange(len(c["t"])), np.arange(3000)]):
+        with pytest.raises(FileFormatError, match="t looks like milliseconds"):
+            read(tmp_path, {name: x[rows] for name, x in c.items()})
+
+
+def test_a_remedy_adds_to_what_was_given(tmp_path):
+    c = measured()
+    late = c | {"tau": shifted(c, 0.03)}
+    (said,) = read(tmp_path, late, delay=0.06)[0].about["doubts"]
+    assert re.search(r"early .*give delay=0\.0(29|3|31)$", said)
+    turned = c | {"tau": c["tau"] * TURNED / 14.0}
+    (said,) = read(tmp_path, turned, torque_gain=14.0)[0].about["doubts"]
+    assert said.endswith("give torque_gain=[14, -14, 14, 14, 14, 14]")
+    zero = c | {"q": c["q"] + np.array([0.5, np.pi / 2, 0.0, 0.0, 0.0, 0.0])}
+    (said,) = read(tmp_path, zero, zero=[-0.5, 0.0, 0.0, 0.0, 0.0, 0.0])[0].about["doubts"]
+    assert said.endswith(f"give zero=[-0.5, {-np.pi / 2:.6f}, 0, 0, 0, 0]")
+
+
+def test_a_saved_dataset_is_questioned_too(tmp_path, shell):
+    data = read(tmp_path, measured())[0]
+    replace(data, tau=1e3 * data.tau, about={}).save(tmp_path / "data.npz")
+    printed = shell("log", tmp_path / "data.npz", "--robot", "ur5").out
+    assert "; 1 doubt" in printed
+    assert "are they in N·mm" in printed
+
+
+def test_recordings_keep_their_numbers_where_one_restarts(tmp_path):
+    c, rows = measured(), 1_200
+    t = np.concatenate([c["t"][:rows], c["t"][:rows], c["t"][:rows]])
+    many = {name: np.concatenate([x[:rows], x[rows : 2 * rows], x[2 * rows : 3 * rows]]) for name, x in c.items()}
+    many |= {"t": t, "trajectory": np.repeat([0, 0, 1], rows)}
+    data, _ = read(tmp_path, many, lowpass=0)
+    last = data.q[data.trajectory == 1]
+    assert_allclose(last, many["q"][2 * rows :][-len(last) :][: len(last)], atol=0.1)
+    assert sorted(set(data.trajectory.tolist())) == [0, 1, 2]
+
+
+def test_delays_beyond_a_log_and_units_of_made_up_times_are_refused(tmp_path):
+    with pytest.raises(ArgumentError, match=r"delay=9.0 s is longer than every trajectory"):
+        read(tmp_path, {name: x[:1_000] for name, x in measured().items()}, delay=9.0)
+    c = {name: x for name, x in measured().items() if name != "t"}
+    with pytest.raises(ArgumentError, match="rate=250 and time_unit='ms' are given"):
+        read(tmp_path, c, rate=250, time_unit="ms")
+
+
+@pytest.mark.parametrize("friction", [0.0, 20.0])
+def test_one_joint_alone_is_turned_round_where_friction_says_so(friction):
+    arm = nbs.load_robot("two_link", lock=["joint2"])
+    data = nbs.collect(arm, "excited", 400, 2)
+    turned = replace(data, tau=-(data.tau + friction * data.v))
+    (doubt,) = log_doubts(turned, arm).doubts
+    assert ("give torque_gain=-1" in doubt) == (friction > 0.0)
 
 
 def test_a_filter_faster_than_the_rows_is_refused(tmp_path):

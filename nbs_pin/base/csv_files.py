@@ -29,13 +29,13 @@ _WORDS = {
 }
 """What the quantities are called in the columns of logs, by rank."""
 _TIMES = ("t", "time", "stamp", "timestamp", "__time", "elapsed", "header.stamp", "field.header.stamp")
-_SEPARATORS = (",", ";", "\t", "|")
+_SEPARATORS = (";", ",", "\t", "|")
 
 
 def read_cells(path: Path) -> list[list[str]]:
     """The cells of a table in a text file, *.csv or *.csv.gz, by rows; empty lines are left out.
 
-    Columns are separated by commas or, where the first line has none, by semicolons, tabs, bars or blanks.
+    Columns are separated by semicolons or, where the first line has none, by commas, tabs, bars or blanks.
 
     Raises:
         FileFormatError: If it is too large or no text.

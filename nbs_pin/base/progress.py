@@ -47,7 +47,7 @@ def _is_terminal() -> bool:
 
 
 @contextmanager
-def told(what: str) -> Iterator[None]:
+def heartbeat(what: str) -> Iterator[None]:
     """A line on stderr every 4 s while the body of the `with` statement runs, if stderr is no terminal.
 
     It says `what`, for how long, and how far the last loop of `tracked` got. At a terminal its bar says so.

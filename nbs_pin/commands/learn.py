@@ -1,7 +1,6 @@
 """`nbs-pin learn`: a model of an arm from data, and its error on held-out motions."""
 
 import dataclasses
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,19 +9,18 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.doors import own_arm
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
-from nbs_pin.base.progress import told
+from nbs_pin.base.progress import heartbeat
 from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import by_quantity, several, units
 from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.log_options import numbers_of
 from nbs_pin.cli.values import OptionError
+from nbs_pin.commands.identified_files import FILES as IDENTIFIED, write_identified
 from nbs_pin.commands.learned_tables import print_learned
 from nbs_pin.commands.results import Results, drawing, sha256_of
-from nbs_pin.dynamics.coupled import CoupledDynamics
 from nbs_pin.dynamics.friction import DriveFriction, JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -38,13 +36,10 @@ from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, Heading, p
 from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.named import load_named
 from nbs_pin.robots.robot import Robot, load_robot
-from nbs_pin.simulation.mujoco_plant import MujocoPlant
 from nbs_pin.storage.checkpoints import save
 
-IDENTIFIED = ("parameters.csv", "model.urdf", "model.xml")
-"""The files that are written for identified bodies alone; URDF and MJCF cannot hold coupled drives."""
 FILES = ("model.nbs", "learning.png", *IDENTIFIED, SUMMARY)
-"""The files that are written."""
+"""The files that are written, some for identified bodies alone."""
 _ASKED = {"auto": None, "on": True, "off": False}
 
 
@@ -71,13 +66,14 @@ def run(options: Learn, console: Console, notes: Console) -> None:
     common: dict[str, Any] = {"held_out": held_out, "transition": options.transition, "progress": True} | drives
     common["coupling"] = _matrix(options.coupling, data.nv)
     with results.made() as folder:
-        with told(f"learning {options.model}"):
+        with heartbeat(f"learning {options.model}"):
             result = learn(data, options.model, robot, options.seed, **common, **given)
         interrupted = result.report.stopped == "interrupted"
         with notes.status(f"writing into {folder}"):
             found = figures(result)
             with results.replaced(FILES, found, interrupted=interrupted) as draft:
-                _write_bodies(result.model, draft)
+                if isinstance(result.model, IdentifiedDynamics):
+                    write_identified(result.model, draft)
                 save(result.model, draft / FILES[0], info={"learned": results.facts | {"interrupted": interrupted}})
             with drawing(folder / FILES[1]) as path:
                 settings = chosen(results.facts["settings"], "loss", "optimiser", "held_out", "seed")
@@ -120,20 +116,6 @@ def arm_of(data: Dataset) -> Robot | None:
             f"the data: the description {said['source']} has changed since; give the arm of then as {own_arm()}."
         )
     return robot
-
-
-def _write_bodies(model: DynamicsProvider, folder: Path) -> None:
-    """Identified bodies and drives with their standard deviations, beside the URDF's, and URDF and MJCF with them."""
-    if isinstance(model, IdentifiedDynamics):
-        head = ("joint", "parameter", "value", "standard deviation", "urdf")
-        rows = [["" if x is None else x for x in row] for row in model.report.details["parameters"]]
-        write_csv(folder / IDENTIFIED[0], head, rows)
-        if not isinstance(model, CoupledDynamics):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that URDF has fewer terms of friction; parameters.csv has them all
-                urdf, gravity = model.write_urdf(folder / IDENTIFIED[1]), model.robot.gravity_vector.tolist()
-                arm = load_robot(urdf, gravity=gravity, zero_limits="unlimited")
-                MujocoPlant(arm, joint_friction="keep").write_mjcf(folder / IDENTIFIED[2])
 
 
 def _matrix(typed: str, n: int) -> np.ndarray | bool | None:
@@ -195,6 +177,7 @@ def figures(result: Learned) -> dict[str, Any]:
     """
     report = dataclasses.asdict(result.report)
     curves = {name: report.pop(name) for name in ("history", "held_out")}
+    report["details"] = {k: x for k, x in report["details"].items() if not k.endswith("deviations")}  # in a table
     friction = result.friction
     return plain(
         report

@@ -37,7 +37,9 @@ def run(options: Log, console: Console, notes: Console) -> None:
         found = None if robot is None or not robot.has_bodies else log_doubts(data, robot)
     prefix = f"{options.data[0]}: "
     lines = [str(warning.message).removeprefix(prefix) for warning in said]
-    tell(console, _verdict(options, data), [*_facts(data, found), *lines], [_joints(data, robot, found)],
+    if found is not None:  # of a saved dataset nothing was said
+        lines += [f"{doubt}." for doubt in found.doubts if f"{doubt}." not in lines]
+    tell(console, _verdict(options, data, found), [*_facts(data, found), *lines], [_joints(data, robot, found)],
          verbose=options.verbose)  # fmt: skip
     if options.out is not None:
         data.save(options.out)
@@ -49,10 +51,10 @@ def run(options: Log, console: Console, notes: Console) -> None:
     console.print(next_step("learn", *learnt), soft_wrap=True, highlight=False, markup=False)
 
 
-def _verdict(options: Log, data: Dataset) -> str:
+def _verdict(options: Log, data: Dataset, found: LogDoubts | None) -> str:
     name = options.data[0].name if len(options.data) == 1 else f"{len(options.data)} logs"
-    doubts = len(data.about.get("doubts", ()))
-    judged = "" if options.robot is None else "; no doubts" if not doubts else f"; {doubts} doubt{'s' * (doubts > 1)}"
+    doubts = 0 if found is None else len(found.doubts)
+    judged = "" if found is None else "; no doubts" if not doubts else f"; {doubts} doubt{'s' * (doubts > 1)}"
     many = f"{data.trajectories} trajector{'y' if data.trajectories == 1 else 'ies'}"
     return f"{name}: {_seconds(data):.4g} s of motion of {data.nv} joints in {many}{judged}"
 
@@ -68,7 +70,9 @@ def _facts(data: Dataset, found: LogDoubts | None) -> list[str]:
     derived = " and ".join(data.about.get("differentiated", ()))
     facts.append(f"{len(data)} rows to learn from" + (f"; {derived} differentiated" if derived else ""))
     if found is not None and math.isfinite(found.delay):
-        late = f"torques late by {1e3 * found.delay:.0f} ms, which {option('delay', round(found.delay, 3))} undoes"
+        given = float((data.about.get("asked") or {}).get("delay") or 0.0)
+        remedy = option("delay", round(found.delay + given, 3))
+        late = f"torques late by {1e3 * found.delay:.0f} ms, which {remedy} undoes"
         facts.append(late if found.delay else "no delay of the torques is seen")
     return facts
 

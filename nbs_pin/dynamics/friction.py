@@ -131,28 +131,30 @@ class DriveFriction(JointFriction):
         x = τ − f solves x (1 + load·tanh(v/transition)·sign x) = τ − f₀ for the friction f₀ of no load.
         """
         (v,) = as_vectors(self.viscous.size, v=v)
-        loadless, side = self._loadless(self._times(v, "to motors"))
+        loadless, side = self._loadless(self._speeds(v))
         if tau is None:
-            return self._times(loadless, "torque to joints")
-        given = self._times(tau, "torque to motors")
-        left = given - loadless
-        found = given - left / (1.0 + constant_like(v, self.load) * side * array_namespace(v).sign(left))
-        return self._times(found, "torque to joints")
+            return self._of_joints(loadless)
+        given = self._of_motors(tau)
+        left, share = given - loadless, constant_like(v, self.load) * side
+        return self._of_joints(given - left / (1.0 + share * array_namespace(v).sign(left)))
 
     def feedforward(self, v: Vectors, needed: Vectors) -> Vectors:
         """What the motor must give at v beyond the torque `needed` [N·m] by the arm without friction [N·m]."""
         (v,) = as_vectors(self.viscous.size, v=v)
-        loadless, side = self._loadless(self._times(v, "to motors"))
-        carried = self._times(needed, "torque to motors")
-        return self._times(loadless + constant_like(v, self.load) * abs(carried) * side, "torque to joints")
+        loadless, side = self._loadless(self._speeds(v))
+        return self._of_joints(loadless + constant_like(v, self.load) * abs(self._of_motors(needed)) * side)
 
-    def _times(self, x: Vectors, way: str) -> Vectors:
-        """Speeds of the motors, or torques of the motors or joints, from those of the others."""
-        if self.coupling is None:
-            return x
-        matrices = {"to motors": self.coupling.T, "torque to joints": self.coupling}
-        matrix = matrices[way] if way in matrices else np.linalg.inv(self.coupling)
-        return x @ constant_like(x, matrix)
+    def _speeds(self, v: Vectors) -> Vectors:
+        """N v, of the motors."""
+        return v if self.coupling is None else v @ constant_like(v, self.coupling.T)
+
+    def _of_motors(self, tau: Vectors) -> Vectors:
+        """N⁻ᵀ τ, for torques of the joints."""
+        return tau if self.coupling is None else tau @ constant_like(tau, np.linalg.inv(self.coupling))
+
+    def _of_joints(self, tau: Vectors) -> Vectors:
+        """Nᵀ τ, for torques of the motors."""
+        return tau if self.coupling is None else tau @ constant_like(tau, self.coupling)
 
     def _loadless(self, v: Vectors) -> tuple[Vectors, Vectors]:
         """The friction of x = 0, and tanh(v/transition)."""

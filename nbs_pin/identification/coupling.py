@@ -20,7 +20,7 @@ from nbs_pin.base.doors import where_printed
 from nbs_pin.dynamics.friction import coupling_of
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted
-from nbs_pin.identification.explain import robust
+from nbs_pin.identification.explain import noise_of, robust
 from nbs_pin.identification.regressor import (
     Geometry,
     RobotGeometry,
@@ -39,6 +39,8 @@ _BETTER = 0.3
 """Least decrease of Σ_k log σ_k, the residuals' deviations, that makes a coupling: two of 14 % each, one of 26 %."""
 _WELL = 0.05
 """Unexplained share of the variance of the motors concerned beyond which a coupling is not believed."""
+_EXACT = 1e-6
+"""Residual, as a share of the torque, below which one coupling is as good as another."""
 _TRIED = (1.0, -1.0)
 """Entries of N that are tried first, between neighbours."""
 _NEAR = 0.6
@@ -202,7 +204,7 @@ def _explained(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coup
     """Whether the torques of the motors concerned are well explained, and no entry is at the bound of its search."""
     off = coupling.matrix - np.eye(data.nv)
     entries = np.abs(off[off != 0.0])
-    if ((np.abs(entries - 1.0) > 0.98 * _NEAR) & (np.abs(entries + 1.0) > 0.98 * _NEAR)).any():
+    if (np.abs(entries - 1.0) > 0.98 * _NEAR).any():
         return False
     moved = coupling.of_motors(coupling.of_joints(data))
     share = np.square(_deviations(geometry, data, wanted, coupling)) / np.maximum(moved.tau.var(axis=0), 1e-300)
@@ -224,14 +226,8 @@ def _deviations(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Cou
     factors = wanted.first(data.nv).factors(moved)
     rows, _ = robust(equation_rows(CoupledGeometry(geometry, coupling.matrix), moved, factors))
     triangles = of_all_joints(triangle(rows))
-    size = torque_size(triangles, len(data))
-    noise = size
-    for _ in range(3):
-        weighted = triangle((triangles / noise[:, None, None]).reshape(-1, triangles.shape[-1]))
-        found = np.linalg.lstsq(weighted[:, :-1], weighted[:, -1], rcond=1e-10)[0]
-        left = np.linalg.norm(triangles @ np.append(found, -1.0), axis=1) / np.sqrt(len(data))
-        noise = np.maximum(left, 1e-6 * size)
-    return noise
+    least = _EXACT * torque_size(triangles, len(data))
+    return np.maximum(noise_of(triangles, 0, len(data)), least)
 
 
 def _entries(off: Float[np.ndarray, "n n"]) -> list[tuple[int, int, float]]:

@@ -1,23 +1,13 @@
 """What a fit makes doubtful: the unit of the torques, drives that were not to be learned, learning itself."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-import numpy as np
-
-from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit_report import FitReport
-from nbs_pin.identification.remainder import next_try, remainder
+from nbs_pin.identification.log_doubts import torque_ratio
+from nbs_pin.identification.remainder import Remainder, next_try
 from nbs_pin.robots.robot import Robot
 
-_SOME = 2_000
-"""Samples that are looked at."""
-_OTHER_UNIT = 20.0
-"""Ratio of torques, measured to URDF, that wrong masses do not explain."""
-_ALIKE = 0.5
-"""Correlation of the two from which on they are of one motion."""
 _NOTICED = 0.02
 """Unexplained share of the torque's variance that is worth a word."""
 _WORSE = 5.0
@@ -25,21 +15,15 @@ _WORSE = 5.0
 
 
 def doubts(
-    model: DynamicsProvider,
-    data: Dataset,
-    friction: JointFriction | None,
-    robot: Robot | None,
-    asked: Mapping[str, bool | None],
+    data: Dataset, robot: Robot | None, left: Remainder | None, asked: Mapping[str, bool | None], joints: Sequence[str]
 ) -> tuple[str, ...]:
-    """Clauses that name what is doubtful in a model fitted to the data and what to do.
+    """Clauses that name what is doubtful in data and in a model fitted to them, and what to do.
 
-    `asked` holds the arguments friction, offset and rotor_inertia of the fit.
+    left: What the model leaves of their torques, None without torque.
+    asked: The arguments friction, offset and rotor_inertia of the fit.
     """
-    some = data.take(np.sort(np.random.default_rng(0).permutation(len(data))[:_SOME]))
-    found = (
-        "" if robot is None or not robot.has_bodies or data.about.get("doubts") else _unit(some, robot),
-        _missing(model, some, friction, asked, robot),
-    )
+    known = robot is None or not robot.has_bodies or "doubts" in data.about
+    found = ("" if known or robot is None else _unit(data, robot), _missing(left, asked, joints))
     return tuple(text for text in found if text)
 
 
@@ -50,14 +34,9 @@ def doubts_of_report(report: FitReport) -> tuple[str, ...]:
 
 
 def _unit(data: Dataset, robot: Robot) -> str:
-    """Torques that are many times those of the URDF: the median over the joints, each by least squares."""
-    stated = PinocchioDynamics(robot).reference_torque(data.q, data.v, data.v, data.a)
-    size, alike = (np.square(x).sum(axis=0) for x in (stated, data.tau))
-    product, known = (stated * data.tau).sum(axis=0), (size > 1e-12 * size.max()) & (alike > 0.0)
-    if not known.any() or np.median(product[known] / np.sqrt(size[known] * alike[known])) < _ALIKE:
-        return ""
-    ratio = float(np.median(product[known] / size[known]))
-    if 1.0 / _OTHER_UNIT < ratio < _OTHER_UNIT:
+    """Torques that are many times those of the URDF, by the statistic of `log_doubts`."""
+    ratio = torque_ratio(data, robot)
+    if ratio == 1.0:
         return ""
     return (
         f"the torques are {ratio:.3g} times those of the masses in the URDF of {robot.name}: are they in mA, N·mm or "
@@ -65,20 +44,11 @@ def _unit(data: Dataset, robot: Robot) -> str:
     )
 
 
-def _missing(
-    model: DynamicsProvider,
-    data: Dataset,
-    friction: JointFriction | None,
-    asked: Mapping[str, bool | None],
-    robot: Robot | None,
-) -> str:
+def _missing(left: Remainder | None, asked: Mapping[str, bool | None], joints: Sequence[str]) -> str:
     """Drives that were not to be learned and would explain much of what is left."""
-    if not data.tau.std(axis=0).any():
+    if left is None or left.unexplained < _NOTICED or asked.get(left.cause, True) is not False:
         return ""
-    found = remainder(model, data, friction)
-    names = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
-    left_out = asked.get(found.cause, True) is False
-    return next_try(found, names, asked) if left_out and found.unexplained >= _NOTICED else ""
+    return next_try(left, joints, asked)
 
 
 def _held_out(train_nmse: float, test_nmse: float | None) -> str:

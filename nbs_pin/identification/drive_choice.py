@@ -152,14 +152,15 @@ def climb(
         unit: Unit of the number of every candidate.
     """
     names, terms = np.array(candidates.names), candidates.wanted.terms()
-    few = samples.min() < _FEW * len(names) or len(samples) < _PARTS
     size = np.sqrt(np.square(triangles[..., -1]).sum(axis=(0, 2)) / samples.sum())
     used = np.array([[terms[name] is True] * len(size) for name in names], dtype=bool).reshape(-1, len(size))
+    if len(samples) < _PARTS or samples.min() < _FEW * len(names):
+        return used
     least = _EXACT * np.maximum(size, _EXACT * size.max())
     judge = _Judge(triangles, samples, np.maximum(noise, least), bodies)
     left, _ = judge.left(used)
     for name in _LADDER:
-        if few or terms[name] is not None:
+        if terms[name] is not None:
             continue
         options = np.flatnonzero(names == name)
         found, means = [], np.full((len(options), len(size)), np.inf)

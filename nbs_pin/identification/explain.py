@@ -108,9 +108,7 @@ class Bodies(NamedTuple):
         return self.terms.rotors(self.scalars)
 
 
-def explain(
-    geometry: Geometry, data: Dataset, wanted: Wanted | DriveTerms, regularisation: float, others: int = 0
-) -> Bodies:
+def explain(geometry: Geometry, data: Dataset, wanted: Wanted, regularisation: float, others: int = 0) -> Bodies:
     """The physically consistent bodies and the drives that explain the data best, for that geometry.
 
     `others` is the number of geometric parameters fitted to the same data, for the degrees of freedom of the noise.
@@ -120,16 +118,14 @@ def explain(
         return _explain(geometry, data.thinned(_MOST), wanted, regularisation, others)
 
 
-def _explain(
-    geometry: Geometry, some: Dataset, wanted: Wanted | DriveTerms, regularisation: float, others: int
-) -> Bodies:
+def _explain(geometry: Geometry, some: Dataset, wanted: Wanted, regularisation: float, others: int) -> Bodies:
     start = time.perf_counter()
     terms, factors, triangles, outliers = _equations(geometry, some, wanted)
     expected = expectation(geometry, len(some), factors, triangles)
     equations = expected.in_units(triangles)
     base = base_directions(geometry, some, terms, expected)
     signed = terms.signed.ravel()
-    noise = _noise(equations, base.shape[1] + others, len(some))
+    noise = noise_of(equations, base.shape[1] + others, len(some))
     fit, design, noise = _physical(equations, noise, some, regularisation, signed)
     weak, values = _unexcited(design, base)
     bodies = [f"{parameter}({joint})" for joint in geometry.names for parameter in PARAMETER_NAMES]
@@ -153,16 +149,10 @@ def _explain(
     return Bodies(expected.bodies @ fit.factors, terms, found, expected, report)
 
 
-def _equations(
-    geometry: Geometry, data: Dataset, wanted: Wanted | DriveTerms
-) -> tuple[DriveTerms, np.ndarray, np.ndarray, int]:
+def _equations(geometry: Geometry, data: Dataset, wanted: Wanted) -> tuple[DriveTerms, np.ndarray, np.ndarray, int]:
     """The terms of the drives, their factors, R of each joint's equations with them, and the number of outliers."""
-    if isinstance(wanted, DriveTerms):
-        factors = wanted.factors(data)
-        rows, outliers = robust(equation_rows(geometry, data, factors))
-        return wanted, factors, of_all_joints(triangle(rows)), outliers
     n, parts = data.nv, parts_of(data)
-    needed = _needed(geometry, data, wanted)
+    needed = data.tau if wanted.terms()["load"] is False else _needed(geometry, data, wanted)
     candidates = Candidates.of(wanted, data, needed)
     rows, outliers = robust(equation_rows(geometry, data, candidates.factors))
     triangles, samples = triangles_of(rows, parts)
@@ -245,8 +235,11 @@ def base_directions(
     return directions[values > _NEGLIGIBLE * values[0]].T
 
 
-def _noise(equations: np.ndarray, base: int, samples: int) -> JointArray:
-    """Standard deviation of the residual per joint [N·m], from iteratively reweighted least squares."""
+def noise_of(equations: np.ndarray, base: int, samples: int) -> JointArray:
+    """Standard deviation of the residual per joint [N·m], from iteratively reweighted least squares.
+
+    base: Numbers that are fitted, for the degrees of freedom.
+    """
     n = len(equations)
     if samples * n < 2 * base:
         raise ArgumentError(

@@ -110,7 +110,7 @@ def fit(
         next_try="" if left is None else next_try(left, joints, asked),
         **fitted.record(),
     )
-    for doubt in (*doubts(bare, train, fitted.friction, robot, asked), *doubts_of_report(report)):
+    for doubt in (*doubts(train, robot, left, asked, joints), *doubts_of_report(report)):
         warnings.warn(f"{doubt}.", stacklevel=2)
     return fitted.assemble(report)
 

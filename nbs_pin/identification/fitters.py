@@ -14,7 +14,6 @@ from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES
 from nbs_pin.dynamics.registry import NETWORKS, make_network
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.identification.chain_fit import fit_chain
@@ -220,9 +219,10 @@ def fit_identified(task: FitTask) -> Fitted:
             "noise_Nm": np.asarray(report.noise).tolist(),
             "condition": float(report.condition),
             "outliers": report.outliers,
+            "parameter_deviations": np.asarray(report.parameter_deviations).tolist(),
+            "drive_deviations": {name: x.tolist() for name, x in report.drive_deviations.items()},
             "mass_kg": float(found.parameters[:, 0].sum()),
             "stated_mass_kg": _stated_mass(_needed(task)),
-            "parameters": parameter_rows(found),
         },
     )
 
@@ -236,22 +236,3 @@ def _needed(task: FitTask) -> Robot:
 def _stated_mass(robot: Robot) -> float | None:
     """The mass of the URDF [kg], None where only its geometry was taken."""
     return float(sum(body.mass for body in list(robot.model.inertias)[1:])) if robot.has_bodies else None
-
-
-def parameter_rows(found: IdentifiedDynamics) -> list[tuple[str, str, float, float, float | None]]:
-    """Joint, parameter, value, standard deviation and the URDF's value of all bodies and drives identified."""
-    robot, report = found.robot, found.report
-    stated = [list(body.toDynamicParameters()) for body in list(robot.model.inertias)[1:]]
-    rows: list[tuple[str, str, float, float, float | None]] = []
-    for j, joint in enumerate(robot.joint_names):
-        numbers = zip(PARAMETER_NAMES, found.parameters[j], report.parameter_deviations[j], stated[j], strict=True)
-        rows += [
-            (joint, name, float(x), float(deviation), float(own) if robot.has_bodies else None)
-            for name, x, deviation, own in numbers
-        ]
-    rotors = found.motor_inertia if isinstance(found, CoupledDynamics) else found.rotor_inertia
-    for name, deviations in report.drive_deviations.items():
-        used = np.flatnonzero(deviations)
-        values = rotors if name == "rotor" else getattr(found.friction, name) if used.size else used
-        rows += [(robot.joint_names[j], name, float(values[j]), float(deviations[j]), None) for j in used]
-    return rows

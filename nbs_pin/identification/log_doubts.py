@@ -70,7 +70,7 @@ def log_doubts(data: Dataset, robot: Robot) -> LogDoubts:
     nothing = np.full(data.nv, np.nan)
     if len(data) < _FEW or not (data.tau.std(axis=0) > 0.0).any():
         return LogDoubts(nothing, nothing, nothing, nothing, float("nan"), ())
-    arm = PinocchioDynamics(robot)
+    arm, asked = PinocchioDynamics(robot), _Asked.of(data)
     stated = _stated(arm, some, some.q)
     if not (stated.std(axis=0) > 0.0).any():
         return LogDoubts(nothing, nothing, nothing, nothing, float("nan"), ())
@@ -78,19 +78,55 @@ def log_doubts(data: Dataset, robot: Robot) -> LogDoubts:
     names = robot.joint_names
     doubts, delay = [], float("nan")
     if not found.all_turned:  # by which gravity seems to come from the other side
-        doubts = [text for text in (_swapped(found, names), _zero(arm, some, found, names)) if text]
+        doubts = [text for text in (_swapped(found, names), _zero(arm, some, found, names, asked)) if text]
     if not doubts:  # which would make the others meaningless
-        signs = list(_signs(found, names))
-        doubts, delay = [*_scale(found, names), *signs], float("nan") if signs else _delay(data, some, robot)
+        signs = list(_signs(found, names, asked))
+        doubts, delay = [*_scale(found, names, asked), *signs], float("nan") if signs else _delay(data, some, robot)
         if not abs(delay) >= _LATE:
             doubts += _constants(some, found, names)
         else:
             late = "late" if delay > 0.0 else "early"
             doubts.append(
                 f"the torques are about {1e3 * abs(delay):.0f} ms {late} in comparison with the motion; give "
-                f"{option('delay', round(delay, 3))}"
+                f"{option('delay', round(delay + asked.delay, 3))}"
             )
     return LogDoubts(found.slope, found.alike, found.friction, found.constant, delay, tuple(doubts))
+
+
+def torque_ratio(data: Dataset, robot: Robot) -> float:
+    """The torques over those that the masses of the URDF need; 1 if masses may be so wrong, or if it is not known."""
+    some = data.take(np.unique(np.linspace(0, len(data) - 1, _SOME).astype(int)))
+    stated = _stated(PinocchioDynamics(robot), some, some.q)
+    if len(data) < _FEW or not ((data.tau.std(axis=0) > 0.0).any() and (stated.std(axis=0) > 0.0).any()):
+        return 1.0
+    return _ratio(_explained(some, stated))
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the log was corrected by when it was read, to which a remedy adds."""
+
+    gain: JointArray
+    zero: JointArray
+    delay: float
+
+    @classmethod
+    def of(cls, data: Dataset) -> "_Asked":
+        """As the data say; none for data that say nothing."""
+        asked = data.about.get("asked") or {}
+        gain, zero = (asked.get(name) for name in ("torque_gain", "zero"))
+        ones = np.ones(data.nv)
+        return cls(
+            ones if gain is None else ones * np.asarray(gain, dtype=float),
+            0.0 * ones if zero is None else ones * np.asarray(zero, dtype=float),
+            float(asked.get("delay") or 0.0),
+        )
+
+    def gain_times(self, factor: float | Sequence[float]) -> str:
+        """The option with the present gain times a factor, one number where joints have the same."""
+        gains = [float(f"{x:.6g}") for x in self.gain * np.asarray(factor, dtype=float)]
+        plain = [int(x) if x.is_integer() else x for x in gains]
+        return option("torque_gain", plain[0] if len(set(plain)) == 1 else plain)
 
 
 @dataclass(frozen=True)
@@ -109,7 +145,8 @@ class _Explained:
         """Whether the torques of all joints have the other sign: against the masses, and not against the motion."""
         known = np.abs(self.alike) > _ALIKE
         drags = self.friction[np.abs(self.friction) > _CLEAR]
-        return bool(known.sum() > 1 and (self.alike[known] < 0.0).all() and (drags < 0.0).all())
+        enough = known.sum() > 1 or (known.size == 1 and known.any() and drags.size > 0)
+        return bool(enough and (self.alike[known] < 0.0).all() and (drags < 0.0).all())
 
     @property
     def own(self) -> JointArray:
@@ -154,7 +191,7 @@ def _swapped(found: _Explained, names: Sequence[str]) -> str:
     return f"columns of torque seem swapped: {fits}; correct their order or their names"
 
 
-def _zero(arm: PinocchioDynamics, data: Dataset, found: _Explained, names: Sequence[str]) -> str:
+def _zero(arm: PinocchioDynamics, data: Dataset, found: _Explained, names: Sequence[str], asked: _Asked) -> str:
     """A joint whose zero is elsewhere, or that counts the other way."""
     before = np.log(found.own).sum()
     trials: list[tuple[float, str]] = []
@@ -168,33 +205,46 @@ def _zero(arm: PinocchioDynamics, data: Dataset, found: _Explained, names: Seque
             if np.median(there.own) < _WELL:
                 said = (
                     f"the zero of {name} seems to be elsewhere than in the URDF: the torques fit q {turn:+d}°; give "
-                    f"{option('zero', [round(math.radians(turn), 6) if k == i else 0 for k in range(len(names))])}"
+                    f"{option('zero', _moved_zero(asked.zero, i, turn))}"
                 )
                 trials.append((float(np.log(there.own).sum()), said))
     best = min(trials, default=(before, ""))
     return best[1] if before - best[0] > _GAIN else ""
 
 
-def _scale(found: _Explained, names: Sequence[str]) -> Iterator[str]:
+def _moved_zero(zero: JointArray, joint: int, turn: float) -> list[float]:
+    """The zeros with that of one joint turned further [°]."""
+    moved = zero + np.where(np.arange(len(zero)) == joint, math.radians(turn), 0.0)
+    return [round(float(x), 6) or 0 for x in moved]
+
+
+def _ratio(found: _Explained) -> float:
+    """The torques over those of the masses, 1 where the masses may be so wrong."""
+    known = np.abs(found.alike) > _ALIKE
+    ratio = float(np.median(np.abs(found.slope[known]))) if known.any() else 1.0
+    return 1.0 if 1.0 / _MASSES < ratio < _MASSES else ratio
+
+
+def _scale(found: _Explained, names: Sequence[str], asked: _Asked) -> Iterator[str]:
     """Torques in another unit."""
     known = np.abs(found.alike) > _ALIKE
     if not known.any():
         return
-    ratio = float(np.median(np.abs(found.slope[known])))
-    if not 1.0 / _MASSES < ratio < _MASSES:
+    ratio = _ratio(found)
+    if ratio != 1.0:
         say = f"the torques are {ratio:.3g} times what the masses of the URDF need in these motions"
         if 300.0 < ratio < 3000.0:
-            yield f"{say}: are they in N·mm (mN·m)? give {option('torque_gain', 0.001)}"
+            yield f"{say}: are they in N·mm (mN·m)? give {asked.gain_times(0.001)}"
         elif ratio > 1.0:
             yield f"{say}: are they in N·cm or another unit than N·m? convert them with {option('torque_gain', BLANK)}"
         else:
             yield (
                 f"{say}: are they motor currents (A), torques on the motors' side of the gears, or not in N·m? give "
                 f"{option('torque_gain', BLANK)} with the gains or gear ratios, about "
-                f"{float(f'{1.0 / ratio:.2g}'):g} by the masses"
+                f"{float(f'{float(np.median(asked.gain)) / ratio:.2g}'):g} by the masses"
             )
     for i in map(int, np.flatnonzero(known)):
-        own = abs(float(found.slope[i])) / ratio
+        own = abs(float(found.slope[i])) / float(np.median(np.abs(found.slope[known])))
         if not 1.0 / _MASSES < own < _MASSES and known.sum() > 2 and abs(found.alike[i]) > 0.95:
             yield (
                 f"tau of {names[i]} is {own:.3g} times as large, in comparison with the masses of the URDF, as that of "
@@ -202,18 +252,17 @@ def _scale(found: _Explained, names: Sequence[str]) -> Iterator[str]:
             )
 
 
-def _signs(found: _Explained, names: Sequence[str]) -> Iterator[str]:
+def _signs(found: _Explained, names: Sequence[str], asked: _Asked) -> Iterator[str]:
     """Torques that are turned round: against the masses, or in the direction of friction."""
     turned = ((found.alike < -_ALIKE) & (found.friction < -_DRIVES)) | (
         (found.friction < _DRIVES) & (found.alike < _ALIKE) & (found.own < _CLEAR)
     )
     if found.all_turned:
-        yield f"the torques have the other sign than q; give {option('torque_gain', -1)}"
+        yield f"the torques have the other sign than q; give {asked.gain_times(-1.0)}"
     if found.all_turned or not turned.any():
         return
     which = ", ".join(names[i] for i in map(int, np.flatnonzero(turned)))
-    gains = [-1 if x else 1 for x in turned]
-    yield f"tau of {which} has the other sign than q; give {option('torque_gain', gains)}"
+    yield f"tau of {which} has the other sign than q; give {asked.gain_times(np.where(turned, -1.0, 1.0).tolist())}"
 
 
 def _constants(data: Dataset, found: _Explained, names: Sequence[str]) -> Iterator[str]:

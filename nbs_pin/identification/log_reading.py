@@ -69,6 +69,9 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
         notes.append("rows are counted in the trajectories that are read")
     tree = _serial(read.q.shape[1], settings.prismatic) if robot is None else (robot.parents, robot.prismatic)
     joints, name = _joints(read, tree[1], robot), "" if robot is None else robot.name
+    if settings.rate is not None and settings.time_unit not in (None, "s"):
+        given = f"{option('rate', settings.rate)} and {option('time_unit', settings.time_unit)}"
+        raise ArgumentError(f"{given} are given, and times made of a rate are in seconds; leave one of them out.")
     read = _in_units(path, _scaled(read, settings), joints, settings.degrees, settings.time_unit, robot)
     if settings.zero is not None:
         read = read._replace(q=read.q + settings.zero)
@@ -89,12 +92,18 @@ def samples_of(files: Sequence[Path], robot: Robot | None, settings: LogSettings
         "read": spacing,
         "notes": [*notes, *blanks, *more, *even.notes],
         "lowpass_Hz": even.lowpass,
+        "asked": {name: _told(getattr(settings, name)) for name in ("torque_gain", "zero", "delay")},
         "differentiated": [kind for kind in "va" if getattr(even.columns, kind) is None],
     }
     data = _dataset(path, whole.columns, tree, name, about)
     check_derivatives(path, data)
     kept = whole.kept if limits is None else whole.kept[~beyond(data.tau[whole.kept], limits)]
     return data.take(kept) if len(kept) < len(data) else data
+
+
+def _told(given: Any) -> Any:
+    """A number, or one per joint, as JSON stores it; None for none."""
+    return given if given is None or isinstance(given, int | float) else np.asarray(given, dtype=float).tolist()
 
 
 def _read(
@@ -185,9 +194,9 @@ def _clocked(columns: Columns) -> tuple[Columns, np.ndarray, list[str]]:
     if len(back):
         more = f", and {len(back) - 1} more times" if len(back) > 1 else ""
         notes.append(f"time goes back between rows {back[0]} and {back[0] + 1}{more}: another recording begins there")
-        begins = ~same
-        begins[back - 1] = True
-        numbers = np.append(0, np.cumsum(begins))
+        ends = np.append(np.flatnonzero(~same) + 1, len(t))
+        for k, row in enumerate(back.tolist()):
+            numbers[row : ends[np.searchsorted(ends, row, side="right")]] = columns.trajectory.max() + 1 + k
     if stopped.any():
         many = f"{np.count_nonzero(stopped)} rows with the time of the row before were left out"
         notes.append(f"{many}, first row {int(np.argmax(stopped)) + 1}")
@@ -232,10 +241,12 @@ def _put_right(
 def _advanced(columns: Columns, delay: float) -> Columns:
     """The columns with the torque that was written `delay` later, without the rows for which there is none."""
     tau, known = columns.tau.copy(), np.zeros(len(columns.t), dtype=bool)
-    for rows in trajectory_slices(columns.trajectory):
+    for rows in (rows for rows in trajectory_slices(columns.trajectory) if rows.stop - rows.start > 1):
         t, late = columns.t[rows], columns.t[rows] + delay
         tau[rows] = PchipInterpolator(t, columns.tau[rows])(np.clip(late, t[0], t[-1]))
         known[rows] = (late >= t[0]) & (late <= t[-1])
+    if not known.any():
+        raise ArgumentError(f"{option('delay', delay)} s is longer than every trajectory; give a shorter one.")
     return columns._replace(tau=tau).take(known)
 
 
@@ -257,7 +268,7 @@ def _joints(columns: Columns, prismatic: Bool[np.ndarray, " n"], robot: Robot | 
 def _in_units(
     path: Path, columns: Columns, joints: Joints, degrees: bool | None, time_unit: str | None, robot: Robot | None
 ) -> Columns:
-    """The columns with every angle in radians and time in seconds from the first row of its trajectory."""
+    """The columns with every angle in radians and time in seconds."""
     fault = degrees_fault(columns.q, joints, robot, turning=False) if degrees is None else ""
     if degrees:
         v, a = (x if x is None else in_radians(x, joints.prismatic) for x in (columns.v, columns.a))

@@ -128,10 +128,10 @@ def load_log(
         _refuse_settings(files[0], settings.given())
         return _of_arm(files[0], load_dataset(files[0]), robot)
     data = samples_of(files, robot, settings)
-    doubts = () if robot is None or not robot.has_bodies else log_doubts(data, robot).doubts
-    for note in [*data.about["notes"], *doubts, *_poor(data)]:
+    asked = {} if robot is None or not robot.has_bodies else {"doubts": list(log_doubts(data, robot).doubts)}
+    for note in [*data.about["notes"], *asked.get("doubts", ()), *_poor(data)]:
         warnings.warn(f"{files[0]}: {note}.", stacklevel=3)
-    return replace(data, about={**data.about, "doubts": list(doubts)})
+    return replace(data, about={**data.about, **asked})
 
 
 def _is_dataset(path: Path) -> bool:
@@ -140,9 +140,7 @@ def _is_dataset(path: Path) -> bool:
 
 def _refuse_settings(path: Path, given: dict[str, Any]) -> None:
     """Raise ArgumentError for settings of a log, since the quantities of a saved dataset are all known."""
-    needless = [name for name, value in given.items() if value is not None]
-    if needless:
-        name = needless[0]
+    for name in given:
         raise ArgumentError(
             f"{path} is a saved dataset, in seconds and radians, with all derivatives: it takes no "
             f"{option(name, given[name])}; leave that out."

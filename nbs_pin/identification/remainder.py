@@ -1,6 +1,6 @@
 """What a fitted model leaves of the torque, joint by joint: how much, what would explain it, what to try next."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset, trajectory_slices
 
 EFFECTS = ("constant", "v", "sign v", "√|v| sign v", "a", "|τ| sign v", "τ earlier or later")
-"""What the residual is regressed on, one at a time; the last is the torque some samples away, less the torque."""
+"""What the residual is regressed on, one at a time; the last is the torque less that some samples away."""
 _SIGN = 0.01
 """Speed within which sign v is smooth [rad/s]."""
 _SHIFTS = (-20, -10, -5, -3, -2, -1, 1, 2, 3, 5, 10, 20)
@@ -43,7 +43,8 @@ class Remainder:
     nmse: JointArray
     """Mean square over the variance of the torque; NaN where the torque is constant."""
     explained: Float[np.ndarray, "effects n"]
-    """Share of the mean square that a multiple of each of `EFFECTS` would explain."""
+    """Share of the mean square that a multiple of each of `EFFECTS` would explain: > 0 but for the constant, as the
+    others cannot have the other sign; with it a delay in one direction would look like one in the other."""
     delay: JointArray
     """Time by which the torque would have to be moved later for the last of them [s]."""
 
@@ -82,8 +83,8 @@ def remainder(model: DynamicsProvider, data: Dataset, friction: JointFriction | 
     left = data.tau - (needed if friction is None else needed + friction.feedforward(data.v, needed))
     side = np.tanh(data.v / _SIGN)
     effects = (np.ones_like(left), data.v, side, np.sqrt(np.abs(data.v)) * side, data.a, np.abs(needed) * side)
-    explained = [_share(left, effect) for effect in effects]
-    shifted = [_share(left, _moved(data, shift) - data.tau) for shift in _SHIFTS]
+    explained = [_share(left, effect, signed=k == 0) for k, effect in enumerate(effects)]
+    shifted = [_share(left, data.tau - _moved(data, shift)) for shift in _SHIFTS]
     best = np.argmax(shifted, axis=0)
     variance, squares = data.tau.var(axis=0), np.square(left).mean(axis=0)
     varies = variance > 1e-12 * max(float(variance.max()), float(np.square(data.tau).max()))
@@ -96,7 +97,7 @@ def remainder(model: DynamicsProvider, data: Dataset, friction: JointFriction | 
     )
 
 
-def next_try(found: Remainder, joints: tuple[str, ...], asked: Mapping[str, bool | None]) -> str:
+def next_try(found: Remainder, joints: Sequence[str], asked: Mapping[str, bool | None]) -> str:
     """The one thing to try next, as a sentence without its full stop; empty if little is left.
 
     Of the effects it names the one that would explain most of the unexplained share of the torque's variance, in the
@@ -129,11 +130,14 @@ def next_try(found: Remainder, joints: tuple[str, ...], asked: Mapping[str, bool
     return f"{share} would be explained by {meaning}; {remedy} to learn it"
 
 
-def _share(left: Float[np.ndarray, "samples n"], effect: Float[np.ndarray, "samples n"]) -> JointArray:
-    """Share of the mean square of each joint's residual that a multiple of the effect explains."""
-    product = np.square((left * effect).sum(axis=0))
+def _share(
+    left: Float[np.ndarray, "samples n"], effect: Float[np.ndarray, "samples n"], *, signed: bool = False
+) -> JointArray:
+    """Share of the mean square of each joint's residual that a multiple of the effect explains, > 0 unless signed."""
+    product = (left * effect).sum(axis=0)
     size = np.square(left).sum(axis=0) * np.square(effect).sum(axis=0)
-    return np.divide(product, size, out=np.zeros_like(size), where=size > 0.0)
+    counts = (size > 0.0) & (signed | (product > 0.0))
+    return np.divide(np.square(product), size, out=np.zeros_like(size), where=counts)
 
 
 def _moved(data: Dataset, shift: int) -> Float[np.ndarray, "samples n"]:

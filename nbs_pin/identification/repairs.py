@@ -33,6 +33,8 @@ _FRESH = 1.6
 """Step after an angle stood still, in the steps around: two or more are made up for."""
 _CUT_ROWS, _CUT_SHARE = 3, 5e-4
 """A largest torque is a limit if it lasts so many rows in succession, and is that share of all rows."""
+_ABOUT, _SLOW = 5, 0.05
+"""Rows before and after one over which its motion is seen, and the share of the usual largest one that is rest."""
 _QUANTA = 8.0
 """Least way into a limit, in units of the smallest step of the torque."""
 _NEAR_LIMIT, _MOST_CUT = 0.03, 0.8
@@ -61,7 +63,7 @@ def repaired(columns: Columns, joints: Joints, absent: Bool[np.ndarray, " rows"]
     """
     fresh, repeats = _fresh(columns, absent)
     columns, zeros = _without_zero_rates(columns, joints)
-    limits, cut = _cut(columns.tau, fresh, joints)
+    limits, cut = _cut(columns.tau, fresh[:, None] & _in_motion(columns.q), joints)
     rows, notes = trajectory_slices(columns.trajectory), [*repeats, *zeros, *cut]
     for name in _CALLED:
         x = getattr(columns, name)
@@ -199,15 +201,22 @@ def _stale(x: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
     return found
 
 
+def _in_motion(q: Float[np.ndarray, "rows n"]) -> Bool[np.ndarray, "rows n"]:
+    """Where each joint moves: a torque that stays the same at rest is no limit."""
+    padded = np.pad(q, ((_ABOUT, _ABOUT), (0, 0)), mode="edge")
+    way = np.abs(padded[2 * _ABOUT :] - padded[: -2 * _ABOUT])
+    return np.asarray(way > _SLOW * np.percentile(way, 95, axis=0))
+
+
 def _cut(
-    tau: Float[np.ndarray, "rows n"], fresh: Bool[np.ndarray, " rows"], joints: Joints
+    tau: Float[np.ndarray, "rows n"], judged: Bool[np.ndarray, "rows n"], joints: Joints
 ) -> tuple[np.ndarray, list[str]]:
     """The torques at which they are cut off, since they stay there, and notes on that."""
     limits, notes = np.array([[-np.inf], [np.inf]]) * np.ones(tau.shape[1]), []
     for i, name in enumerate(joints.names):
         unit = units("torque", joints.prismatic)[i]
         for side, value in enumerate((float(tau[:, i].min()), float(tau[:, i].max()))):
-            at = (tau[:, i] == value) & fresh
+            at = (tau[:, i] == value) & judged[:, i]
             if _long(at, _CUT_ROWS - 1).any() and _CUT_SHARE < at.mean() < 0.5 and _runs_into(tau[:, i], at):
                 limits[side, i] = value
                 notes.append(

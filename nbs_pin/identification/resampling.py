@@ -194,13 +194,12 @@ def _cutoff(columns: Columns, step: float) -> float:
         return 0.0
     if not (torque_noise(columns) > _NOISY * np.maximum(columns.tau.std(axis=0), 1e-12)).any():
         return 0.0
-    widest = 0.0
-    for rows in stretches:
-        length = 2 * max(round(0.5 * WINDOW / step), ORDER // 2 + 1) + 1
-        if rows.stop - rows.start < 2 * length:
-            continue
-        v = derivative(columns.q[rows], step, length)
-        v = v[:, v.std(axis=0) > 0.1 * v.std(axis=0).max()]
+    widest, length = 0.0, 2 * max(round(0.5 * WINDOW / step), ORDER // 2 + 1) + 1
+    speeds = [derivative(columns.q[s], step, length) for s in stretches if s.stop - s.start >= 2 * length]
+    moving = 0.1 * max((float(v.std(axis=0).max()) for v in speeds), default=0.0)
+    for v in (v[:, v.std(axis=0) > moving] for v in speeds):
+        if not v.size:
+            continue  # at rest
         frequency, power = periodogram(v, 1.0 / step, window="hann", axis=0)
         shares = np.cumsum(power, axis=0) / power.sum(axis=0)
         widest = max(widest, float(frequency[np.argmax(shares > _MOTION, axis=0)].max()))

@@ -90,18 +90,21 @@ def time_fault(
         return ""
     steps = np.concatenate([np.diff(t[rows]) for rows in kept])
     moved = np.concatenate([np.diff(q[rows], axis=0) for rows in kept])
-    if not (np.isfinite(moved).all() and (steps > 0.0).all()):
+    runs = steps > 0.0
+    if not (np.isfinite(moved).all() and runs.mean() > 0.5):
         return ""  # which is another fault
-    step, unit, why = float(np.median(steps)), "", ""
+    step, unit, why = float(np.median(steps[runs])), "", ""
     if v is not None and np.isfinite(v).all() and v.any():
         area = np.concatenate([0.5 * (v[rows][1:] + v[rows][:-1]) for rows in kept]) * steps[:, None]
+        area = area[runs]
         known = np.ones_like(prismatic) if step > _LONG_STEP else ~prismatic
-        moved_there, area = moved[:, known], area[:, known]
+        moved_there, area = moved[runs][:, known], area[:, known]
         ratio = float(np.vdot(moved_there, area) / max(np.vdot(area, area), 1e-300))
         unit = next((u for u in _CALLED if abs(ratio / TIME_UNITS[u] - 1.0) < _LIKE_A_RATIO), "")
         why = f"in which q changes as v states; give {option('time_unit', unit)}"
     if not unit and step > _LONG_STEP:
-        speed = float((np.where(np.abs(moved) > np.pi, 0.0, np.abs(moved)) / steps[:, None]).max(initial=0.0))
+        way = np.where(np.abs(moved) > np.pi, 0.0, np.abs(moved))[runs]
+        speed = float((way / steps[runs][:, None]).max(initial=0.0))
         unit = _unit_of_speed(speed, step)
         why = (
             f"since in seconds its rows are {step:.4g} s apart and no joint is faster than {speed:.3g} "

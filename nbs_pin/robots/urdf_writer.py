@@ -46,7 +46,10 @@ def _inertial(body: pin.Inertia) -> ET.Element:
 
 
 def _settle(element: ET.Element, joint: JointData, drive: Drive) -> None:
-    """State the limits that the arm has and the drive; a joint without position limits is continuous again."""
+    """State the limits that the arm has and the drive; a joint without position limits is continuous again.
+
+    Effort and velocity limits that were taken away stay as in the description: URDF states one of each.
+    """
     limit = element.find("limit")
     limit = ET.SubElement(element, "limit") if limit is None else limit
     for key in LIMITS:
