@@ -42,7 +42,8 @@ class FixedLaw(NamedTuple):
     """The law without adaptation under the same loads, along a reference."""
 
     joint_errors: JointArray
-    """Largest |z1_i| measured with the worst load and with the largest one at the frame's origin [rad, m]."""
+    """Largest |z1_i| measured with the worst load and with the largest one at the frame's origin [rad, m], of the arm
+    with its friction and without disturbance."""
     certificate: Certificate | None
     """Its certificate for all loads of the box; None if that is refused."""
     refused: str
@@ -106,6 +107,15 @@ class TransientBound(Shown):
     def joint_errors_always(self) -> JointArray:
         """Bound of each |z1_i| at all times [rad, m]."""
         return np.asarray(self.joint_errors * self._growth)
+
+    @property
+    def useless(self) -> tuple[str, ...]:
+        """Why the bound is of no use to anyone, empty if it is of some."""
+        turning = self.joint_errors[~self.law.robot.prismatic]
+        if not (turning.size and turning.max() > np.pi):
+            return ()
+        turns = f"a bound of {turning.max() / (2.0 * np.pi):.2g} turns says nothing"
+        return (f"{turns}; give a smaller load or disturbance, or a larger bandwidth",)
 
     @property
     def _growth(self) -> float:
@@ -236,7 +246,7 @@ def transient_bound(
     found = _bounded(law, payload, base, start, length)
     if reference is None:
         return found
-    given = {"disturbance": base.admissible, "friction": friction}
+    given = {"disturbance": base.admissible, "friction": friction or JointFriction.of(law.robot)}
     return replace(found, fixed=_fixed(law, payload, found.worst, given, reference, length))
 
 
@@ -244,6 +254,8 @@ def _check_box(law: AdaptiveLaw, mass: float, radius: float) -> None:
     """Raises CertificateRefused unless every load of the box is one that the law can learn."""
     if law.load_mass is None or law.load_radius is None or law.load_across is None:
         refuse(f"the law adapts {', '.join(law.adapts)} and no load", 'give one that adapts "load"')
+    if not 0.0 <= law.leak < math.inf:
+        refuse(f"the leak of the law is {law.leak}", "give a finite number ≥ 0")
     within = min(law.load_radius, law.load_across)
     if mass > law.load_mass or radius > within:
         refuse(
@@ -294,6 +306,9 @@ def _bounded(law: AdaptiveLaw, payload: Payload, base: Certificate, start: float
             "the bound of a continuous joint is π or more, where its error jumps",
             "give a smaller load, start or disturbance",
         )
+    always = beginning.always()
+    if (radians(base.stiffness, always)[1][law.robot.continuous] >= math.pi).any():
+        always = math.inf  # where the error jumps, V does too
     code = known(foreign_code(law), f"V_a does not increase but by what is supplied, {_HERE}")
     is_free = comparison.t == comparison.power == law.leak == 0.0
     found = TransientBound(
@@ -306,7 +321,7 @@ def _bounded(law: AdaptiveLaw, payload: Payload, base: Certificate, start: float
         divergence=divergence,
         duration=math.inf if is_free else length,
         storage_within=within,
-        storage_always=beginning.always(),
+        storage_always=always,
         potential=potential,
         error=error,
         joint_errors=joint_errors,
@@ -360,7 +375,7 @@ def _fixed(
         refused = str(error)
     frame, errors = _frame(law), []
     for mass, centre in {(worst.mass, tuple(worst.centre)), (payload.mass, (0.0, 0.0, 0.0))}:
-        plant = DynamicsPlant(_loaded(law, frame, mass, np.array(centre)), friction=inner.friction)
+        plant = DynamicsPlant(_loaded(law, frame, mass, np.array(centre)), friction=given["friction"])
         run = simulate(plant, inner.compile(), reference, math.ceil(length / _PERIOD) * _PERIOD, _PERIOD)
         errors.append(np.abs(inner.dynamics.difference(run.q, run.q_ref)).max(axis=0))
     return FixedLaw(np.max(errors, axis=0), certificate, refused)

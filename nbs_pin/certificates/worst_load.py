@@ -83,7 +83,7 @@ class Divergence:
         """
         values = np.linalg.eigvalsh(self.known())
         inside, slack = np.clip(values, 0.0, 1.0), 1e-9 + self.rounding
-        if np.abs(values - inside).max() > slack:
+        if not np.abs(values - inside).max() <= slack:
             refuse(
                 f"the model's body of {self.body.name} cannot exist or is above the largest one, as its shares are "
                 f"{np.round(values, 9).tolist()}",
@@ -99,7 +99,7 @@ class Divergence:
         """
         spread = self.carrier @ np.diag([radius**2] * 3 + [1.0]) @ self.carrier.T
         most = self.known() + 2.0 * mass * self._symmetric(spread)
-        if np.linalg.eigvalsh(most)[-1] > 1.0 + 1e-9 + self.rounding:
+        if not np.linalg.eigvalsh(most)[-1] <= 1.0 + 1e-9 + self.rounding:
             refuse(
                 f"loads up to {mass:g} kg within {radius:g} m are beyond the largest body of {self.body.name}",
                 "give a law with a larger load_mass or load_radius",
@@ -121,17 +121,11 @@ class Divergence:
         ‖v‖² is at most r² + 3ρ² where ‖x‖ ≤ r, that mean is at most the largest d − μ(‖v‖² − r² − 3ρ²), any μ ≥ 0.
         """
         bend = min(max(_SHARE * least, _TINY), 1e-4)
-        slope, columns = math.log1p(-bend) - math.log(bend), self.carrier[:, :3]
-        linear = slope * (columns**2).sum(axis=0) + (columns * (self.dual @ columns)).sum(axis=0)
-        bulge, margin = mass * float(np.clip(linear, 0.0, None).sum()), self.margin(bend)
-        prices = np.append(0.0, slope * mass * (columns**2).sum() * 0.5 ** np.arange(_PRICES))
+        margin = self.margin(bend)
         centres, half, place, best = np.zeros((1, 3)), radius, np.zeros(3), -math.inf
         while True:
             corners = centres[:, None] + half * _CORNERS
-            values = self.value(self.loaded(mass, corners), bend)
-            beyond = (corners**2).sum(axis=-1) - radius**2 - 3.0 * half**2
-            means = (values[..., None] - prices * beyond[..., None]).max(axis=1).min(axis=-1)
-            uppers = means + bulge * half**2 + margin
+            uppers = self.above(mass, radius, corners, half, bend)
             likely = corners[np.argsort(uppers)[-_LIKELY:]].reshape(-1, 3)
             likely = likely * (radius / np.maximum(np.linalg.norm(likely, axis=-1), radius))[:, None]
             found = self._found(mass, likely)
@@ -145,6 +139,19 @@ class Divergence:
             if len(children) == 0 or len(children) > _MOST_CELLS or half < _FINEST * radius:
                 return max(enough, float(uppers[still].max(initial=0.0))), best, place
             centres, half = children, 0.5 * half
+
+    def above(
+        self, mass: float, radius: float, corners: Float[np.ndarray, "cells 8 3"], half: float, bend: float
+    ) -> Float[np.ndarray, " cells"]:
+        """A bound of d over each cell with these corners, as far as it is within the ball (`_searched`)."""
+        slope, columns = math.log1p(-bend) - math.log(bend), self.carrier[:, :3]
+        linear = slope * (columns**2).sum(axis=0) + (columns * (self.dual @ columns)).sum(axis=0)
+        bulge = mass * float(np.clip(linear, 0.0, None).sum())
+        prices = np.append(0.0, slope * mass * (columns**2).sum() * 0.5 ** np.arange(_PRICES))
+        values = self.value(self.loaded(mass, corners), bend)
+        beyond = (corners**2).sum(axis=-1) - radius**2 - 3.0 * half**2
+        means = (values[..., None] - prices * beyond[..., None]).max(axis=1).min(axis=-1)
+        return np.asarray(means + bulge * half**2 + self.margin(bend))
 
     def _found(self, mass: float, at: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
         return np.asarray(self.value(self.loaded(mass, at)))

@@ -21,7 +21,8 @@ from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import print_certificate
-from nbs_pin.commands.certify_adaptive import box_or_ball, certify_adaptive, refuse_radius, stated_friction
+from nbs_pin.commands.certify_adaptive import certify_adaptive, refuse_radius
+from nbs_pin.commands.inputs import box_or_ball, stated_friction
 from nbs_pin.commands.results import Results, drawing
 from nbs_pin.controllers.adaptive_law import AdaptiveLaw
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw

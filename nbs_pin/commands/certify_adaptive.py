@@ -8,22 +8,19 @@ from rich.console import Console
 from rich.table import Table
 
 from nbs_pin.base.doors import option
-from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.plain import plain
 from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.certificates.adaptive_bound import TransientBound, transient_bound
-from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.commands.certificate_tables import claims_table
+from nbs_pin.commands.inputs import box_or_ball, stated_friction
 from nbs_pin.commands.results import Results, drawing, table, tell
 from nbs_pin.controllers.adaptive_law import AdaptiveLaw
-from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.motions.by_name import motion_of
 from nbs_pin.reports.captions import chosen
 from nbs_pin.reports.certificate_charts import plot_transient
 from nbs_pin.reports.verdicts import verdict_of
-from nbs_pin.robots.robot import Robot
 
 PICTURE = "certificate.png"
 _OF_FIXED_LAWS = (
@@ -52,7 +49,7 @@ def certify_adaptive(options: Certify, law: AdaptiveLaw, console: Console, notes
             bound = _bound(options, law)
         saved = options.controller.endswith(SAVED)
         found = {"law": options.controller.split("/")[-1] if saved else "a law built for it", "arm": robot.name}
-        figures: dict[str, Any] = plain(found | {"transient": bound.summary()})
+        figures: dict[str, Any] = plain(found | {"transient": bound.summary(), "useless": list(bound.useless)})
         verdict = verdict_of(figures)
         with results.replaced((PICTURE,), figures):
             pass
@@ -71,9 +68,9 @@ def _bound(options: Certify, law: AdaptiveLaw) -> TransientBound:
     motion, duration = motion_of(options.reference, robot, frequency=options.frequency, period=period, **settings)
     numbers = None if options.disturbance is None else plain_numbers(options.disturbance) or []
     within = min(law.load_radius or 0.0, law.load_across or 0.0)
-    return transient_bound(
+    return transient_bound(  # which refuses a law that adapts no load
         law,
-        law.load_mass or math.inf if options.unknown_payload is None else options.unknown_payload,
+        law.load_mass or 1.0 if options.unknown_payload is None else options.unknown_payload,
         within if options.payload_radius is None else options.payload_radius,
         disturbance=0.0 if numbers is None else box_or_ball(numbers, robot.nv, norm=options.norm),
         friction=stated_friction(options.friction, robot),
@@ -100,29 +97,3 @@ def refuse_radius(options: Certify) -> None:
     """Raises OptionError for --payload-radius with a law that does not adapt."""
     if options.payload_radius is not None:
         raise OptionError("--payload-radius is for a law that adapts; omit it, or give --law adaptive.")
-
-
-def stated_friction(text: str | None, robot: Robot) -> JointFriction | None:
-    """The joint friction that --friction states, None for the URDF's."""
-    if text is None:
-        return None
-    viscous, coulomb = plain_numbers(text) or [0.0, 0.0]
-    return JointFriction(np.full(robot.nv, viscous), np.full(robot.nv, coulomb))
-
-
-def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
-    """The box |τ_d,i| ≤ numbers, one for all joints or one per joint, or the ball ‖τ_d‖ ≤ number [N·m].
-
-    Raises:
-        ArgumentError: If there are too many or too few numbers.
-    """
-    if norm:
-        if len(numbers) != 1:
-            raise ArgumentError(f"a norm is one number and {len(numbers)} were given; give one, or omit --norm.")
-        return Admissible.of(numbers[0], nv)
-    if len(numbers) not in (1, nv):
-        raise ArgumentError(
-            f"{len(numbers)} torques were given for {nv} joints; give one for all joints, or one per joint "
-            "[N·m, N where it slides]."
-        )
-    return Admissible.of(np.full(nv, numbers, dtype=float), nv)

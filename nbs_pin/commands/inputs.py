@@ -3,12 +3,16 @@
 import math
 from typing import Any
 
+import numpy as np
+
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.train import Train
-from nbs_pin.cli.values import SAVED, OptionError
+from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.registry import build_law
+from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.robots.robot import Robot, load_robot
 from nbs_pin.robots.urdf_options import ALL
 from nbs_pin.storage.checkpoints import load
@@ -43,3 +47,29 @@ def law_of(name: str, robot: Robot, **settings: Any) -> Controller:
     if not isinstance(stored, Controller):
         raise ArgumentError(f"{name} contains a {type(stored).__name__}, a model; give a file with a controller.")
     return stored
+
+
+def stated_friction(text: str | None, robot: Robot) -> JointFriction | None:
+    """The joint friction that --friction states, None for the URDF's."""
+    if text is None:
+        return None
+    viscous, coulomb = plain_numbers(text) or [0.0, 0.0]
+    return JointFriction(np.full(robot.nv, viscous), np.full(robot.nv, coulomb))
+
+
+def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
+    """The box |τ_d,i| ≤ numbers, one for all joints or one per joint, or the ball ‖τ_d‖ ≤ number [N·m].
+
+    Raises:
+        ArgumentError: If there are too many or too few numbers.
+    """
+    if norm:
+        if len(numbers) != 1:
+            raise ArgumentError(f"a norm is one number and {len(numbers)} were given; give one, or omit --norm.")
+        return Admissible.of(numbers[0], nv)
+    if len(numbers) not in (1, nv):
+        raise ArgumentError(
+            f"{len(numbers)} torques were given for {nv} joints; give one for all joints, or one per joint "
+            "[N·m, N where it slides]."
+        )
+    return Admissible.of(np.full(nv, numbers, dtype=float), nv)

@@ -8,15 +8,14 @@ import numpy as np
 
 from nbs_pin.base.arrays import Array, array_namespace, constant_like
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
-from nbs_pin.controllers.unknowns import Unknowns
+from nbs_pin.controllers.unknowns import UPPER, Unknowns
 from nbs_pin.dynamics.body_fields import BodyFields, body_fields
 from nbs_pin.dynamics.rigid_tree import RigidTree
 from nbs_pin.kernels.layout import NumberCode
 from nbs_pin.kernels.symmetric4 import FARTHEST, TRIANGLE
 
-_UPPER = np.triu_indices(4)
 _PLACES = np.zeros((4, 4), dtype=np.int64)
-_PLACES[_UPPER] = _PLACES.T[_UPPER] = np.arange(TRIANGLE)
+_PLACES[UPPER] = _PLACES.T[UPPER] = np.arange(TRIANGLE)
 
 
 class Duals(NamedTuple):
@@ -33,7 +32,7 @@ class Duals(NamedTuple):
 
     def flat(self) -> Array:
         """That vector."""
-        triangles = self.bodies[..., _UPPER[0], _UPPER[1]]
+        triangles = self.bodies[..., UPPER[0], UPPER[1]]
         rows = triangles.reshape(*triangles.shape[:-2], TRIANGLE * triangles.shape[-2])
         return array_namespace(self.numbers).concat([rows, self.numbers], axis=-1)
 

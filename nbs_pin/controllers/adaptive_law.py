@@ -344,9 +344,9 @@ class AdaptiveLaw(Controller, nn.Module):
         if believed is None or isinstance(believed, AdaptiveMemory):
             given = self.unknowns.start if believed is None else believed.duals
             (duals,) = as_vectors(len(self.unknowns.start), duals=given)
-            return estimate_of(*known, _plain(duals))
+            return replace(estimate_of(*known, _plain(duals)), friction=self.law.friction)
         (values,) = as_vectors(len(self.unknowns.start), believed=believed)
-        return Estimate(*known, _plain(values))
+        return Estimate(*known, _plain(values), friction=self.law.friction)
 
     def _after(self, run: Run) -> Estimate:
         """The last estimates of a run, and how far they may be off."""

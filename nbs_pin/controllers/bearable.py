@@ -1,8 +1,9 @@
 """How heavy an adaptive law may believe an arm to be: what its sampled loop bears.
 
-A law with M̂ in its model feeds M̂ g v back to an arm with the inertia M, g = −∂a_r/∂v. A torque that is held for a
-period h turns this into v⁺ = (1 − h g M⁻¹M̂)v, so that estimates far above M make the arm shake, saturate, and stop
-learning before they can become smaller again. Largest loads and rotors keep h g λ_max(M⁻¹ΔM̂) ≤ ½ over sampled poses.
+A law with M̂ in its model feeds M̂ g v back to an arm with the inertia M, g = −∂(a_r − ωz2)/∂v. A torque that is held
+for a period h turns this into v⁺ = (1 − h g M⁻¹M̂)v, so that estimates far above M make the arm shake, saturate, and
+stop learning before they can become smaller again. Largest loads and rotors keep h g λ_max(M⁻¹ΔM̂) ≤ ½ over sampled
+poses.
 """
 
 import warnings
@@ -61,7 +62,8 @@ class Bearable:
 
     def mass(self, carrier: Carrier, most: float) -> float:
         """The largest mass of a load by default [kg], at most this."""
-        return most * min(1.0, _OF_MASS * self.limit / self.heavier(carrier.joint, carrier.largest(most, 0.0, 0.0)))
+        heavier, bound = self.heavier(carrier.joint, carrier.largest(most, 0.0, 0.0)), _OF_MASS * self.limit
+        return most if heavier <= bound else most * bound / heavier
 
     def radius(self, carrier: Carrier, mass: float, most: float) -> float:
         """How far a load may be along the axis of its joint by default [m], at most this."""

@@ -49,6 +49,8 @@ class Estimate(Shown):
     """How far each value may be off, like a standard deviation (docs/theory.md §10); None without a run."""
     unexcited: tuple[str, ...] = ()
     """Directions of the values that the run did not show at all, each of the width of its interval, in words."""
+    friction: JointFriction | None = None
+    """The friction that the law feeds forward, which is that of the model where friction does not adapt."""
 
     @property
     def names(self) -> list[str]:
@@ -146,7 +148,7 @@ class Estimate(Shown):
         Estimates of friction and rotors a little below zero become zero, and constant torques are left out. Raises
         ArgumentError for an arm with a body without mass or extent.
         """
-        friction = None
+        friction = self.friction
         if any(number.code == NumberCode.COULOMB for number in self.unknowns.numbers):
             own = np.maximum(self.viscous, 0.0), np.maximum(self.coulomb, 0.0)
             friction = JointFriction(*own, self.unknowns.transition)

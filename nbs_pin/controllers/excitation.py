@@ -18,14 +18,14 @@ from nbs_pin.base.shown import mixture
 from nbs_pin.controllers.adapting_model import AdaptingModel
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.passive_outputs import Output, feedback_of, signals_of
-from nbs_pin.controllers.unknowns import Unknowns
+from nbs_pin.controllers.unknowns import UPPER, Unknowns
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
 from nbs_pin.dynamics.rigid_tree import RigidTree
 
 _INSTANTS = 2000
 _SILENT = 1e-6  # of the largest feedback, below which that of a joint is rounding
-_UPPER = np.triu_indices(4)
-_WEIGHTS = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))  # so that triangles have the norm of their matrices
+
+_WEIGHTS = np.where(UPPER[0] == UPPER[1], 1.0, np.sqrt(2.0))  # so that triangles have the norm of their matrices
 
 
 class Excitation(NamedTuple):
@@ -63,7 +63,7 @@ def excitation(
 def _row(now: AdaptingModel, mu: Array) -> Array:
     """The derivatives of μᵀτ by all shares (rows, m)."""
     slopes = now.slopes(mu)
-    bodies = slopes.bodies[..., _UPPER[0], _UPPER[1]] * _WEIGHTS
+    bodies = slopes.bodies[..., UPPER[0], UPPER[1]] * _WEIGHTS
     return np.concatenate([bodies.reshape(len(mu), -1), slopes.numbers], axis=-1)
 
 
@@ -71,7 +71,7 @@ def _to_values(unknowns: Unknowns) -> Float[np.ndarray, "k m"]:
     """The matrix from changes of the shares to those of the values."""
     found = np.zeros((10 * len(unknowns.bodies) + len(unknowns.numbers),) * 2)
     basis = np.zeros((10, 4, 4))
-    basis[np.arange(10), _UPPER[0], _UPPER[1]] = basis[np.arange(10), _UPPER[1], _UPPER[0]] = 1.0 / _WEIGHTS
+    basis[np.arange(10), UPPER[0], UPPER[1]] = basis[np.arange(10), UPPER[1], UPPER[0]] = 1.0 / _WEIGHTS
     for k, body in enumerate(unknowns.bodies):
         told = np.linalg.inv(body.place) @ body.factor
         found[10 * k : 10 * k + 10, 10 * k : 10 * k + 10] = inertial_parameters(told @ basis @ told.T).T

@@ -28,7 +28,7 @@ ADAPTS = ("load", "links", "friction", "rotors", "offsets")
 """What a law can adapt: a load at a frame, bodies of links, joint friction, rotor inertia, constant torques."""
 LOAD_AT = "load at "
 """What the name of a load begins with, before its link."""
-_UPPER = np.triu_indices(4)
+UPPER = np.triu_indices(4)
 _LEAST_SHARE = 1e-4  # what every direction of a body begins with, where the model has less, as a share of the largest
 _REACH = 2.0  # a link's largest body, as a multiple of the one that the model has
 _LENGTH, _SPREAD = 0.05, 0.02  # what a link's largest body has besides, so that a point mass is within it [m, share]
@@ -82,7 +82,7 @@ class Unknowns(NamedTuple):
     @property
     def start(self) -> np.ndarray:
         """All duals at the start."""
-        own = [body.start[_UPPER] for body in self.bodies]
+        own = [body.start[UPPER] for body in self.bodies]
         return np.concatenate([*own, [number.start for number in self.numbers]])
 
     def packed(self, rates: np.ndarray, leak: float, output: tuple[int, np.ndarray]) -> Packed:
@@ -92,7 +92,7 @@ class Unknowns(NamedTuple):
         for body, rate in zip(self.bodies, rates, strict=False):
             p = body.known
             known = [p[3, 3], *p[:3, 3], *p[:3, :3][np.triu_indices(3)]]
-            weights.append(np.hstack([body.factor.ravel(), body.start[_UPPER], known, rate]))
+            weights.append(np.hstack([body.factor.ravel(), body.start[UPPER], known, rate]))
             assert len(weights[-1]) == PER_BODY
         for number, rate in zip(self.numbers, rates[len(self.bodies) :], strict=True):
             layout += [number.code, number.joint]

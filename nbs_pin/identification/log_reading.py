@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.interpolate import PchipInterpolator
 
+from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz
 from nbs_pin.identification.datasets import Dataset, trajectory_slices

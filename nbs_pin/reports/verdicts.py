@@ -247,11 +247,14 @@ def _transient(figures: Mapping[str, Any]) -> Verdict:
         always = found["joint_errors_always_rad"]
         more.append("at all times no bound is known" if always is None else f"at all times it is below {most(always)}")
     if found["fixed_joint_errors_rad"] is not None:
-        more.append(f"with a fixed model the worst of two such loads brings {most(found['fixed_joint_errors_rad'])}")
+        strays = most(found["fixed_joint_errors_rad"])
+        more.append(f"with a fixed model the worst of two such loads, undisturbed, brings {strays}")
         bounds = found["fixed_joint_error_bounds_rad"]
         certified = f"it is certified to {most(bounds)}" if bounds else f"no certificate: {found['fixed_refused']}"
         more[-1] += f"; {certified}".rstrip(".")
-    return Verdict(GOOD if found["label"] == "PROVED" else WARNING, said, tuple(more))
+    useless = figures.get("useless") or []
+    more += [f"of no use: {text}" for text in useless]
+    return Verdict(GOOD if found["label"] == "PROVED" and not useless else WARNING, said, tuple(more))
 
 
 def _attacked(attack: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
