@@ -12,11 +12,12 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import ROW_ARRAYS, Reference
 from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.bearable import Bearable
-from nbs_pin.controllers.excitation import _UPPER, _WEIGHTS, _row, _to_values
+from nbs_pin.controllers.excitation import _WEIGHTS, _row, _to_values
 from nbs_pin.controllers.gains import effective_inertia, sample_configurations
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
 from nbs_pin.controllers.passive_outputs import damping_of, output_of
-from nbs_pin.controllers.unknowns import ADAPTS, Carrier, model_body
+from nbs_pin.controllers.unknowns import ADAPTS, UPPER, Carrier, model_body
+from nbs_pin.controllers.update_rates import UsualMotions
 from nbs_pin.dynamics.body_fields import body_fields
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
@@ -288,7 +289,7 @@ def test_a_light_wrist_is_not_driven_into_its_torque_limits():
             disturbance=lambda t, q, v: 5.0 * np.where(np.sin(rates * t) >= 0.0, 1.0, -1.0),
         )  # fmt: skip
         errors.append(np.sqrt(np.square(run.q - run.q_ref)[run.t > 4.0].mean(axis=0)).max())
-    assert errors[1] <= 1.1 * errors[0]
+    assert errors[1] <= 0.25 * errors[0]
     assert (np.abs(run.tau_command) > run.effort_limit).any(axis=1).mean() < 0.01
 
 
@@ -337,7 +338,7 @@ def test_what_a_motion_shows_is_the_slope_of_the_torque(robot, adapts):
     def at(step):
         duals = memory.duals + step * direction
         now = law._now(duals[None], q, v, v_r, a_r)
-        x = np.concatenate([(now.shares.bodies[0][:, *_UPPER] * _WEIGHTS).ravel(), now.shares.numbers[0]])
+        x = np.concatenate([(now.shares.bodies[0][:, *UPPER] * _WEIGHTS).ravel(), now.shares.numbers[0]])
         return now, x, now.torque()[0], law.estimate(memory._replace(duals=duals)).values
 
     (now, more, up, high), (_, less, down, low) = at(h), at(-h)
@@ -466,3 +467,14 @@ def test_wrong_settings_are_refused():
 
 class Foreign(nbs.PinocchioDynamics):
     """A model whose equations may not be those of a rigid tree."""
+
+
+@pytest.mark.parametrize("name", ["two_link", "panda", "xarm7"])
+@pytest.mark.parametrize("adapts", [["load", "friction", "rotors"], ["offsets"], ["links", "offsets"]], ids="+".join)
+def test_slow_motions_bear_the_delay_of_the_update(name, adapts):
+    """M s̈ + Δ ṡ + I s(t − d) = 0 is stable for I d ≺ Δ: all but loads together stay below `gain` of it."""
+    law = law_for(nbs.load_robot(name), adapts, gain=0.4)
+    motions = UsualMotions.of(law.law, law.output, law.unknowns, *law._tree)
+    delayed = [not body.is_load for body in law.unknowns.bodies] + [True] * len(law.unknowns.numbers)
+    stiffness = np.einsum("k,skij->sij", law.rates[delayed], motions.slow[:, delayed]) / 4.0
+    assert 0.0 < np.linalg.eigvalsh(stiffness).max() * 3.0 * law.period <= 0.4 * (1.0 + 1e-9)

@@ -14,10 +14,13 @@ import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.known_code import foreign_code
 from nbs_pin.certificates.adaptive_bound import _loaded
+from nbs_pin.certificates.adaptive_storage import Beginning
+from nbs_pin.certificates.error_bounds import radians
 from nbs_pin.certificates.worst_load import Divergence, of_number
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
 from nbs_pin.controllers.unknowns import model_body
 from nbs_pin.dynamics.pinocchio_tree import pack_model
+from nbs_pin.reports.verdicts import verdict_of
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 
@@ -247,3 +250,92 @@ def test_simulated_arms_stay_within_the_bound(seed):
     found = outcome(seed)
     assert not found.broken, found
     assert found.cut or found.joint >= 1.0
+
+
+@pytest.mark.parametrize(("gain", "known"), [(0.3, True), (0.1, False)])
+def test_nothing_is_known_at_all_times_once_the_bound_of_a_continuous_joint_is_half_a_turn(gain, known):
+    """There its error jumps, and V with it: the slower law has the same finite V∞ + Σ d̄/γ formula, of no meaning."""
+    robot = nbs.load_robot("kinova")
+    law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), load_mass=0.5, gain=gain)
+    bound = nbs.transient_bound(law, 0.5, disturbance=np.full(robot.nv, 0.05), duration=1.0)
+    base = nbs.certify(law.law, np.full(robot.nv, 0.05))
+    comparison = dataclasses.replace(base.comparison, kappa=0.0, nu=math.inf)
+    formula = Beginning(law, comparison, 0.0, bound.divergence, 1.0).always()
+    assert bound.joint_errors[robot.continuous].max() < math.pi
+    assert math.isfinite(formula)
+    assert (radians(base.stiffness, formula)[1][robot.continuous] < math.pi).all() == known
+    assert bound.storage_always == (formula if known else math.inf)
+    assert (bound.summary()["joint_errors_always_rad"] is None) != known
+
+
+def test_a_load_on_the_first_joint_is_bounded():
+    law = law_for("panda", frame="panda_link1", load_radius=0.05)
+    bound = nbs.transient_bound(law, 2.0, 0.05)
+    assert bound.frame == "panda_link1"
+    heavier = nbs.DynamicsPlant(_loaded(law, bound.frame, bound.worst.mass, bound.worst.centre))
+    run = nbs.simulate(heavier, law, nbs.Sinusoid.for_robot(law.robot), 1.0, 0.001)
+    errors = np.abs(run.q - run.q_ref).max(axis=0)
+    assert errors.max() > 0.0
+    assert (errors <= bound.joint_errors).all()
+
+
+@pytest.mark.parametrize("leak", [math.nan, math.inf, -5.0])
+def test_a_leak_that_is_no_rate_is_refused(leak):
+    edited = law_for("two_link")
+    edited.leak = leak
+    with pytest.raises(CertificateRefused, match=f"the leak of the law is {leak}; give a finite number"):
+        nbs.transient_bound(edited, 0.5)
+
+
+def test_a_leak_faster_than_the_loop_adds_at_all_times():
+    slow, fast = (
+        nbs.transient_bound(law_for("panda", leak=leak), 2.0, friction=FREE["panda"], duration=1.0)
+        for leak in (1.0, 50.0)
+    )
+    assert slow.storage_always == slow.storage
+    assert fast.storage_always > fast.storage
+
+
+@pytest.mark.parametrize(("push", "start"), [(0.0, 0.0), (0.0, 0.3), (0.5, 0.0), (0.5, 0.3)])
+def test_the_bound_of_the_potential_is_the_best_of_all_multipliers(push, start):
+    """Φ + mV_a falls but by what is supplied where its quadratic form is ≥ 0: a dense grid finds no smaller bound."""
+    law = law_for("panda")
+    base = nbs.certify(law.law, np.full(7, push), friction=FREE["panda"])
+    k = dataclasses.replace(base.comparison, kappa=0.0, nu=math.inf)
+    found, length = Beginning(law, k, start, 0.02, 2.0), 2.0
+    m = np.geomspace(1e-4, 1e4, 40_000)
+    best = math.inf
+    for share in np.linspace(0.0, 1.0, 41)[1:-1] if push else [0.0]:
+        holds = 4.0 * (1.0 + m) * m * (1.0 - share) >= (1.0 / math.sqrt(k.delta) + m * k.cross) ** 2
+        supplied = length * (k.power + (k.t**2 / (4.0 * share) if push else 0.0))
+        bounds = (start + m * (start + 0.02 + supplied)) / (1.0 + m)
+        best = min(best, float(bounds[holds].min(initial=math.inf)))
+    assert found.potential() <= best * (1.0 + 1e-9)
+    assert found.potential() == pytest.approx(best, rel=1e-3)
+
+
+@pytest.mark.parametrize("half", [0.05, 0.002])
+def test_the_bound_of_a_cell_is_above_everything_in_it(body, half):
+    """Whatever the cell: across the edge of the ball, only its part within counts."""
+    found, rng, radius = Divergence(body), np.random.default_rng(3), 0.08
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    for centre in in_ball(rng, radius, 12):
+        (upper,) = found.above(0.5, radius, (centre + half * corners)[None], half, 1e-6)
+        inside = centre + half * rng.uniform(-1.0, 1.0, (4_000, 3))
+        inside = inside[np.linalg.norm(inside, axis=1) <= radius]
+        values = found.value(found.loaded(0.5, inside))
+        assert values.max() <= upper
+        assert half > 0.01 or upper <= 1.2 * values.max() + 1e-3
+
+
+def test_a_bound_of_more_than_half_a_turn_is_of_no_use():
+    law = law_for("panda")
+    fine, useless = (nbs.transient_bound(law, 2.0, start=start) for start in (0.0, 1e4))
+    assert fine.useless == ()
+    assert useless.joint_errors.max() > math.pi
+    assert "turns says nothing; give a smaller load" in useless.useless[0]
+    for bound, level in ((fine, "good"), (useless, "warning")):
+        figures = {"transient": bound.summary(), "useless": list(bound.useless), "arm": "panda", "law": "a law"}
+        verdict = verdict_of(figures)
+        assert verdict.level == level
+        assert any("of no use" in line for line in verdict.more) == (level == "warning")

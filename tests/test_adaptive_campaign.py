@@ -53,7 +53,10 @@ def test_a_body_that_cannot_exist_is_seen():
 
 @pytest.mark.parametrize("name", ["panda", "ur5"])
 def test_a_constant_torque_is_integrated_away(name):
-    """5 N·m that nobody told the law: the error vanishes, at rates that bear the delay of the update."""
+    """5 N·m that nobody told the law: the error vanishes, at rates that bear the delay of the update.
+
+    Bounds of the whole effort limit make 5 N·m a small share of the interval, which takes some seconds to learn.
+    """
     robot = nbs.load_robot(name)
     law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), ["offsets"])
     hold = nbs.Hold(nbs.Sinusoid.for_robot(robot).offset)

@@ -1,11 +1,14 @@
 """The house of docs/architecture.md, held to the code: arrows run one way, engines stay in their rooms."""
 
 import ast
+import builtins
+import dis
 import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
+from types import CodeType
 
 import pytest
 
@@ -171,6 +174,39 @@ def test_house_numbers():
             if isinstance(node, ast.FunctionDef) and node.body[-1].end_lineno - node.body[0].lineno >= 60:
                 faults.append(f"{name}.{node.name} is longer than 60 lines")
     assert not faults
+
+
+def undefined(code: CodeType, known: set[str]) -> set[str]:
+    """Global names that a module or what is in it reads and nothing assigns."""
+    steps = list(dis.get_instructions(code))
+    own = {str(step.argval) for step in steps if step.opname in ("STORE_NAME", "DELETE_NAME")}
+    read = {str(step.argval) for step in steps if step.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
+    inner = (undefined(x, known) for x in code.co_consts if isinstance(x, CodeType))
+    return (read - own - known).union(*inner)
+
+
+def assigned(code: CodeType) -> set[str]:
+    """What a module assigns at its level, and what its functions declare `global`."""
+    stores = {str(x.argval) for x in dis.get_instructions(code) if x.opname in ("STORE_NAME", "STORE_GLOBAL")}
+    inner = (assigned(x) for x in code.co_consts if isinstance(x, CodeType) and "STORE_GLOBAL" in dis.Bytecode(x).dis())
+    return stores.union(*inner)
+
+
+@pytest.mark.parametrize("folder", ["nbs_pin", "tests", "tools", "demos"])
+def test_every_name_is_defined(folder):
+    """What F821 and name-defined would say, which are off as they take jaxtyping's shapes for names."""
+    given = set(dir(builtins)) | {"__file__", "__doc__", "__name__", "__path__", "__package__", "__annotations__"}
+    faults = {}
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        code = compile(path.read_text(), str(path), "exec")
+        if lacking := undefined(code, given | assigned(code)):
+            faults[str(path.relative_to(ROOT))] = lacking
+    assert not faults
+
+
+def test_a_name_that_nothing_defines_is_found():
+    code = compile("import os\nx = 1\ndef f(y):\n    z = x + y\n    return [os, z, lost]\n", "a", "exec")
+    assert undefined(code, assigned(code)) == {"lost"}
 
 
 def test_the_architecture_page_names_every_room():

@@ -340,6 +340,14 @@ def test_other_separators_are_understood(load, tmp_path, mark, point):
         assert_array_equal(load_log(tmp_path / "log.csv.gz", robot=TWO).tau, plain.tau)
 
 
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_references_are_read_with_other_separators(tmp_path, mark):
+    rows = np.column_stack((T, smooth(T)))
+    (tmp_path / "motion.csv").write_text("\n".join(mark.join(map(str, row)) for row in (["t", "q_1", "q_2"], *rows)))
+    motion = load_reference(tmp_path / "motion.csv", TWO)
+    assert_allclose(motion(T).q, smooth(T), atol=1e-9)
+
+
 def test_a_velocity_that_is_zero_is_found_again(load):
     head, rows = table()
     plain, _ = load(head, rows)
