@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -339,3 +340,13 @@ def test_a_bound_of_more_than_half_a_turn_is_of_no_use():
         verdict = verdict_of(figures)
         assert verdict.level == level
         assert any("of no use" in line for line in verdict.more) == (level == "warning")
+
+
+@pytest.mark.parametrize(("mass", "radius"), [(0.3, 0.0), (1.0, 0.1), (50.0, 0.1)])
+def test_a_fixed_law_with_too_heavy_a_load_is_refused_without_infinite_numbers(mass, radius):
+    law = nbs.NeuralBackstepping.for_robot(nbs.load_robot("panda"))
+    uncertain = nbs.Uncertainty(payload=nbs.Payload(mass, radius))
+    reference = nbs.Sinusoid.for_robot(law.dynamics.robot)
+    with pytest.raises(CertificateRefused, match="a lighter payload") as refused:
+        nbs.certify(law, np.zeros(7), reference=reference, duration=2.0, uncertainty=uncertain)
+    assert not re.search("nan|inf", str(refused.value))

@@ -55,6 +55,11 @@ def bounds_for_all(
     errors = uncertainty.errors(robot, model)
     regressor = BodyRegressor(robot, model, errors)
     bounds = BodyBounds.of(robot, tree, errors, constants)
+    if not np.isfinite([*bounds.whole, *bounds.damped, *bounds.rated]).all():
+        refuse(
+            "no bound in every pose is found for bodies that are off by so much",
+            "state smaller shares or a lighter payload",
+        )
     # A payload only adds to M, the shares may take from it.
     own = (
         bounds

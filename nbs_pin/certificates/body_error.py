@@ -32,7 +32,8 @@ _SPLITS = np.linspace(0.02, 1.0, 50).tolist()
 """Shares θ of y² that may compensate t."""
 _ROOM = 1.02
 """Room around the set of motions within which the terms are bounded, so that its border lies inside."""
-_ROUNDS = 40
+_ROUNDS, _FARTHEST = 40, 1e3
+"""How often the set is widened, and the ‖z1‖ at which that ends [rad, m]: a larger bound is of no use to anyone."""
 
 
 class Local(NamedTuple):
@@ -212,10 +213,15 @@ def body_error(terms: Terms, base: ComparisonSystem, start: float) -> BodyError:
         needed = (start + storage) * _ROOM
         if needed <= region:
             return _bounds(terms, comparison, start, start + storage, t)
+        if radians(terms.constants.stiffness, needed)[0] > _FARTHEST:
+            break
         region = needed * _ROOM
     k = comparison
+    left = "they may take more than all the damping"
+    if k.beta < 1.0:
+        left = f"1 − β = {1.0 - k.beta:.3g}, α = {k.cross:.3g} and ω = {k.omega:.3g}"
     refuse(
-        f"the errors of the bodies leave no bound: 1 − β = {1.0 - k.beta:.3g}, α = {k.cross:.3g} and ω = {k.omega:.3g}",
+        f"the errors of the bodies leave no bound: {left}",
         "state smaller shares or a lighter payload, or take a larger D₀",
     )
 
