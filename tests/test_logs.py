@@ -558,7 +558,7 @@ def test_delays_beyond_a_log_and_units_of_made_up_times_are_refused(tmp_path):
     with pytest.raises(ArgumentError, match=r"delay=9.0 s is longer than every trajectory"):
         read(tmp_path, {name: x[:1_000] for name, x in measured().items()}, delay=9.0)
     c = {name: x for name, x in measured().items() if name != "t"}
-    with pytest.raises(ArgumentError, match="rate=250 and time_unit='ms' are given"):
+    with pytest.raises(ArgumentError, match=r"rate=250\.0 and time_unit='ms' are given"):
         read(tmp_path, c, rate=250, time_unit="ms")
 
 
