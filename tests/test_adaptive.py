@@ -208,6 +208,61 @@ def test_gradients_pass_through_steps(robot):
     assert float(start.grad @ torch.as_tensor(direction)) == pytest.approx(slope, rel=1e-5)
 
 
+@pytest.mark.parametrize("leak", [0.0, 2.0])
+def test_gradients_pass_to_rates_and_leak(robot, leak):
+    """∂/∂s of torques after four steps, by torch against differences of the numpy law."""
+    law, n = law_for(robot, ["load", "friction", "rotors"], leak=leak), robot.nv
+    rng = np.random.default_rng(8)
+    states, weight = 0.02 * rng.normal(size=(4, 5, n)), rng.normal(size=n)
+    direction = rng.normal(size=law.speed.change.shape)
+
+    def cost(kind):
+        memory, total = law.initial_memory(kind(np.zeros(n))), 0.0
+        for q, v, *aim in states:
+            tau, memory = law.step(memory, kind(q), kind(v), Reference(*map(kind, aim)), 0.001)
+            assert (abs(tau) <= kind(robot.effort_limit)).all()  # else the estimates wait
+            total = total + (tau * kind(weight)).sum()
+        return total
+
+    cost(torch.as_tensor).backward()
+    h, found = 1e-5, law.speed.change.grad.numpy() @ direction
+    values = []
+    for sign in (1.0, -1.0):
+        law.speed.change.data[:] = torch.as_tensor(sign * h * direction)
+        values.append(float(cost(np.asarray)))
+    assert found == pytest.approx((values[0] - values[1]) / (2.0 * h), rel=1e-5, abs=1e-10)
+    assert (float(law.speed.change.grad[-1]) != 0.0) == (leak > 0.0)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.01, 30.0))
+def test_no_training_makes_a_step_cost_all_of_the_damping(seed, size):
+    law = law_for(nbs.load_robot("two_link"), ["load", "friction", "rotors"], gain=0.4, leak=0.5)
+    first, leak, motions = law.rates, law.leak, UsualMotions.of(law.law, law.output, law.unknowns, *law._tree)
+    law.speed.change.data[:] = torch.as_tensor(np.random.default_rng(seed).normal(scale=size, size=len(first) + 1))
+    assert (law.rates >= 0.0).all()
+    assert (law.rates <= first / 0.4 * (1.0 + 1e-12)).all()
+    assert law.period * motions.cost(law.rates) <= 1.0 + 1e-9
+    assert law.leak == pytest.approx(leak * np.exp(float(law.speed.change.detach()[-1])))
+
+
+@pytest.mark.parametrize("gains", [True, False])
+def test_training_on_a_loaded_arm_chooses_rates(gains):
+    robot = nbs.load_robot("two_link")
+    law = law_for(robot, ["load"], load_mass=1.0, period=0.01, gain=0.2, leak=0.5)
+    rates, leak = law.rates, law.leak
+    plant = nbs.DynamicsPlant.for_robot(robot.with_payload("tip", 0.8))
+    training = nbs.train(
+        law, plant, [nbs.Sinusoid.for_robot(robot)], starts=2, duration=0.5, period=0.01, epochs=6, gains=gains
+    )
+    after = training.controller
+    assert training.history[training.best_epoch] < training.history[0]
+    assert (after.rates != rates).all() == gains
+    assert (after.leak != leak) == gains
+    np.testing.assert_array_equal(law.rates, rates)
+    assert any((a != b).any() for a, b in zip(after.law.parameters(), law.law.parameters(), strict=True))
+
+
 def test_estimates_wait_while_a_torque_is_cut_off():
     robot = nbs.load_robot("two_link")
     for adapting in (law_for(robot, list(ADAPTS)), law_for(robot, list(ADAPTS)).compile()):
@@ -417,8 +472,11 @@ def test_files_keep_rates_of_a_law_that_was_trained_first(tmp_path, robot):
         for parameter in inner.parameters():
             parameter += 0.01
     law = nbs.AdaptiveLaw(inner, ["load", "rotors"], load_mass=1.5, load_radius=0.2, leak=0.1)
+    law.speed.change.data[:] = torch.linspace(-1.0, 1.0, len(law.rates) + 1)
     nbs.save(law, tmp_path / "law.nbs")
     again = nbs.load(tmp_path / "law.nbs")
+    np.testing.assert_array_equal(again.rates, law.rates)
+    assert again.leak == law.leak != 0.1
     memory = stirred(law, ())
     q, v, *aim = 0.1 * np.random.default_rng(9).normal(size=(5, robot.nv))
     for one, other in ((law, again), (law.compile(), again.compile())):

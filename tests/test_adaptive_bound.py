@@ -14,9 +14,9 @@ from hypothesis import given, settings, strategies as st
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.known_code import foreign_code
-from nbs_pin.certificates.adaptive_bound import _loaded
 from nbs_pin.certificates.adaptive_storage import Beginning
 from nbs_pin.certificates.error_bounds import radians
+from nbs_pin.certificates.fixed_beside import loaded_model
 from nbs_pin.certificates.worst_load import Divergence, of_number
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
 from nbs_pin.controllers.unknowns import model_body
@@ -239,7 +239,7 @@ def test_the_fixed_law_is_simulated_with_the_bodies_of_its_model():
     q, centre = np.random.default_rng(1).uniform(-1.0, 1.0, (4, 7)), np.array([0.01, -0.02, 0.05])
     loaded = robot.with_payload("panda_hand_tcp", 1.5, com=centre.tolist())
     own, bare, more = (x.mass_matrix(q) for x in (heavier, nbs.PinocchioDynamics(robot), nbs.PinocchioDynamics(loaded)))
-    found = _loaded(law, "panda_hand_tcp", 1.5, centre).mass_matrix(q)
+    found = loaded_model(law, "panda_hand_tcp", 1.5, centre).mass_matrix(q)
     assert np.abs(own - bare).max() > 0.05
     np.testing.assert_allclose(found, own + more - bare, rtol=0.0, atol=1e-7)
 
@@ -273,18 +273,17 @@ def test_a_load_on_the_first_joint_is_bounded():
     law = law_for("panda", frame="panda_link1", load_radius=0.05)
     bound = nbs.transient_bound(law, 2.0, 0.05)
     assert bound.frame == "panda_link1"
-    heavier = nbs.DynamicsPlant(_loaded(law, bound.frame, bound.worst.mass, bound.worst.centre))
+    heavier = nbs.DynamicsPlant(loaded_model(law, bound.frame, bound.worst.mass, bound.worst.centre))
     run = nbs.simulate(heavier, law, nbs.Sinusoid.for_robot(law.robot), 1.0, 0.001)
     errors = np.abs(run.q - run.q_ref).max(axis=0)
     assert errors.max() > 0.0
     assert (errors <= bound.joint_errors).all()
 
 
-@pytest.mark.parametrize("leak", [math.nan, math.inf, -5.0])
-def test_a_leak_that_is_no_rate_is_refused(leak):
-    edited = law_for("two_link")
-    edited.leak = leak
-    with pytest.raises(CertificateRefused, match=f"the leak of the law is {leak}; give a finite number"):
+def test_a_leak_that_is_no_rate_is_refused():
+    edited = law_for("two_link", leak=1.0)
+    edited.speed.change.data[-1] = math.nan
+    with pytest.raises(CertificateRefused, match="the leak of the law is nan; give a finite number"):
         nbs.transient_bound(edited, 0.5)
 
 
@@ -350,3 +349,55 @@ def test_a_fixed_law_with_too_heavy_a_load_is_refused_without_infinite_numbers(m
     with pytest.raises(CertificateRefused, match="a lighter payload") as refused:
         nbs.certify(law, np.zeros(7), reference=reference, duration=2.0, uncertainty=uncertain)
     assert not re.search("nan|inf", str(refused.value))
+
+
+def checked_run(law, mass, seconds=1.0, **given):
+    robot = law.robot
+    plant = nbs.DynamicsPlant.for_robot(robot.with_payload("tip", mass))
+    return nbs.simulate(plant, law, nbs.Sinusoid.for_robot(robot), seconds, 0.001, **given)
+
+
+def test_a_run_is_checked_against_its_bound_and_what_failed_is_named():
+    law = law_for("two_link")
+    bound = nbs.transient_bound(law, 0.5, disturbance=[0.1, 0.1], duration=2.0)
+    kept = bound.check(checked_run(law, 0.5))
+    assert kept.is_kept
+    assert kept.failures == {}
+    assert 0.0 < kept.ratio < 1.0
+    assert kept.verdict.startswith("promise kept: joint1 came nearest, 0.00")
+    heavy = nbs.transient_bound(law, 0.5).check(checked_run(law, 3.5, check=False))
+    assert not heavy.is_kept
+    assert heavy.ratio > 1.0
+    assert heavy.verdict.endswith("as the load, the model or a torque from outside is not as stated")
+    pushed = bound.check(checked_run(law, 0.3, disturbance=lambda t, q, v: [0.0, 50.0 * (t >= 0.2)]))
+    assert pushed.failures["the recorded disturbance was larger than stated"] == pytest.approx(0.2)
+    assert "beyond" in pushed.verdict
+    assert "disturbance was larger than stated (t = 0.2 s)" in pushed.verdict
+    away = bound.check(checked_run(law, 0.3, q0=nbs.Sinusoid.for_robot(law.robot)(0.0).q + 0.1))
+    assert any(name.startswith("the start has V = ") for name in away.failures)
+
+
+def test_after_its_duration_the_bound_at_all_times_holds():
+    law = law_for("two_link")
+    bound = nbs.transient_bound(law, 0.5, disturbance=[0.1, 0.1], duration=0.5)
+    seen = bound.check(checked_run(law, 0.5))
+    assert (seen.joint_bounds[seen.t <= 0.5] == bound.joint_errors).all()
+    assert (seen.joint_bounds[seen.t > 0.501] == bound.joint_errors_always).all()
+
+
+def test_a_number_that_is_not_finite_breaks_the_promise():
+    law = law_for("two_link")
+    run = checked_run(law, 0.3, 0.1)
+    run.q[40, 1] = np.nan
+    seen = nbs.transient_bound(law, 0.5).check(run)
+    assert not seen.is_kept
+    assert math.isnan(seen.ratio)
+    assert seen.failures == {"a number is not finite": pytest.approx(0.04)}
+    assert "joint2 was nan" in seen.verdict
+
+
+def test_a_run_of_another_law_is_not_checked():
+    law = law_for("two_link")
+    fixed = nbs.simulate(nbs.DynamicsPlant.for_robot(law.robot), law.law, nbs.Hold([0.1, 0.2]), 0.1, 0.001)
+    with pytest.raises(ArgumentError, match=r"no estimates, expected .* give a run of the law that was bounded"):
+        nbs.transient_bound(law, 0.5).check(fixed)

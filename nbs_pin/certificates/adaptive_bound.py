@@ -3,17 +3,16 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from nbs_pin.base.arguments import DURATION, a, checked, maybe, number
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.claims import Claim, Group, Known, Label, known, refuse, weakest
-from nbs_pin.base.exceptions import CertificateRefused
 from nbs_pin.base.known_code import foreign_code
+from nbs_pin.base.records import Run
 from nbs_pin.base.rounding import up
 from nbs_pin.base.shown import Cells, Shown
 from nbs_pin.base.units import measured, several, units
@@ -22,32 +21,16 @@ from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.error_bounds import radians
-from nbs_pin.certificates.uncertainty import Payload, Uncertainty
+from nbs_pin.certificates.fixed_beside import FixedLaw, fixed_law, frame_of
+from nbs_pin.certificates.transient_check import Assumed, TransientCheck
+from nbs_pin.certificates.uncertainty import Payload
 from nbs_pin.certificates.worst_load import Divergence, WorstLoad, of_number
 from nbs_pin.controllers.adaptive_law import AdaptiveLaw
-from nbs_pin.controllers.unknowns import LOAD_AT
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
 from nbs_pin.motions.references import MOTION, DesiredMotion
-from nbs_pin.simulation.dynamics_plant import DynamicsPlant
-from nbs_pin.simulation.simulate import simulate
 
 _HERE = "docs/certificates.md §16"
-_LENGTH, _PERIOD = 10.0, 0.001  # of a loop without a reference [s]; of simulated loops [s]
-
-
-class FixedLaw(NamedTuple):
-    """The law without adaptation under the same loads, along a reference."""
-
-    joint_errors: JointArray
-    """Largest |z1_i| measured with the worst load and with the largest one at the frame's origin [rad, m], of the arm
-    with its friction and without disturbance."""
-    certificate: Certificate | None
-    """Its certificate for all loads of the box; None if that is refused."""
-    refused: str
-    """Why it is refused; empty if it is not."""
+_LENGTH = 10.0  # of a loop without a reference [s]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,7 +108,7 @@ class TransientBound(Shown):
     @property
     def frame(self) -> str:
         """The link that carries the load."""
-        return _frame(self.law)
+        return frame_of(self.law)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -136,6 +119,24 @@ class TransientBound(Shown):
     def joint_units(self) -> tuple[str, ...]:
         """Unit of the error of each joint: rad, or m for a prismatic joint."""
         return units("position", self.law.robot.prismatic)
+
+    def check(self, run: Run, start: int = 0) -> TransientCheck:
+        """The errors of a run of the law, simulated or logged, beside their bounds, and the assumptions that failed.
+
+        Raises ArgumentError for a run that is not of such a law.
+
+        Example:
+            >>> import nbs_pin as nbs
+            >>> robot = nbs.load_robot("two_link")
+            >>> law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), load_mass=0.5)
+            >>> plant = nbs.DynamicsPlant.for_robot(robot.with_payload("tip", 0.3))
+            >>> run = nbs.simulate(plant, law, nbs.Sinusoid.for_robot(robot), 2.0, 0.001)
+            >>> nbs.transient_bound(law, 0.5).check(run).is_kept
+            True
+        """
+        bounds = self.joint_errors, self.joint_errors_always
+        assumed = Assumed(self.law, self.start, self.admissible, self.duration, *bounds)
+        return assumed.check(run, start, self.joint_units)
 
     def _facts(self) -> Iterable[str]:
         within = f" within {self.load_radius:g} m" if self.load_radius else ""
@@ -247,7 +248,7 @@ def transient_bound(
     if reference is None:
         return found
     given = {"disturbance": base.admissible, "friction": friction or JointFriction.of(law.robot)}
-    return replace(found, fixed=_fixed(law, payload, found.worst, given, reference, length))
+    return replace(found, fixed=fixed_law(law, payload, found.worst, given, reference, length))
 
 
 def _check_box(law: AdaptiveLaw, mass: float, radius: float) -> None:
@@ -360,41 +361,3 @@ def _lines(found: TransientBound, base: Certificate, code: Known) -> tuple[Claim
         *base.constants.lines,
         *base.friction.lines,
     )
-
-
-def _fixed(
-    law: AdaptiveLaw, payload: Payload, worst: WorstLoad, given: dict[str, Any], reference: DesiredMotion, length: float
-) -> FixedLaw:
-    """The inner law with the same loads: what is certified of it, and its largest errors along the reference."""
-    inner, refused, certificate = law.law, "", None
-    try:
-        certificate = certify(
-            inner, **given, reference=reference, duration=length, uncertainty=Uncertainty(payload=payload)
-        )
-    except CertificateRefused as error:
-        refused = str(error)
-    frame, errors = _frame(law), []
-    for mass, centre in {(worst.mass, tuple(worst.centre)), (payload.mass, (0.0, 0.0, 0.0))}:
-        plant = DynamicsPlant(_loaded(law, frame, mass, np.array(centre)), friction=given["friction"])
-        run = simulate(plant, inner.compile(), reference, math.ceil(length / _PERIOD) * _PERIOD, _PERIOD)
-        errors.append(np.abs(inner.dynamics.difference(run.q, run.q_ref)).max(axis=0))
-    return FixedLaw(np.max(errors, axis=0), certificate, refused)
-
-
-def _loaded(law: AdaptiveLaw, frame: str, mass: float, centre: Float[np.ndarray, "3"]) -> DynamicsProvider:
-    """The law's model with a point mass [kg] there [m]."""
-    model = law.law.dynamics
-    if mass == 0.0:
-        return model
-    if type(model) is PinocchioDynamics:
-        return PinocchioDynamics(law.robot.with_payload(frame, mass, com=centre.tolist()))
-    first = law.estimate()
-    at = 10 * [body.is_load for body in first.unknowns.bodies].index(True)
-    values, point = first.values.copy(), np.append(centre, 1.0)
-    values[at : at + 10] = inertial_parameters(mass * point[:, None] * point)
-    return replace(first, values=values).dynamics()
-
-
-def _frame(law: AdaptiveLaw) -> str:
-    """The link that carries the load."""
-    return next(body.name for body in law.unknowns.bodies if body.is_load).removeprefix(LOAD_AT)

@@ -298,7 +298,7 @@ def _check_run(run: Run, certificate: Certificate, start: int) -> None:
         raise ArgumentError(f"a {type(run).__name__} is not a Run; give what simulate returned or Run.load read.")
     if run.estimates is not None:
         raise ArgumentError(
-            "the run is of a law that adapts, which no certificate is of; compare its errors with transient_bound."
+            "the run is of a law that adapts, which no certificate is of; give it to transient_bound(…).check."
         )
     robot, nv = certificate.robot, certificate.controller.nv
     if robot is not None and run.robot_sha256 not in ("", robot.sha256):

@@ -104,12 +104,12 @@ class AdaptingModel:
         bodies = xp.stack(own, axis=-3) if own else 0.0 * self.duals.bodies
         return Duals(bodies, width * self.factors * (mu @ constant_like(mu, self._joints().T)))
 
-    def moved(self, z2: Array, rates: np.ndarray, leak: float, period: float) -> Array:
+    def moved(self, z2: Array, rates: Array, leak: Array, period: float) -> Array:
         """The duals (..., m) after a period of Q̇ = −γL − σ(Q − Q₀) with L held."""
-        slopes, count = self.slopes(z2), len(self.unknowns.bodies)
+        xp, slopes, count = array_namespace(z2), self.slopes(z2), len(self.unknowns.bodies)
         start = Duals.of(constant_like(z2, self.unknowns.start), count)
-        keep = float(np.exp(-leak * period))
-        drive = constant_like(z2, rates * (period if leak == 0.0 else -np.expm1(-leak * period) / leak))
+        keep = xp.exp(-leak * period)
+        drive = rates * (period if leak == 0.0 else -xp.expm1(-leak * period) / leak)
         return Duals(
             start.bodies + keep * (self.duals.bodies - start.bodies) - drive[:count, None, None] * slopes.bodies,
             start.numbers + keep * (self.duals.numbers - start.numbers) - drive[count:] * slopes.numbers,

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.base.arguments import BANDWIDTH, PERIOD, SEED, a, checked, joints, maybe, number, numbers, text, texts
@@ -53,7 +54,7 @@ from nbs_pin.controllers.unknowns import (
     unknown_numbers,
     unknown_rotors,
 )
-from nbs_pin.controllers.update_rates import UsualMotions, update_rates
+from nbs_pin.controllers.update_rates import TrainedRates, UsualMotions, update_rates
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
@@ -70,9 +71,10 @@ _TRANSITION = 0.01  # speed scale of Coulomb friction where the law feeds none f
 @storable(
     (
         *("adapts", "frame", "links", "load_mass", "load_radius", "load_across", "largest_rotor"),
-        *("gain", "leak", "period", "rates", "output_rate"),
+        *("gain", "period", "output_rate"),
     ),
     parts=("law",),
+    arrays=lambda t: {"rates": t["speed.rates"].numpy(force=True), "leak": float(t["speed.leak"])},
 )
 class AdaptiveLaw(Controller, nn.Module):
     """A law whose model learns what it does not know while the arm moves.
@@ -97,11 +99,11 @@ class AdaptiveLaw(Controller, nn.Module):
         largest_rotor: Largest rotor inertia of every joint [kg·m², kg]; None takes a quarter of the arm's largest. None
             of these four takes less where the model's inertia is so small that the sampled law would shake the arm
             with estimates of that size (docs/theory.md §10); what is given and too large for it warns.
-        gain: Speed of adaptation, the share of the damping's work that a sampled step costs at most in usual motions;
-            with `rates` it says nothing.
+        gain: Speed of adaptation, the share of the damping's work that a sampled step costs at most in usual motions.
+            Training raises γ by less than 1/gain (`update_rates.TrainedRates`), so that it never costs all of it.
         leak: σ [1/s], at which estimates return to the first ones; 0 for none.
         period: Longest control period h [s] that γ is stable for.
-        rates: γ of every unknown, in place of those that `gain` gives.
+        rates: γ of every unknown, in place of those that `gain` gives; for these `gain` only limits training.
         output_rate: ε or λ [1/s] of PD and ComputedTorque (`passive_outputs.py`), (n,); None takes it from their gains.
 
     Raises:
@@ -163,13 +165,14 @@ class AdaptiveLaw(Controller, nn.Module):
         self._refuse_unused(adapts, links=links or None, largest_rotor=largest_rotor)
         self.law, self.robot = law, robot
         self.adapts, self.frame, self.links = tuple(map(str, adapts)), frame, tuple(map(str, links))
-        self.gain, self.leak, self.period = gain, leak, period
+        self.gain, self.period = gain, period
         self.load_mass, self.load_radius, self.load_across = load_mass, load_radius, load_across
         self.largest_rotor = None if largest_rotor is None else rotors_of(robot, largest_rotor)
         if isinstance(law, LyapunovLaw):
             self._complete(Bearable(law, self._believed, period))
         self.output = output_of(law, output_rate)
-        self.output_rate, self.rates = self.output.rate, self._rates(rates)
+        self.output_rate = self.output.rate
+        self.speed = TrainedRates(self._rates(rates), leak, gain)
 
     @classmethod
     @checked(robot=ARM, dynamics=maybe(MODEL), bandwidth=BANDWIDTH, period=PERIOD, friction=maybe(FRICTION), seed=SEED)
@@ -265,13 +268,23 @@ class AdaptiveLaw(Controller, nn.Module):
         count = len(self.unknowns.bodies) + len(self.unknowns.numbers)
         return np.array(numbers(count, least=0.0, unit="1/J")("AdaptiveLaw: rates", rates))
 
+    @property
+    def rates(self) -> Float[np.ndarray, " unknowns"]:
+        """γ of every unknown [1/J]."""
+        return np.asarray(self.speed.value(numpy=True)[0])
+
+    @property
+    def leak(self) -> float:
+        """σ [1/s]."""
+        return float(self.speed.value(numpy=True)[1])
+
     def step_cost(self) -> float:
         """The share of the damping's work that a step of `period` with `rates` costs at most in usual motions.
 
         `gain` where these follow from it and the law was not trained since (docs/theory.md §10).
         """
         motions = UsualMotions.of(self.law, self.output, self.unknowns, *self._tree)
-        return self.period * motions.cost(np.asarray(self.rates, dtype=float))
+        return self.period * motions.cost(self.rates)
 
     def initial_memory(self, q: Vectors) -> AdaptiveMemory:
         """The first estimates, with the array type and the leading axes of q."""
@@ -310,7 +323,7 @@ class AdaptiveLaw(Controller, nn.Module):
         xp = array_namespace(q)
         read = xp.isfinite(before)
         free = xp.all((abs(tau) <= constant_like(q, self.robot.effort_limit)) & read, axis=-1)[..., None]
-        moved = now.moved(xp.where(read, before, 0.0 * output), self.rates, self.leak, period)
+        moved = now.moved(xp.where(read, before, 0.0 * output), *self.speed.like(q), period)
         after = xp.where(free, moved, now.duals.flat())
         return tau, AdaptiveMemory(after, output, last)
 

@@ -1,10 +1,14 @@
-"""How fast an adaptive law may learn: rates γ at which a sampled step is stable."""
+"""How fast an adaptive law may learn: rates γ at which a sampled step is stable, and what training makes of them."""
 
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import nn
 
+from nbs_pin.base.arrays import Array, array_namespace, is_torch_array
+from nbs_pin.base.known_code import known_code
 from nbs_pin.controllers.adapting_model import AdaptingModel
 from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.controllers.model_law import ModelLaw
@@ -100,3 +104,38 @@ def update_rates(
                 rates[k], _WELL_DAMPED * 4.0 / (_DELAY * float(np.linalg.eigvalsh(motions.slow[:, k])[:, -1].max()))
             )
     return np.asarray(gain / period * rates)
+
+
+@known_code
+class TrainedRates(nn.Module):
+    """γ(s) = γ₀/(g + (1 − g)e^−s) of every unknown [1/J] and σ(s) = σ₀eˢ [1/s], with s = `change`, initially zero.
+
+    γ(0) = γ₀, and γ(s) < γ₀/g for every s: where γ₀ makes a step cost at most the share g of the damping's work in
+    usual motions, no s makes it cost all of it. A rate or leak of 0 stays 0.
+
+    Args:
+        rates: γ₀.
+        leak: σ₀.
+        gain: g, between 0 and 1.
+    """
+
+    rates: torch.Tensor
+    leak: torch.Tensor
+
+    def __init__(self, rates: Float[np.ndarray, " unknowns"], leak: float, gain: float) -> None:
+        super().__init__()
+        self.gain = gain
+        self.register_buffer("rates", torch.as_tensor(np.array(rates, dtype=float)))
+        self.register_buffer("leak", torch.tensor(leak, dtype=torch.float64))
+        self.change = nn.Parameter(torch.zeros(len(rates) + 1, dtype=torch.float64))
+
+    def value(self, *, numpy: bool) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+        """γ and σ as numpy arrays, or as tensors differentiable in s."""
+        parts = self.rates, self.leak, self.change
+        rates, leak, s = (x.numpy(force=True) for x in parts) if numpy else parts
+        xp = array_namespace(s)
+        return rates / (1.0 + (1.0 - self.gain) * xp.expm1(-s[:-1])), leak * xp.exp(s[-1])  # the first is exact at 0
+
+    def like(self, x: Array) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+        """γ and σ with the array type of x."""
+        return self.value(numpy=not is_torch_array(x))

@@ -26,6 +26,7 @@ from nbs_pin.base.arguments import (
 )
 from nbs_pin.base.checks import integral, real
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.torch_threads import one_thread
 from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.motions.references import MOTION, DesiredMotion
 from nbs_pin.simulation.costs import StageCost, TorqueAware
@@ -142,7 +143,8 @@ def train(
         engine=engine_for(controller, loop) if engine is None else engine,
         checkpoint=None if checkpoint is None else Path(checkpoint),
     )
-    return Trainer(task, resume, progress).run(progress)
+    with one_thread():  # steps of a loop are small: threads of torch wait for each other longer than these take
+        return Trainer(task, resume, progress).run(progress)
 
 
 def _batches(

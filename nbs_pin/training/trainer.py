@@ -19,6 +19,7 @@ from nbs_pin.base.progress import tracked, waiting
 from nbs_pin.base.shown import Shown
 from nbs_pin.controllers.gain import Gain
 from nbs_pin.controllers.model_law import ModelLaw
+from nbs_pin.controllers.update_rates import TrainedRates
 from nbs_pin.simulation.costs import StageCost
 from nbs_pin.simulation.rollout import Batch, Engine, motions, running_cost
 from nbs_pin.storage.checkpoints import TrainingState, read_checkpoint, write_checkpoint
@@ -138,7 +139,7 @@ class Trainer:
     def __init__(self, task: Task, resume: bool, progress: bool) -> None:
         self.task, self.at = task, _Progress()
         modules = task.controller.modules()
-        fixed = set() if task.gains else {id(m.change) for m in modules if isinstance(m, Gain)}
+        fixed = set() if task.gains else {id(m.change) for m in modules if isinstance(m, (Gain, TrainedRates))}
         self.parameters = [p for p in task.controller.parameters() if p.requires_grad and id(p) not in fixed]
         if not self.parameters:
             raise ArgumentError(
