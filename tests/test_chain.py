@@ -23,7 +23,8 @@ from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.drive_terms import DriveTerms
-from nbs_pin.identification.fit import fit
+from nbs_pin.identification.fit import fit, split_data
+from nbs_pin.identification.fit_report import torque_errors, torque_nmse
 from nbs_pin.identification.identify import explain, identify
 from nbs_pin.identification.levenberg_marquardt import Normal, levenberg_marquardt
 from nbs_pin.identification.measurement import Noise
@@ -506,6 +507,26 @@ def test_an_arm_found_in_noise_is_about_as_good_as_one_of_known_geometry():
         known, found = identify(data, robot), LagrangianDynamics(fit_chain(data, seed, starts=4).network)
         ratios.append(errors(found, truth) / errors(known, truth))
     assert (np.median(ratios, axis=0) < 3.0).all()
+
+
+@pytest.mark.parametrize(("samples", "seed"), [(500, 0), (600, 0), (700, 1), (800, 0), (900, 2), (1_000, 0)])
+def test_noise_and_arm_are_found_however_long_the_recording(samples, seed):
+    """With four of these recordings no physical bodies fit the placements that arbitrary bodies have found."""
+    robot, noise = load_robot("three_link"), 0.5
+    data, _ = split_data(collect(robot, "excited", samples, seed, noise=Noise(encoder=2**-16, torque=noise)))
+    found = fit_chain(data)
+    np.testing.assert_allclose(found.bodies.noise, noise, rtol=0.25)  # the accelerations have some too
+    left = torque_errors(LagrangianDynamics(found.network), data, found.friction)
+    assert (np.sqrt(np.square(left).mean(axis=0)) < 1.15 * found.bodies.noise).all()
+    assert errors(LagrangianDynamics(found.network), PinocchioDynamics(robot)).max() < 0.02
+
+
+def test_torques_that_no_arm_needs_are_explained_no_worse_than_by_none():
+    """A joint that pulls where it should push; only unphysical bodies do, which must not count for all."""
+    data = collect(load_robot("three_link"), "uniform", 300, seed=0, noise=Noise(torque=0.5))
+    data = replace(data, tau=data.tau * [1.0, -1.0, 1.0])
+    found = fit_chain(data, starts=8, friction=False, offset=False, rotor_inertia=False)
+    assert torque_nmse(LagrangianDynamics(found.network), data) < 1.0
 
 
 def test_parallel_axes_are_held_parallel_in_noise():

@@ -29,7 +29,7 @@ from nbs_pin.dynamics.pseudo_inertia import coordinates
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.drive_terms import DriveTerms
-from nbs_pin.identification.explain import Bodies, IdentificationReport, explain
+from nbs_pin.identification.explain import Bodies, IdentificationReport, contradicted, explain
 from nbs_pin.identification.levenberg_marquardt import Descent, levenberg_marquardt
 from nbs_pin.identification.physical_tree import PhysicalTree
 from nbs_pin.identification.tree_search import Measurements, TreeEstimate
@@ -310,23 +310,42 @@ def _physical(
     guess: TreeEstimate, bodies: Bodies, data: Measurements, strength: float, right_angles: bool
 ) -> PhysicalTree:
     """The descent over placements and physical bodies together, then once more with the likely right angles."""
-    fair = replace(data, scale=bodies.report.noise)
-
-    def descend(start: PhysicalTree) -> Descent[PhysicalTree]:
-        return levenberg_marquardt(
-            start, lambda x: x.normal(fair), lambda x: x.cost(fair), PhysicalTree.moved, iterations=300, stall=1e-4
-        )
-
     guess = replace(guess, drag=bodies.scalars)
-    free = descend(PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.terms.signed, bodies.expected, strength))
+    start = PhysicalTree(guess, bodies.factors, bodies.scalars, bodies.terms.signed, bodies.expected, strength)
+    fair, free = _fair(start, bodies, data)
     if not right_angles:
         return free.at
     for errors in _ERRORS:
-        held = descend(free.at.at_right_angles(fair, errors))
+        held = _descent(free.at.at_right_angles(fair, errors), fair)
         worse = (held.cost - free.cost) * data.q.size
         if worse < _UNLIKELY + _LIKELY * np.count_nonzero(held.at.angles):
             return held.at
     return free.at
+
+
+def _descent(start: PhysicalTree, data: Measurements) -> Descent[PhysicalTree]:
+    return levenberg_marquardt(
+        start, lambda x: x.normal(data), lambda x: x.cost(data), PhysicalTree.moved, iterations=300, stall=1e-4
+    )
+
+
+def _fair(start: PhysicalTree, bodies: Bodies, data: Measurements) -> tuple[Measurements, Descent[PhysicalTree]]:
+    """The data in the units by which the joints are weighted, and the descent in them.
+
+    Arbitrary bodies determine the placements less well than physical ones, so these may leave much until the placements
+    move along. Only where they still leave far more than the noise are the joints weighted by their torque.
+    """
+    weighed = replace(data, scale=bodies.weighed)
+    found = _descent(start, weighed)
+    noise = bodies.report.noise
+    if (bodies.weighed == noise).all():
+        return weighed, found
+    fair = replace(data, scale=noise)
+    renewed = _descent(found.at, fair)
+    left = np.sqrt(np.square(renewed.at.whole().residual(data)).mean(axis=0))
+    if contradicted(noise, left, np.sqrt(np.square(data.tau).mean(axis=0))):
+        return weighed, found
+    return fair, renewed
 
 
 def _write(tree: PhysicalTree, network: Chain, terms: DriveTerms) -> None:

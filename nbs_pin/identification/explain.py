@@ -58,7 +58,7 @@ class IdentificationReport:
     seconds: float
     """Duration of the fit [s]."""
     noise: JointArray
-    """Estimated standard deviation of the torque residual per joint [N·m], the inverse of its weight."""
+    """Estimated standard deviation of the torque's noise per joint [N·m]: what arbitrary symmetric bodies leave."""
     train_nmse: float
     """Mean squared residual over torque variance, averaged over the joints whose torque varies."""
     base_parameters: int
@@ -95,6 +95,8 @@ class Bodies(NamedTuple):
     """Their numbers; those of terms that a joint lacks have no meaning."""
     expected: Expected
     """Prior values of all of these."""
+    weighed: JointArray
+    """Unit of the residuals of each joint [N·m]: the noise, or more where physical bodies contradict it."""
     report: IdentificationReport
 
     @property
@@ -126,7 +128,7 @@ def _explain(geometry: Geometry, some: Dataset, wanted: Wanted, regularisation: 
     base = base_directions(geometry, some, terms, expected)
     signed = terms.signed.ravel()
     noise = noise_of(equations, base.shape[1] + others, len(some))
-    fit, design, noise = _physical(equations, noise, some, regularisation, signed)
+    fit, design, weighed = _physical(equations, noise, some, regularisation, signed)
     weak, values = _unexcited(design, base)
     bodies = [f"{parameter}({joint})" for joint in geometry.names for parameter in PARAMETER_NAMES]
     names = bodies + terms.names(geometry.names)
@@ -146,7 +148,7 @@ def _explain(geometry: Geometry, some: Dataset, wanted: Wanted, regularisation: 
         outliers=outliers,
     )
     found = (fit.scalars * expected.scalars).reshape(-1, some.nv)
-    return Bodies(expected.bodies @ fit.factors, terms, found, expected, report)
+    return Bodies(expected.bodies @ fit.factors, terms, found, expected, weighed, report)
 
 
 def _equations(geometry: Geometry, data: Dataset, wanted: Wanted) -> tuple[DriveTerms, np.ndarray, np.ndarray, int]:
@@ -258,7 +260,7 @@ def noise_of(equations: np.ndarray, base: int, samples: int) -> JointArray:
 def _physical(
     equations: np.ndarray, noise: JointArray, data: Dataset, strength: float, signed: Bool[np.ndarray, " scalars"]
 ) -> tuple[ConsistentFit, np.ndarray, JointArray]:
-    """The physically consistent fit, its weighted design, and the noise by which it is weighted [N·m].
+    """The physically consistent fit, its weighted design, and the unit of the residuals of each joint [N·m].
 
     `noise` is the residual of arbitrary bodies. Where physical bodies leave far more, as with a torque of wrong sign,
     a joint that only unphysical bodies explain would count for all. The joints are then weighted by their torque
@@ -266,12 +268,19 @@ def _physical(
     """
     design, target = weighted(equations, noise)
     fit, size = consistent_fit(design, target, data.nv, strength, signed), torque_size(equations, len(data))
-    left = np.sqrt(_squares(equations, fit, len(data)))
-    if (left > np.maximum(_UNPHYSICAL * noise, _MUCH * size)).any() or (left > _WORSE * size).any():
-        noise = np.maximum(noise, size)
-        design, target = weighted(equations, noise)
-        fit = consistent_fit(design, target, data.nv, strength, signed)
-    return fit, design, noise
+    if not contradicted(noise, np.sqrt(_squares(equations, fit, len(data))), size):
+        return fit, design, noise
+    weighed = np.maximum(noise, size)
+    design, target = weighted(equations, weighed)
+    return consistent_fit(design, target, data.nv, strength, signed), design, weighed
+
+
+def contradicted(noise: JointArray, left: JointArray, size: JointArray) -> bool:
+    """Whether physical bodies leave far more of the torque of some joint than the noise, or more than no bodies [N·m].
+
+    size: Root mean square torque per joint.
+    """
+    return bool((left > np.maximum(_UNPHYSICAL * noise, _MUCH * size)).any() or (left > _WORSE * size).any())
 
 
 def weighted(equations: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
