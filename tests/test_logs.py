@@ -14,7 +14,7 @@ import nbs_pin as nbs
 from nbs_pin import cli
 from nbs_pin.base.csv_files import joint_columns
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
-from nbs_pin.identification.datasets import recordings
+from nbs_pin.identification.datasets import recordings, trajectory_slices
 from nbs_pin.identification.fit import split_data
 from nbs_pin.identification.log_doubts import log_doubts
 from nbs_pin.identification.log_files import Columns
@@ -96,6 +96,28 @@ def test_the_filter_delays_nothing_and_treats_all_signals_alike():
     assert_allclose(found.q[inside], slow[inside], atol=1e-3)
     assert_allclose(found.tau, 3.0 * found.q, atol=1e-12)
     assert found.a is None
+
+
+@pytest.mark.parametrize("step", [0.001, 0.004, 0.01])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_recording_that_begins_and_ends_in_motion_is_as_good_there_as_inside(tmp_path, step, seed):
+    robot, rng, t = nbs.load_robot("two_link"), np.random.default_rng(seed), np.arange(0.0, 4.0, step)
+    dynamics, parts = nbs.PinocchioDynamics(robot), []
+    for number in range(4):
+        size, rate, phase = rng.uniform(0.3, 0.8, 2), rng.uniform(1.0, 4.0, 2), rng.uniform(0.0, 6.0, 2)
+        found = nbs.Sinusoid(size, rate, phase)(t)
+        tau = nbs.inverse_dynamics(dynamics, found.q, found.v, found.a)
+        noisy = tau + rng.normal(0.0, 0.05, tau.shape)
+        parts.append({"t": t, "trajectory": np.full(len(t), number), "q": found.q, "tau": noisy})
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    data, _ = read(tmp_path, columns, robot=robot)
+    assert data.about["lowpass_Hz"] > 0.0
+    off = nbs.inverse_dynamics(dynamics, data.q, data.v, data.a) - data.tau
+    for rows in trajectory_slices(data.trajectory):
+        own = np.abs(off[rows])
+        inside = np.sqrt(np.square(own[10:-10]).mean())
+        assert max(own[:10].max(), own[-10:].max()) < 6.0 * inside
+    assert nbs.identify(data, robot).report.outliers == 0
 
 
 def test_jitter_repeats_spikes_and_gaps_are_put_right(tmp_path):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.signal import butter, periodogram, sosfiltfilt
 
@@ -48,6 +48,8 @@ _FINE = 5.0
 """Fewest rows per period of a cut-off frequency that is chosen."""
 _LONG = 6.0
 """Shortest trajectory that is filtered unasked, in periods of the cut-off frequency."""
+_BEYOND, _CUBIC = 2.0, 3
+"""Periods of the cut-off frequency by which a recording is continued before it is filtered; degree of its polynomials."""
 _STAGES = 4
 """Order of the filter, which acts twice."""
 
@@ -172,10 +174,22 @@ def lowpassed(columns: Columns, step: float, cutoff: float) -> Columns:
         if x is not None:
             parts = []
             for rows in trajectory_slices(columns.trajectory):
-                pad = min(round(1.0 / (cutoff * step)), rows.stop - rows.start - 1)
-                parts.append(sosfiltfilt(stages, x[rows], axis=0, padlen=pad))
+                more = min(round(_BEYOND / (cutoff * step)), rows.stop - rows.start - 1)
+                parts.append(sosfiltfilt(stages, _continued(x[rows], more), axis=0, padlen=more)[more:-more])
             found[name] = np.concatenate(parts)
     return columns._replace(**found)
+
+
+def _continued(x: Float[np.ndarray, "rows n"], more: int) -> Float[np.ndarray, "longer n"]:
+    """The signals with as many rows more at both ends, of the cubic that is nearest to as many rows there.
+
+    A filter starts as if at rest beyond the rows. Reflected there, as is usual, a motion would keep its speed and turn
+    its acceleration round, and the filter would spoil that of two periods of its cut-off frequency.
+    """
+    here = np.linspace(0.0, 1.0, more + 1)[:, None] ** np.arange(_CUBIC + 1)
+    there = np.linspace(-1.0, 0.0, more + 1)[:-1, None] ** np.arange(_CUBIC + 1)
+    before, after = (there @ np.linalg.lstsq(here, end[: more + 1], rcond=None)[0] for end in (x, x[::-1]))
+    return np.concatenate([before, x, after[::-1]])
 
 
 def torque_noise(columns: Columns) -> JointArray:
