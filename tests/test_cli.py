@@ -397,6 +397,15 @@ def test_the_example_in_each_help_is_a_command(command, capsys):
     assert type(parsed).__name__.lower() == command
 
 
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_the_help_says_in_words_what_is_done_without_an_option(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert cli.main([command, "--help"]) == 0
+    printed = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert "(default: )" not in printed
+    assert not re.search(r"\bNone\b|\(default: \(", printed)
+
+
 def test_help_is_quick_because_it_imports_no_engine():
     code = "import sys; from nbs_pin.cli import main; main(['track', '--help']); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

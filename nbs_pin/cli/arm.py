@@ -128,7 +128,11 @@ class ArmOptions:
     ] = ()
     """Joints to fix besides those that the catalogue fixes, at 0 or at a position [rad, m]:
     --lock finger_left,finger_right=0.02; may be repeated."""
-    zero_limits: Literal["refuse", "unlimited"] | None = None
+    zero_limits: Annotated[
+        Literal["refuse", "unlimited"] | None,
+        tyro.conf.arg(metavar="{refuse,unlimited}"),
+        default("as is known of the arm, else refuse"),
+    ] = None
     """Limits that are left out, not above 0, or an empty range at 0: refuse them, or read them as no limit."""
     limits: Annotated[
         tyro.conf.UseAppendAction[tuple[Annotated[str, text("J1.LIMIT=VALUE,…", _checked(_read_limits))], ...]],

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from nbs_pin.cli.reported import Reported
-from nbs_pin.cli.values import Verbose, integer
+from nbs_pin.cli.values import Verbose, default, integer
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Bench(Reported):
     """Number of timed calls of each law."""
     long: bool = False
     """Also time an hour of motion and a thousand starts, which takes a few minutes."""
-    compare: Annotated[Path | None, tyro.conf.arg(metavar="SUMMARY")] = None
+    compare: Annotated[Path | None, tyro.conf.arg(metavar="SUMMARY"), default("none")] = None
     """summary.json of an earlier bench; print the figures that changed by more than 10 %."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/bench")
     """Folder for summary.json and joints.png."""

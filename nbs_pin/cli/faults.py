@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from nbs_pin.cli.values import integer
+from nbs_pin.cli.values import default, integer
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Faults:
     """Arms by name or path."""
     seeds: Annotated[int, integer("--seeds", most=1000, least=1)] = 5
     """Trials of every row."""
-    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FAULT")] = ()
-    """Rows to run, such as F16 F21; all without it."""
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FAULT"), default("all")] = ()
+    """Rows to run, such as F16 F21."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out/faults")
     """Folder for summary.json."""

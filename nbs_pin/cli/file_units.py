@@ -1,17 +1,21 @@
 """Options of every command that reads recorded motions: the units of the file."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from nbs_pin.cli.values import OptionError
+import tyro
+
+from nbs_pin.cli.values import OptionError, default
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileUnits:
     """Units of a file with a motion, where they are not seconds and radians."""
 
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None
-    """Unit of the times in the file; without it they are seconds, and refused if they look otherwise."""
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, tyro.conf.arg(metavar="{s,ms,us,ns}"), default("s")] = (
+        None
+    )
+    """Unit of the times in the file; without it they are refused if they do not look like seconds."""
     degrees: bool = False
     """Angles in the file are in degrees."""
     radians: bool = False

@@ -9,7 +9,7 @@ import tyro
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.log_options import LogOptions, whole_numbers
 from nbs_pin.cli.reported import Reported
-from nbs_pin.cli.values import Verbose, choice, couplings, default, integer, number
+from nbs_pin.cli.values import Verbose, choice, couplings, default, integer, number, several_of
 from nbs_pin.identification.registry import MODELS
 
 
@@ -23,7 +23,7 @@ class Learn(LogOptions, Reported):
     Example: nbs-pin learn out/collect-panda/data.npz --model chain
     """
 
-    data: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    data: Annotated[tuple[Path, ...], tyro.conf.Positional, several_of("DATA")]
     """Data of nbs-pin collect, or logs with t, q, tau and optionally v and a; see nbs-pin log."""
     model: Annotated[str, choice("--model", MODELS)] = "chain"
     """chain: a rigid tree, from the order of the joints alone. cholesky: M = LLᵀ + εI by a network.
@@ -52,9 +52,11 @@ class Learn(LogOptions, Reported):
     """Numbers of the trajectories to hold out."""
     loss: Literal["torque", "acceleration"] = "torque"
     """Quantity whose error a network minimises."""
-    optimiser: Annotated[Literal["lm", "adam", "lbfgs"] | None, default("lm, lbfgs for more than 3500 parameters")] = (
-        None
-    )
+    optimiser: Annotated[
+        Literal["lm", "adam", "lbfgs"] | None,
+        tyro.conf.arg(metavar="{lm,adam,lbfgs}"),
+        default("lm, lbfgs for more than 3500 parameters"),
+    ] = None
     """Optimiser of a network: Levenberg–Marquardt, Adam, or L-BFGS after some steps of Adam."""
     iterations: Annotated[
         int | None, integer("--iterations", least=1, most=1_000_000), default("lm 30, adam 300, lbfgs 400")

@@ -8,7 +8,7 @@ import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
 from nbs_pin.cli.log_options import LogOptions
-from nbs_pin.cli.values import Verbose
+from nbs_pin.cli.values import Verbose, default, several_of
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class Log(LogOptions):
     Example: nbs-pin log measured.csv --robot ur10e --out clean.npz
     """
 
-    data: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """The log, .csv, .csv.gz, .txt, .npz or .mat, with t, q, tau and optionally v and a; or one for each recording."""
-    robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT")] = None
+    data: Annotated[tuple[Path, ...], tyro.conf.Positional, several_of("FILE")]
+    """Logs with t, q, tau, perhaps v and a: .csv, .txt, .tsv, .dat (also .gz), .npz, .mat, .db3, .mcap, .bag of ROS."""
+    robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("none")] = None
     """The arm by name or a path to a .urdf, .xacro or MJCF file; without it, units and signs are not questioned."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="DATA.npz")] = None
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DATA.npz"), default("nothing is written")] = None
     """Write the data to this file."""
     force: bool = False
     """Overwrite that file."""

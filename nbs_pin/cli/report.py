@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from nbs_pin.cli.values import default
+from nbs_pin.cli.values import default, several_of
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Report:
     Example: nbs-pin report out/track-panda out/track-panda-2 --open
     """
 
-    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, several_of("DIR")]
     """Folders with the results, each with its summary.json."""
     out: Annotated[
         Path | None, tyro.conf.arg(metavar="FILE"), default("report.html in the folder, or beside the first of several")

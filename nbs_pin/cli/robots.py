@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 
 from nbs_pin.cli.arm import ArmOptions, OfArm
+from nbs_pin.cli.values import default
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,7 @@ class Robots:
     Example: nbs-pin robots
     """
 
-    robot: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")] = None
+    robot: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT"), default("all")] = None
     """The arm to describe: a name, or the path of a description; without it, all arms are listed."""
     arm: OfArm = field(default_factory=ArmOptions)
     """How the arm is read."""

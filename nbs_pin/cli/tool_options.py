@@ -14,9 +14,11 @@ class ToolOptions:
 
     frame: Annotated[str | None, tyro.conf.arg(metavar="LINK"), default("the arm's end")] = None
     """Link or joint that a path of the tool leads."""
-    orientation: Annotated[Literal["hold", "free"] | None, default("hold, where six joints or more move the frame")] = (
-        None
-    )
+    orientation: Annotated[
+        Literal["hold", "free"] | None,
+        tyro.conf.arg(metavar="{hold,free}"),
+        default("hold, where six joints or more move the frame"),
+    ] = None
     """Orientation of the frame along a path of the tool: that of the path or of its beginning, or any."""
     posture: Annotated[str | None, configuration("--posture"), default("one with room around it")] = None
     """Configuration in which a path of the tool begins and to which spare joints keep [rad]: --posture=0,-0.3,0.1."""

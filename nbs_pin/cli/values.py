@@ -128,6 +128,11 @@ def default(hint: str) -> Any:
     return tyro.conf.arg(help_behavior_hint=f"(default: {hint})")
 
 
+def several_of(metavar: str) -> Any:
+    """The name, in --help, of an argument that takes one path or several."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="(one or several)")
+
+
 def text(metavar: str, parse: Callable[[list[str]], str]) -> PrimitiveConstructorSpec[str]:
     """A tyro parser of a text that `parse` checks."""
     return _spec(metavar, parse, str)

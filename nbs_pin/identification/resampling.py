@@ -49,7 +49,7 @@ _FINE = 5.0
 _LONG = 6.0
 """Shortest trajectory that is filtered unasked, in periods of the cut-off frequency."""
 _BEYOND, _CUBIC = 2.0, 3
-"""Periods of the cut-off frequency by which a recording is continued before it is filtered; degree of its polynomials."""
+"""Periods of the cut-off frequency by which a recording is continued before it is filtered, and the degree there."""
 _STAGES = 4
 """Order of the filter, which acts twice."""
 
