@@ -191,6 +191,18 @@ def test_noise_falls_with_the_root_of_the_samples():
     assert (many < 0.5 * few).all()
 
 
+@pytest.mark.parametrize("name", ["two_link", "ur5", GANTRY])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_mass_of_all_bodies_is_within_its_deviation(name, seed):
+    """A joint of the gantry lifts them all; no torque of the others depends on the sum."""
+    robot = load_robot(name)
+    model = identify(collect(robot, "uniform", 300, seed, noise=Noise(torque=0.3)), robot)
+    true, found = sum(body.mass for body in robot.model.inertias), model.parameters[:, 0].sum()
+    assert abs(found - true) < 4.0 * model.report.mass_deviation
+    assert (model.report.mass_deviation < 0.01 * found) == (name == GANTRY)
+    assert model.report.mass_deviation <= model.report.parameter_deviations[:, 0].sum()
+
+
 def test_a_noisy_joint_does_not_spoil_the_others():
     robot, noise = load_robot("ur5"), np.array([50.0, 0.01, 0.01, 0.01, 0.01, 0.01])
     model = identify(clean(robot, 400, noise=noise), robot)

@@ -1,5 +1,6 @@
 """`nbs-pin learn`: what it writes, what it prints, and what it refuses."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from nbs_pin.identification.datasets import load_dataset
 from nbs_pin.identification.fit import fit, split_data
 from nbs_pin.identification.fit_report import torque_errors
 from tests.commands import contents, refusal, summary
+from tests.test_dynamics import GANTRY
 from tests.test_plotting import png_size
 
 ROBOT = nbs.load_robot("two_link")
@@ -83,6 +85,23 @@ def test_the_arm_is_the_one_of_the_data_and_inertias_are_found(path, tmp_path, c
     for word in ("two_link, identified", "joint2", "held out", "model.nbs", "learning.png"):
         assert word in said
     assert "no better" not in said
+    assert "do not show what the bodies weigh in all" in said
+    assert "masses add up" not in said
+
+
+def test_the_mass_of_all_bodies_is_told_where_a_joint_lifts_them(tmp_path, capsys):
+    gantry = nbs.load_robot(GANTRY)
+    collect(gantry, "uniform", 200, noise=nbs.Noise(torque=0.1)).save(tmp_path / "data.npz")
+    assert run(tmp_path / "data.npz", tmp_path / "out", "--model", "identified") == 0
+    told = re.search(r"masses add up to (\S+) kg, give or take (\S+) kg, 5.3 kg in the URDF", capsys.readouterr().out)
+    assert float(told[1]) == pytest.approx(5.3, abs=4.0 * float(told[2]))
+
+
+def test_what_is_solved_without_iterations_has_no_empty_panel(path, network, tmp_path):
+    assert run(path, tmp_path, "--model", "identified") == 0
+    (narrow, height), (wide, usual) = (png_size(folder / "learning.png") for folder in (tmp_path, network))
+    assert narrow < 0.7 * wide
+    assert height == pytest.approx(usual, rel=0.15)  # by the lines of the heading
 
 
 def test_a_log_needs_a_named_arm(path, tmp_path, capsys):
@@ -93,6 +112,20 @@ def test_a_log_needs_a_named_arm(path, tmp_path, capsys):
     assert not (tmp_path / "a").exists()
     assert run(log, tmp_path / "b", "--model", "identified", "--robot", "two_link") == 0
     assert nbs.load(tmp_path / "b" / "model.nbs").robot.name == "two_link"
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_the_command_that_is_named_next_compares_the_model_with_an_arm(path, tmp_path, capsys, named):
+    data = load_dataset(path)
+    log, folder = tmp_path / "log.npz", tmp_path / "out"
+    np.savez(log, t=data.t, q=data.q, v=data.v, a=data.a, tau=data.tau, trajectory=data.trajectory)
+    assert run(path if named else log, folder, "--model", "cholesky", "--iterations", "4", "--held-out", "0") == 0
+    following = capsys.readouterr().out.splitlines()[-1]
+    assert following == f"next: nbs-pin compare {folder / 'model.nbs'}" + ("" if named else " --against ROBOT")
+    words = following.removeprefix("next: nbs-pin ").replace("ROBOT", "two_link").split()
+    compared = tmp_path / "compared"
+    assert cli.main([*words, "--samples", "20", "--trajectories", "0", "--out", str(compared)]) == 0
+    assert "relative_error" in summary(compared)["figures"]
 
 
 def test_an_early_end_keeps_the_best(path, tmp_path, monkeypatch, capsys):

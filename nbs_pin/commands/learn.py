@@ -80,8 +80,9 @@ def run(options: Learn, console: Console, notes: Console) -> None:
                 verdict = verdict_of(found, interrupted=interrupted)
                 plot_learning(result, path, Heading(f"{name}: {options.model}, learned", settings, verdict))
     print_learned(console, f"{name}, {options.model}", found, verbose=options.verbose, interrupted=interrupted)
-    known = robot is not None and not interrupted
-    results.show(console, FILES, *(("compare", results.folder / FILES[0]) if known else ()))
+    against = () if robot is not None else ("--against", "ROBOT")
+    following = () if interrupted else ("compare", results.folder / FILES[0], *against)
+    results.show(console, FILES, *following)
     if interrupted:
         raise KeyboardInterrupt
 
@@ -227,21 +228,20 @@ def plot_learning(result: Learned, path: str | Path, heading: Heading | None = N
     """Plot the course of the fit and write the picture (`plotting.picture`); returns its path.
 
     Left: normalised mean squared residual by iteration, on training and held-out data. Right: RMS torque error of each
-    joint on both, between the standard deviation of its torque and the noise in the data, where that is known.
+    joint on both, between the standard deviation of its torque and the noise in the data, where that is known. Of a
+    model that was solved without iterations only the latter.
     """
-    with picture(path, 11.0, 4.2, heading=heading) as figure:
+    curves = (("training", result.report.history, ACTUAL), ("held out", result.report.held_out, REFERENCE))
+    width = 11.0 if result.report.history else 7.0
+    with picture(path, width, 4.2, heading=heading) as figure:
+        if not result.report.history:
+            _draw_errors(figure.subplots(), result)
+            return Path(path)
         curve, bars = figure.subplots(1, 2)
-        for name, values, colour in (
-            ("training", result.report.history, ACTUAL),
-            ("held out", result.report.held_out, REFERENCE),
-        ):
+        for name, values, colour in curves:
             if values:
                 curve.semilogy(values, color=colour, label=name)
-        if not result.report.history:
-            curve.set_axis_off()
-            curve.text(0.5, 0.5, "solved without iterations", ha="center", transform=curve.transAxes, color=LIMIT)
-        else:
-            curve.legend(frameon=False)
+        curve.legend(frameon=False)
         curve.set(xlabel="iteration")
         curve.set_title("residual, mean square over variance", loc="left")
         _draw_errors(bars, result)

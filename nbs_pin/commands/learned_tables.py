@@ -19,6 +19,8 @@ _HEADINGS = {
     "|τ| sign v": "±load",
     "τ earlier or later": "delay",
 }
+_KNOWN = 0.1
+"""Standard deviation of the mass of all bodies, as a share of it, up to which the data determine it."""
 _ENDED = {"held out": "no further progress on held-out data", "iterations": "all iterations done"}
 
 
@@ -103,8 +105,13 @@ def _short(value: float | None) -> str:
 
 
 def _masses(details: dict[str, Any]) -> list[str]:
-    """The mass that was found beside that of the URDF, and outliers."""
-    found, stated, outliers = (details.get(name) for name in ("mass_kg", "stated_mass_kg", "outliers"))
-    beside = "" if stated is None else f", {stated:.3g} kg in the URDF"
-    mass = [f"masses add up to {found:.3g} kg{beside}; what torques do not show is a guess"] if found else []
+    """The mass that was found beside that of the URDF, as far as torques depend on it, and outliers."""
+    names = ("mass_kg", "mass_deviation_kg", "stated_mass_kg", "outliers")
+    found, deviation, stated, outliers = (details.get(name) for name in names)
+    mass = []
+    if found and deviation <= _KNOWN * found:
+        beside = "" if stated is None else f", {stated:.3g} kg in the URDF"
+        mass.append(f"masses add up to {found:.3g} kg, give or take {deviation:.2g} kg{beside}")
+    elif found:
+        mass.append("these torques do not show what the bodies weigh in all; those of the model are one choice of many")
     return mass + ([f"{outliers} torques are far from all others, and count little"] if outliers else [])

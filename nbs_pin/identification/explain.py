@@ -76,6 +76,8 @@ class IdentificationReport:
     parameter_deviations: Float[np.ndarray, "n 10"] | None = None
     """Standard deviations of the inertial parameters of `IdentifiedDynamics`, in its units, with the prior as knowledge
     and as if samples were independent: those of a fast log are not, and its true deviations are larger."""
+    mass_deviation: float = np.inf
+    """The same of the sum of all masses [kg]."""
     drive_deviations: Mapping[str, JointArray] = field(default_factory=dict)
     """The same of the numbers of the drives, by term; zero where a joint lacks it."""
     drive_numbers: int = 0
@@ -319,9 +321,13 @@ def _deviations(
     factors = expected.bodies @ fit.factors
     moves = np.einsum("nij,kjl,nml->nkim", factors, BASIS, factors)  # of a step along each of BASIS
     maps = PARAMETERS_OF_COORDINATES @ coordinates(moves).swapaxes(1, 2)
-    bodies = np.linalg.norm(maps @ root[: 10 * n].reshape(n, 10, -1), axis=-1)
+    each = maps @ root[: 10 * n].reshape(n, 10, -1)
     drives = expected.scalars * scale * np.linalg.norm(root[10 * n :], axis=-1)
-    return {"parameter_deviations": bodies, "drive_deviations": terms.numbers(drives.reshape(-1, n))}
+    return {
+        "parameter_deviations": np.linalg.norm(each, axis=-1),
+        "mass_deviation": float(np.linalg.norm(each[:, 0].sum(axis=0))),
+        "drive_deviations": terms.numbers(drives.reshape(-1, n)),
+    }
 
 
 def nmse(equations: np.ndarray, fit: ConsistentFit, data: Dataset) -> float:

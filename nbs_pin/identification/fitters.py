@@ -222,6 +222,7 @@ def fit_identified(task: FitTask) -> Fitted:
             "parameter_deviations": np.asarray(report.parameter_deviations).tolist(),
             "drive_deviations": {name: x.tolist() for name, x in report.drive_deviations.items()},
             "mass_kg": float(found.parameters[:, 0].sum()),
+            "mass_deviation_kg": report.mass_deviation,
             "stated_mass_kg": _stated_mass(_needed(task)),
         },
     )
