@@ -16,6 +16,7 @@ import nbs_pin
 from nbs_pin import cli
 from nbs_pin.base import exceptions
 from tests.pages import blocks, commands, run_page, typed_by_hand
+from tools.pictures import CHARTS, RUNS
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
@@ -56,6 +57,13 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+def made_by(run: str) -> list[str]:
+    """The commands behind a picture, in order, as a page has them."""
+    folders = {name: f"out/{name}-three_link" for name in ("collect", "learn")} | {"arm": "my_arm.urdf"}
+    before = [line for name in re.findall(r"{(\w+)}", RUNS[run]) if name in RUNS for line in made_by(name)]
+    return [*before, f"nbs-pin {RUNS[run].format(**folders)}"]
+
+
 def functions(file: Path) -> set[str]:
     return {node.name for node in ast.parse(file.read_text()).body if isinstance(node, ast.FunctionDef)}
 
@@ -72,6 +80,19 @@ def test_sections_that_the_theory_cites_of_itself_exist():
     text = THEORY.read_text()
     sections = set(re.findall(r"^## §(\d+)", text, flags=re.M))
     assert set(re.findall(r"§(\d+)", text)) <= sections
+
+
+def test_pictures_are_of_the_commands_beside_them():
+    runs = {name: run for name, (run, _) in CHARTS.items()} | {name: name for name in ("swing", "track", "circle")}
+    shown = [
+        (page.name, command, page.read_text())
+        for page in (page for page in PAGES if page not in SHORT)
+        for name in re.findall(r"images/([\w-]+)\.webp", page.read_text())
+        for command in made_by(runs[name])
+    ]
+    assert len(shown) > 12
+    is_there = [bool(re.search(rf"{re.escape(command)} *(`|#|$)", text, re.M)) for _, command, text in shown]
+    assert [(page, command) for (page, command, _), there in zip(shown, is_there, strict=True) if not there] == []
 
 
 def test_every_test_that_the_pages_name_exists():
