@@ -95,7 +95,7 @@ def main(folder: Path) -> None:
         picture.thumbnail((1000, 1000), Image.Resampling.LANCZOS)
         picture.save(IMAGES / f"{name}.webp", quality=88, method=6)
     with Image.open(IMAGES / "errors.webp") as picture:
-        picture.crop((0, 0, picture.width, 3 * picture.height // 7)).save(IMAGES / "errors-of-a-model.webp", method=6)
+        picture.crop((0, 0, picture.width, 5 * picture.height // 12)).save(IMAGES / "errors-of-a-model.webp", method=6)
 
 
 if __name__ == "__main__":
