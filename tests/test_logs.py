@@ -596,3 +596,13 @@ def test_one_joint_alone_is_turned_round_where_friction_says_so(friction):
 def test_a_filter_faster_than_the_rows_is_refused(tmp_path):
     with pytest.raises(ArgumentError, match=r"lowpass is 400 Hz, expected less than half the .* give lowpass="):
         read(tmp_path, measured(), lowpass=400.0)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_recordings_of_hardly_any_rows_are_filtered_whole(rows):
+    x = np.cumsum(np.random.default_rng(0).normal(size=(200, 2)), axis=0)
+    numbers = np.repeat([0, 1], [200 - rows, rows])
+    found = lowpassed(Columns(np.arange(200) * 0.01, x, x, None, None, numbers), 0.01, 5.0)
+    assert found.q.shape == (200, 2)
+    if rows <= 2:  # too short to be anything but a line
+        assert_allclose(found.q[200 - rows :], x[200 - rows :], atol=0.2 * np.abs(np.diff(x[-2:], axis=0)).max() + 1e-9)

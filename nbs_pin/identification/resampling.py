@@ -174,8 +174,9 @@ def lowpassed(columns: Columns, step: float, cutoff: float) -> Columns:
         if x is not None:
             parts = []
             for rows in trajectory_slices(columns.trajectory):
-                more = min(round(_BEYOND / (cutoff * step)), rows.stop - rows.start - 1)
-                parts.append(sosfiltfilt(stages, _continued(x[rows], more), axis=0, padlen=more)[more:-more])
+                count = rows.stop - rows.start
+                more = min(round(_BEYOND / (cutoff * step)), count - 1)
+                parts.append(sosfiltfilt(stages, _continued(x[rows], more), axis=0, padlen=more)[more : more + count])
             found[name] = np.concatenate(parts)
     return columns._replace(**found)
 
