@@ -604,5 +604,6 @@ def test_recordings_of_hardly_any_rows_are_filtered_whole(rows):
     numbers = np.repeat([0, 1], [200 - rows, rows])
     found = lowpassed(Columns(np.arange(200) * 0.01, x, x, None, None, numbers), 0.01, 5.0)
     assert found.q.shape == (200, 2)
-    if rows <= 2:  # too short to be anything but a line
-        assert_allclose(found.q[200 - rows :], x[200 - rows :], atol=0.2 * np.abs(np.diff(x[-2:], axis=0)).max() + 1e-9)
+    assert np.isfinite(found.q).all()
+    if rows == 1:
+        assert_allclose(found.q[-1], x[-1], atol=1e-9)
