@@ -7,6 +7,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -19,6 +20,7 @@ from tests.commands import contents, refusal, summary
 KILLED = """
 import os, sys
 from pathlib import Path
+from xml.etree import ElementTree
 from nbs_pin.base.files import replaced_together
 folder, last, seen = Path(sys.argv[1]), int(sys.argv[2]), 0
 def killed(event, arguments):
@@ -227,3 +229,16 @@ def test_the_next_command_of_the_shell_is_not_refused(tmp_path, monkeypatch, cap
         assert cli.main(["track", "two_link", "--duration", "0.05", "--seed", seed]) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["track-two_link", "track-two_link-2"]
     assert [summary(tmp_path / "out" / f"track-two_link{more}")["seed"] for more in ("", "-2")] == [1, 2]
+
+
+def test_pictures_are_vectors_too_if_asked_and_none_is_left_of_another_run(tmp_path, capsys):
+    words = ["track", "two_link", "--duration", "0.2", "--out", str(tmp_path)]
+    assert cli.main([*words, "--svg"]) == 0
+    assert str(tmp_path / "tracking.svg") in capsys.readouterr().out.splitlines()
+    drawing = ElementTree.parse(tmp_path / "tracking.svg").getroot()
+    assert drawing.tag.endswith("svg")
+    assert (tmp_path / "tracking.png").exists()
+    assert "svg" not in summary(tmp_path)["settings"]
+    assert cli.main([*words, "--seed", "1", "--force"]) == 0
+    assert not (tmp_path / "tracking.svg").exists()
+    assert "tracking.svg" not in capsys.readouterr().out

@@ -1,11 +1,13 @@
-"""The option of every command that writes results: a page of all of them."""
+"""The options of every command that writes results: a page of all of them, and pictures for print."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reported:
-    """Whether to write a page of the results."""
+    """What to write of the results besides files and pictures."""
 
     report: bool = False
     """Also write report.html: verdict, numbers, charts and replay on one page that needs no network."""
+    svg: bool = False
+    """Also write every picture as SVG, for print."""

@@ -20,6 +20,7 @@ from rich.console import Console
 from nbs_pin import __version__
 from nbs_pin.base.doors import at_the_shell
 from nbs_pin.base.exceptions import CertificateRefused, NbsPinError
+from nbs_pin.base.picture_kinds import svg_too
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.collect import Collect
@@ -32,6 +33,7 @@ from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.log import Log
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.report import Report
+from nbs_pin.cli.reported import Reported
 from nbs_pin.cli.reproduce import Reproduce
 from nbs_pin.cli.robots import Robots
 from nbs_pin.cli.run import Run
@@ -129,7 +131,8 @@ def _run(arguments: list[str], notes: Console, stops: list[int], begin: Callable
         begin()
         if stops:  # a library that is being imported may swallow the interrupt
             raise KeyboardInterrupt
-        with at_the_shell(flags(command), given(command), ["nbs-pin", *arguments]):
+        wanted = isinstance(command, Reported) and command.svg
+        with at_the_shell(flags(command), given(command), ["nbs-pin", *arguments]), svg_too(wanted):
             return body.run(command, console, notes) or 0
     return 0
 

@@ -19,6 +19,7 @@ from rich.text import Text
 
 from nbs_pin.base.doors import typed_command
 from nbs_pin.base.files import replaced_together
+from nbs_pin.base.picture_kinds import svg_beside
 from nbs_pin.base.summaries import REPORT, SUMMARY, summary_in, summary_text
 from nbs_pin.base.versions import versions
 from nbs_pin.cli.reported import Reported
@@ -26,7 +27,7 @@ from nbs_pin.cli.values import OptionError
 from nbs_pin.robots.robot import Robot
 
 _MOST_FOLDERS = 1000
-_NO_SETTINGS = ("out", "resume", "force", "verbose", "report")
+_NO_SETTINGS = ("out", "resume", "force", "verbose", "report", "svg")
 
 
 @dataclass(frozen=True)
@@ -124,13 +125,14 @@ class Results:
         summary.json is added with the facts, the figures and further entries. Whenever the process ends, the files of
         those names in the folder belong to one run. Pictures are drawn afterwards, within `drawing`.
         """
-        with replaced_together(self.folder, [SUMMARY, REPORT, *names]) as draft:
+        drawn = [str(svg_beside(name)) for name in names if name.endswith(".png")]
+        with replaced_together(self.folder, [SUMMARY, REPORT, *names, *drawn]) as draft:
             yield draft
             typed = {"command": typed_command()} if typed_command() else {}
             summary = summary_text(self.facts | typed | more | {"figures": figures})
             (draft / SUMMARY).write_text(summary, encoding="utf-8")
 
-    def show(self, console: Console, names: Iterable[str], *following: str | Path) -> None:
+    def show(self, console: Console, names: Sequence[str], *following: str | Path) -> None:
         """Print the paths of the results that exist, one per line, and the arguments of a command to go on with.
 
         The report is written before, if it is wanted, within `drawing`.
@@ -140,7 +142,8 @@ class Results:
 
             with drawing(self.folder / REPORT) as path:
                 report([self.folder], path)
-        for name in (*names, REPORT):
+        drawn = (str(svg_beside(name)) for name in names if name.endswith(".png"))
+        for name in (*names, *drawn, REPORT):
             if (self.folder / name).exists():
                 console.print(str(self.folder / name), soft_wrap=True, highlight=False, markup=False)
         if following:

@@ -22,6 +22,7 @@ from nbs_pin.base.arguments import checked, count, maybe, writable
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
+from nbs_pin.base.picture_kinds import is_svg_wanted, svg_beside
 from nbs_pin.base.records import RUN, Run
 from nbs_pin.dynamics.momentum_observer import OBSERVED, ObservedTorques
 from nbs_pin.reports.captions import arm_in_words, law_in_words, settings_in_words
@@ -74,7 +75,8 @@ def picture(
 ) -> Iterator[Figure]:
     """An empty figure of that size [inch] in the common style, written to the path when the block ends.
 
-    A path that ends in .svg or .pdf gets that kind, any other a PNG. It is written whole, or not at all if drawing
+    A path that ends in .svg or .pdf gets that kind, any other a PNG, beside which there is an SVG if the shell asks for
+    it (`base/picture_kinds.py`). It is written whole, or not at all if drawing
     fails. The heading takes its room from the figure. Raises OSError if it cannot be written.
     """
     kind = Path(path).suffix.lower().removeprefix(".")
@@ -87,9 +89,16 @@ def picture(
             _head(figure, heading)
         yield figure
         _lay_out(figure)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, metadata={} if kind == "png" else _UNDATED[kind])
-    write_whole(path, buffer.getvalue())
+        files = {Path(path): kind}
+        if kind == "png" and is_svg_wanted():
+            files[svg_beside(path)] = "svg"
+        drawn = {}
+        for file, form in files.items():
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=form, metadata={} if form == "png" else _UNDATED[form])
+            drawn[file] = buffer.getvalue()
+    for file, data in drawn.items():
+        write_whole(file, data)
 
 
 def _lay_out(figure: Figure) -> None:
