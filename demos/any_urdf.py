@@ -20,4 +20,4 @@ def main(arm: str = "panda", duration: float = 5.0) -> float:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    main(sys.argv[1] if len(sys.argv) > 1 else "panda")

@@ -69,4 +69,4 @@ def main(out: Path = Path("out/demo/own_arm"), duration: float = 4.0) -> tuple[f
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:2]))
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("out/demo/own_arm"))

@@ -6,6 +6,8 @@ radian: what the model does not know acts as a torque against the law's stiffnes
 allow, errs half as much again: it shapes its stiffness by the inertia, which a light wrist has little of.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 import nbs_pin as nbs
@@ -22,13 +24,16 @@ def main(duration: float = 8.0) -> dict[str, float]:
     bare = nbs.load_robot("panda")
     loaded = bare.with_payload("panda_link8", 1.0, com=[0.0, 0.0, 0.1], inertia=1e-3)
     reference = nbs.Sinusoid.for_robot(bare)
-    laws = {"NBS": nbs.NeuralBackstepping, "computed torque": nbs.ComputedTorque}
+    laws: dict[str, Callable[..., nbs.Controller]] = {
+        "NBS": nbs.NeuralBackstepping.for_robot,
+        "computed torque": nbs.ComputedTorque.for_robot,
+    }
     cases = {"no load": (bare, bare), "1 kg unknown": (bare, loaded), "1 kg known": (loaded, loaded)}
     errors = {}
-    for law, kind in laws.items():
+    for law, build in laws.items():
         for case, (belief, truth) in cases.items():
             # One tuning for all: only what the law believes of the arm changes.
-            controller = kind.for_robot(bare, nbs.PinocchioDynamics(belief))
+            controller = build(bare, nbs.PinocchioDynamics(belief))
             errors[f"{law}, {case}"] = steady_error(controller, truth, reference, duration)
             print(f"{law:16} {case:13} {errors[f'{law}, {case}']:.1e} rad")
     return errors

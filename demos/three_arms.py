@@ -21,7 +21,7 @@ START_ERROR = 0.3  # rad, in every joint, with alternating sign
 PERIOD = 0.001  # s
 
 
-def main(out: Path = Path("out/demo"), duration: float = 8.0) -> dict[str, dict]:
+def main(out: Path = Path("out/demo"), duration: float = 8.0) -> dict[str, dict[str, float]]:
     """Tracks the arms in MuJoCo at 1 kHz; returns the figures of each by name."""
     console = Console(highlight=False)
     table = Table("arm", box=box.SIMPLE_HEAD)
@@ -60,4 +60,4 @@ def main(out: Path = Path("out/demo"), duration: float = 8.0) -> dict[str, dict]
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:2]))
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("out/demo"))

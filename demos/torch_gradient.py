@@ -45,7 +45,7 @@ def main(epochs: int = 15) -> tuple[float, list[float]]:
     with torch.no_grad():
         for shift in (h, -2.0 * h, h):
             for w, d in zip(weights, direction, strict=True):
-                w += shift * d
+                w.add_(d, alpha=shift)
             costs.append(rollout_cost(controller, dynamics).item())
     difference = (costs[0] - costs[1]) / (2.0 * h)
     disagreement = abs(slope - difference) / abs(difference)
@@ -56,7 +56,7 @@ def main(epochs: int = 15) -> tuple[float, list[float]]:
     for epoch in range(epochs):
         optimiser.zero_grad()
         cost = rollout_cost(controller, dynamics)
-        cost.backward()
+        cost.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         history.append(cost.item())
         print(f"epoch {epoch:2}: cost {history[-1]:.6f} rad²·s")
