@@ -10,6 +10,7 @@ from nbs_pin import cli
 from nbs_pin.cli.payloads import read_payload_or_timed
 from nbs_pin.reports import plotting
 from nbs_pin.reports.captions import settings_in_words
+from nbs_pin.reports.signals import signals_of
 from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.carrying import carrying
 from nbs_pin.robots.urdf_options import Payload
@@ -354,3 +355,11 @@ def test_a_load_that_never_came_is_not_told_and_notes_that_cannot_be_read_are_no
     for noted, times in ((None, []), (0.2, []), ([0.2, "x", None, True, 9.0], [0.2])):
         run.info["plant_changes"] = noted
         assert changes_of(run) == times
+
+
+def test_charts_of_pages_mark_when_the_plant_changes():
+    robot = nbs.load_robot("two_link")
+    bare, loaded = (nbs.DynamicsPlant.for_robot(arm) for arm in (robot, robot.with_payload("tip", 0.5)))
+    law, motion = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    for plant, times in ((nbs.ChangingPlant(bare, [(0.05, loaded), (0.1, bare)]), [0.05, 0.1]), (bare, [])):
+        assert signals_of(nbs.simulate(plant, law, motion, 0.2, 0.001), robot)["changes"] == times

@@ -14,6 +14,7 @@ from nbs_pin.reports.pages import encoded
 from nbs_pin.reports.plotting import stretches
 from nbs_pin.reports.scene import positions, tips_of
 from nbs_pin.robots.robot import Robot, configuration_difference
+from nbs_pin.simulation.run_figures import changes_of
 
 MAX_ROWS = 10_001
 """Of longer runs, the page has the first row of every stretch, and those of its largest error and largest torque."""
@@ -42,6 +43,7 @@ def signals_of(run: Run, robot: Robot, most: int = MAX_ROWS) -> dict[str, Any]:
         "tips": [tip.name for tip in ends],
         "tip": encoded(np.linalg.norm(gap, axis=-1)),
         "saturated": [[(float(t[i]), float(t[j])) for i, j in stretches(of_joint)] for of_joint in cut.T],
+        "changes": changes_of(run),
         "disturbed": bool(run.disturbance.any()),
         "estimates": [
             {"title": title, "unit": unit, "names": list(curves), "of_joints": of_joints,

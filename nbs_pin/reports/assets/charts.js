@@ -129,7 +129,7 @@ function createCharts(root, runs, clock, shown, height) {
     };
   }
 
-  function shade(plot) {   // the stretches in which a chosen joint was saturated, and the line of the limit
+  function shade(plot) {   // the stretches in which a chosen joint was saturated
     const {ctx, bbox} = plot, colours = themed("--cut");
     const between = (t) => Math.min(bbox.left + bbox.width, Math.max(bbox.left, plot.valToPos(t, "x", true)));
     ctx.save();
@@ -141,6 +141,22 @@ function createCharts(root, runs, clock, shown, height) {
           if (end > plot.scales.x.min && begin < plot.scales.x.max) ctx.fillRect(x, bbox.top, Math.max(wide, 2 * devicePixelRatio), bbox.height);
         }
       }
+    }
+    ctx.restore();
+  }
+
+  function dot(plot) {   // the times at which the plant changes
+    const {ctx, bbox} = plot;
+    ctx.save();
+    Object.assign(ctx, {strokeStyle: themed("--ink"), lineWidth: 1.2 * devicePixelRatio});
+    ctx.setLineDash([1.5 * devicePixelRatio, 2.5 * devicePixelRatio]);
+    for (const t of new Set(runs.flatMap((run) => run.signals.changes))) {
+      if (t < plot.scales.x.min || t > plot.scales.x.max) continue;
+      const x = plot.valToPos(t, "x", true);
+      ctx.beginPath();
+      ctx.moveTo(x, bbox.top);
+      ctx.lineTo(x, bbox.top + bbox.height);
+      ctx.stroke();
     }
     ctx.restore();
   }
@@ -158,7 +174,8 @@ function createCharts(root, runs, clock, shown, height) {
       heading.textContent = signal.title;   // the panels name their units
       heading.append(choice("what was learned", panels, panels.indexOf(panel), (k) => { panel = panels[k]; }));
     }
-    if (signal.note) heading.appendChild(document.createElement("span")).textContent = signal.note;
+    const notes = [signal.note, runs.some((run) => run.signals.changes.length) && "dotted: the plant changes"].filter(Boolean);
+    if (notes.length) heading.appendChild(document.createElement("span")).textContent = notes.join("; ");
     const data = uPlot.join(tables.map(({run, lines: own}) => [run.columns.times, ...own.map((line) => line.values)]));
     const hovered = {is: false, from: 0};
     const tooltip = document.createElement("div");
@@ -176,7 +193,7 @@ function createCharts(root, runs, clock, shown, height) {
       series: [{}, ...lines.map((line) => ({label: line.label, stroke: line.colour, width: line.width, dash: line.dash, points: {show: false}}))],
       hooks: {
         drawClear: [shade],
-        draw: [(p) => {
+        draw: [dot, (p) => {
           if (signal.line === undefined) return;
           const y = p.valToPos(signal.line, "y", true);
           Object.assign(p.ctx, {strokeStyle: themed("--soft"), lineWidth: devicePixelRatio});
