@@ -18,7 +18,7 @@ from nbs_pin.identification.excitation import torque_limits
 from nbs_pin.identification.measurement import Noise
 from nbs_pin.motions.reference_files import load_reference
 from nbs_pin.reports.captions import chosen
-from nbs_pin.reports.plotting import ACTUAL, LIMIT, TORQUE, Heading, picture
+from nbs_pin.reports.plotting import ACTUAL, LIMIT, TORQUE, Heading, picture, short_name
 from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot, load_robot
 
@@ -99,13 +99,14 @@ def plot_coverage(data: Dataset, path: str | Path, robot: Robot, heading: Headin
                 torques.axhline(bound, color=LIMIT, linewidth=0.9, linestyle=(0, (5, 3)))
             torques.set_ylim(shown_range)
             (of,) = units_of([info.prismatic])
-            states.set_title(info.name, loc="left")
+            states.set_title(short_name(info.name), loc="left", fontsize=8.5, pad=12)
             share = float(np.ptp(data.q[:, joint]) / (info.upper - info.lower))
             if share > 0.0:
                 states.annotate(f"{share:.0%} of its range", (1.0, 1.0), xycoords="axes fraction", ha="right",
                                 va="bottom", fontsize=7, color=LIMIT)  # fmt: skip
             states.set(xlabel=f"q [{of.position}]", ylabel=f"v [{of.velocity}]")
-            torques.annotate(f"limit ±{limit:.4g}", (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom",
+            told = f"limit ±{limit:.4g}" if np.isfinite(limit) else "no limit"
+            torques.annotate(told, (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom",
                              fontsize=7, color=LIMIT)  # fmt: skip
             torques.set(xlabel=f"acceleration [{of.acceleration}]", ylabel=f"τ [{of.torque}]")
     return Path(path)

@@ -80,17 +80,16 @@ def figures(motion: ExcitingMotion, robot: Robot) -> dict[str, Any]:
 
 
 def plot_excitation(motion: ExcitingMotion, path: str | Path, robot: Robot, heading: Heading | None = None) -> Path:
-    """Plot position, velocity and torque of every joint with their limits, and write the picture; returns its path.
+    """Plot position, velocity and torque of every joint with its own limits and write the picture; returns its path.
 
     The torque is M v̇ + C v + G and its joint friction added, which bounds it from above in size.
     """
     t = np.linspace(0.0, motion.duration, _ROWS)
     moved = motion(t)
-    needed, (lower, upper) = demand(robot, moved), robot.one_turn_range
     curves = [
-        (moved.q, ACTUAL, lower, upper),
+        (moved.q, ACTUAL, robot.lower, robot.upper),
         (moved.v, _VELOCITY, -robot.velocity_limit, robot.velocity_limit),
-        (needed, TORQUE, np.full(robot.nv, np.nan), torque_limits(robot)),
+        (demand(robot, moved), TORQUE, np.full(robot.nv, np.nan), robot.effort_limit),
     ]
     with picture(path, 13.0, 1.15 + 1.4 * robot.nv, heading=heading) as figure:
         grid = figure.subplots(robot.nv, len(curves), squeeze=False, sharex=True)

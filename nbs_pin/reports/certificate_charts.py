@@ -212,7 +212,8 @@ def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) ->
     at = np.arange(len(bounds))
     axes.barh(at, bounds, height=0.7, color=LIMIT, alpha=0.35, label="void" if certificate.void else "certified")
     found = np.zeros(len(at)) if attack is None else attack.joint_errors
-    axes.barh(at, found, height=0.38, color=ERROR, label="worst found")
+    if attack is not None:
+        axes.barh(at, found, height=0.38, color=ERROR, label="worst found")
     if certificate.overshoot is not None:
         axes.plot(certificate.overshoot[1], at, "|", color=INK, markersize=14, label="from the start given")
     for y, bound, end, unit in zip(at.tolist(), bounds.tolist(), np.maximum(bounds, found), units, strict=True):
@@ -223,11 +224,9 @@ def _draw_joints(axes: Axes, certificate: Certificate, attack: Attack | None) ->
     most = max(bounds.max(), found.max(), 0.0 if certificate.overshoot is None else certificate.overshoot[1].max())
     axes.set_xlim(0.0, 1.35 * float(most) or 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    title = f"error of each joint in the long run, |z1| [{several(units)}]"
-    if attack is not None:
-        _title(axes, title)
-        return
-    axes.set_title(title, loc="left", color=INK)
+    axes.set_title(f"error of each joint in the long run, |z1| [{several(units)}]", loc="left", color=INK)
+    if attack is not None or certificate.overshoot is not None:  # below the panel, whose title takes its width
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.07), **_LEGEND)
     if not bounds.any():
         axes.set_xticks([0.0])
         axes.annotate("every bound is 0: no disturbance", (0.5, 0.5), xycoords="axes fraction", ha="center",

@@ -21,12 +21,11 @@ from nbs_pin.reports.plotting import (
     heading_of,
     one_start,
     picture,
+    short_name,
     thin,
     time_span,
 )
 
-_WIDEST = 20
-"""Longer names of joints are shortened in legends [characters]."""
 _ROWS = 10
 """Names below each other in the legend of a panel."""
 
@@ -70,7 +69,7 @@ def _draw(axes: Axes, t: Float[np.ndarray, " rows"], panel: Panel) -> None:
         style = {"color": LINES[k % len(LINES)], "linestyle": DASHES[k // len(LINES) % len(DASHES)], "linewidth": 1.2}
         if name == CARRIED and not panel.of_joints:
             style = {"color": INK, "linestyle": (0, (1, 1.5)), "linewidth": 1.3}
-        axes.plot(*thin(t, values), label=_short(name), **style)
+        axes.plot(*thin(t, values), label=short_name(name), **style)
     axes.set_title(f"{panel.title} [{panel.unit}]".replace("$", r"\$"), loc="left", fontsize=9.0, color=INK)
     axes.yaxis.set_major_locator(MaxNLocator(5))
     if len(panel.curves) > 1:  # right of the panel, where the legend covers no curve
@@ -86,9 +85,3 @@ def _draw(axes: Axes, t: Float[np.ndarray, " rows"], panel: Panel) -> None:
         low, high = np.percentile(known, [0.5, 99.5])
         room = max(0.1 * (high - low), 0.5)
         axes.set_ylim(low - room, high + room)
-
-
-def _short(name: str) -> str:
-    """The name of a joint, without its middle if it is long, with dollar signs escaped for matplotlib."""
-    half = (_WIDEST - 1) // 2
-    return (name if len(name) <= _WIDEST else f"{name[:half]}…{name[-half:]}").replace("$", r"\$")

@@ -56,6 +56,7 @@ _UNDATED: Any = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
 _WIDE: Any = {"color": "#ffc891", "linewidth": 4.5}  # of the reference, so that it shows beside the curve on it
 _CHANGE: Any = {"color": INK, "linewidth": 0.9, "linestyle": (0, (1, 1.5))}
 _OBSERVED: Any = {"color": ERROR, "linewidth": 0.9, "linestyle": (0, (4, 2))}
+_LONGEST = 20  # characters of a name beside a row or in a legend
 _NARROWEST = 0.012  # share of the time axis that a marked stretch takes, at least
 
 
@@ -179,7 +180,7 @@ def plot_tracking(
                 _draw_stops(position_axes, run.t, q[:, joint], v[:, joint], robot.joints[joint])
             _draw_error(error_axes, run.t, error[:, joint], decades[joint])
             _draw_torque(torque_axes, one, joint, cut[:, joint], None if outside is None else outside[:, joint])
-            position_axes.set_ylabel(_short(run.joint_names[joint]), fontweight="bold", color=INK)
+            position_axes.set_ylabel(short_name(run.joint_names[joint]), fontweight="bold", color=INK)
             if len(set(run.units)) > 1:
                 of = run.units[joint]
                 for axes, unit in zip(grid[joint], (of.position, of.position, of.torque), strict=True):
@@ -215,7 +216,7 @@ def heading_of(run: Run, robot: Robot | None = None, title: str = "") -> Heading
 def _draw_tool(figure: Figure, row: np.ndarray, run: Run, robot: Robot, tool: dict[str, Any]) -> None:
     """Errors of the tool's position and orientation, and its path, seen along the direction in which it is thinnest."""
     errors = tool_errors(run, robot)
-    row[0].set_ylabel(_short(tool["frame"]), fontweight="bold", color=INK)
+    row[0].set_ylabel(short_name(tool["frame"]), fontweight="bold", color=INK)
     titles = ["distance from the path [m]", "angle from its orientation [rad]"]
     shown = [errors.position, errors.orientation]
     for axes, title, error in zip(row, titles, shown if tool.get("orientation") == "hold" else shown[:1], strict=False):
@@ -329,7 +330,7 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float, observed: boo
     if changes_of(run):
         handles.append(figure.axes[0].plot([], [], label="the plant changes", **_CHANGE)[0])
     shown = handles if cut else [*handles[:2], *handles[3:]]
-    figure.legend(handles=shown, loc="upper right", ncols=6, frameon=False)
+    figure.legend(handles=shown, loc="outside lower right", ncols=6, frameon=False)  # above, a long title may reach it
 
 
 def time_span(run: Run) -> tuple[float, float]:
@@ -375,6 +376,7 @@ def stretches(flags: Bool[np.ndarray, " rows"]) -> list[tuple[int, int]]:
     return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
 
 
-def _short(text: str, width: int = 28) -> str:
-    """The text cut to the width, with dollar signs escaped for matplotlib."""
-    return (text if len(text) <= width else text[: width - 1] + "…").replace("$", r"\$")
+def short_name(name: str) -> str:
+    """The name of a joint or link, without its middle if it is long, with dollar signs escaped for matplotlib."""
+    half = (_LONGEST - 1) // 2
+    return (name if len(name) <= _LONGEST else f"{name[:half]}…{name[-half:]}").replace("$", r"\$")
