@@ -91,7 +91,7 @@ def test_track_prints_the_figures_it_stores(tracked):
         torques = [figures["joint_peak_torque_Nm"][i], figures["effort_limit_Nm"][i]]
         assert rows[joint] == [*(f"{e:.2e}" for e in errors), *(f"{x:.4g}" for x in torques)]
     cut = figures["saturated_fraction"]
-    assert (f"{cut:.2%} of the time" if cut else "no torque was cut") in printed
+    assert (f"{100.0 * cut:.2f} % of the time" if cut else "no torque was cut") in printed
     assert f"from {figures['convergence_time_s']:.3g} s on" in printed
     *_, following = lines = printed.splitlines()
     assert lines[-5:-1] == [f"out/{folder.name}/{name}" for name in tracking.FILES]

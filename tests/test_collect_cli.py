@@ -62,7 +62,7 @@ def test_the_table_is_the_summary(tmp_path, capsys):
     for joint in range(2):
         (row,) = (row for row in map(str.split, printed.splitlines()) if row[:1] == [figures["joints"][joint]])
         assert row[1:3] == [f"{figures[key][joint]:.3g}" for key in ("q_least_rad", "q_most_rad")]
-        assert row[-1] == f"{figures['at_torque_limit_fraction'][joint]:.1%}"
+        assert " ".join(row[-2:]) == f"{100.0 * figures['at_torque_limit_fraction'][joint]:.1f} %"
     assert "80 samples of 2 trajectories" in printed
     assert printed.splitlines()[-4:-1] == [str(tmp_path / "x" / name) for name in collecting.FILES]
 

@@ -122,7 +122,7 @@ def test_a_recorded_run_can_be_the_closed_loop(wrong, tmp_path, capsys):
     recorded = nbs.simulate(nbs.MujocoPlant(robot), law, nbs.Sinusoid.for_robot(robot, 1.0), 0.2, 0.002)
     recorded.save(tmp_path / "run.npz")
     assert run(tmp_path / "a", wrong, "--against", "three_link", "--along", str(tmp_path / "run.npz")) == 0
-    assert "1 starts are too few to bound further ones" in capsys.readouterr().out
+    assert "1 start is too few to bound further ones" in capsys.readouterr().out
     assert summary(tmp_path / "a")["figures"]["mismatch"]["trajectories"] == 1
     assert run(tmp_path / "b", wrong, "--against", "two_link", "--along", str(tmp_path / "run.npz")) == 2
 

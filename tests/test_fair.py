@@ -137,7 +137,7 @@ def test_the_protocol_is_made_from_the_settings(rows, monkeypatch):
     said = fair._protocol(rows, seed=41)
     assert "| two_link, 20 ms | 19 | 23 | 17 | 7 | 0.37 | 0.43 | 20 | 5 | 2.9 |" in said
     assert "one seed (41)" in said
-    assert "at least 10% of its S, Λ and D₀" in said
+    assert "at least 10 % of its S, Λ and D₀" in said
 
 
 @pytest.mark.parametrize(

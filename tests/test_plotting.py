@@ -98,7 +98,7 @@ def test_limits_are_drawn_when_the_torque_comes_near_and_named_otherwise(tmp_pat
     near = drawn_figure(sinusoid_run(1), tmp_path / "a.png", monkeypatch).axes[2]
     assert {-5.0, 5.0} <= {line.get_ydata()[0] for line in near.lines}
     far = drawn_figure(sinusoid_run(1, limit=80.0), tmp_path / "b.png", monkeypatch).axes[2]
-    assert [text.get_text() for text in far.texts] == ["limit ±80 (peak 10%)"]
+    assert [text.get_text() for text in far.texts] == ["limit ±80 (peak 10 %)"]
     none = drawn_figure(sinusoid_run(1, limit=np.inf), tmp_path / "c.png", monkeypatch).axes[2]
     assert [text.get_text() for text in none.texts] == ["no limit"]
 

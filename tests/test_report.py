@@ -162,7 +162,7 @@ def test_a_picture_has_the_verdict_of_the_page(monkeypatch, tmp_path):
     nbs.plot_tracking(away, tmp_path / "a.png", robot=robot)
     assert drawn[0].verdict == verdict_of(tracking_figures(away, robot))
     assert drawn[0].verdict.level == WARNING
-    assert "Joint1 left its range by " in drawn[0].verdict.text
+    assert " Joint joint1 left its range by " in drawn[0].verdict.text
     why = {"code": "TIME", "time_s": 0.25, "why": "a sample is late."}
     for noted, level in (({"stopped": why}, BAD), ({"interrupted": True}, WARNING)):
         nbs.plot_tracking(nbs.Run(**{**vars(run), "q": run.q_ref, "info": noted}), tmp_path / "a.png", robot=robot)
@@ -237,7 +237,7 @@ def test_errors_that_only_end_near_zero_have_not_converged(time, level):
     assert verdict_of(figures).level == level
     assert ("converged: from" in verdict_of(figures).said) == (level == GOOD)
     said = verdict_of({"laws": {"nbs": figures}}).said
-    assert said.startswith("nbs is off the least" if level == GOOD else "none of nbs converged")
+    assert said.startswith("of the laws, nbs is off the least" if level == GOOD else "none of nbs converged")
     both = verdict_of(figures, interrupted=True)
     assert both.said == "interrupted before its end"
     assert both.level == (BAD if level == BAD else WARNING)

@@ -15,7 +15,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import RUN, Run
-from nbs_pin.base.shown import Cells, Shown
+from nbs_pin.base.shown import Cells, Shown, counted
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 
@@ -101,7 +101,7 @@ class ModelErrors(Shown):
 
     def _facts(self) -> Iterable[str]:
         of = {"M": self.mass_matrix, "C v": self.coriolis, "G": self.gravity, "torque": self.inverse}
-        return *(f"{name} {error:.2e}" for name, error in of.items()), f"relative, {self.samples} samples"
+        return *(f"{name} {error:.2e}" for name, error in of.items()), f"relative, {counted(self.samples, 'sample')}"
 
     def _cells(self) -> Cells:
         shown = {"M": "mass_matrix", "C v": "coriolis", "G": "gravity", "torque": "inverse", "acceleration": "forward"}

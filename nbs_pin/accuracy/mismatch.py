@@ -15,6 +15,7 @@ from scipy.special import betainccinv
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
+from nbs_pin.base.shown import joints_told
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -125,7 +126,7 @@ def accelerations(
 ) -> Float[np.ndarray, "rows *batch n"]:
     """True v̇ [rad/s²] in all rows of a run but the last, whose torque was not applied."""
     if run.nv != truth.nv:
-        raise ArgumentError(f"the run has {run.nv} joints and the truth {truth.nv}; give a run of that arm.")
+        raise ArgumentError(f"the run has {joints_told(run.nv)} and the truth {truth.nv}; give a run of that arm.")
     net = run.tau[:-1] + run.disturbance[:-1]
     if friction is not None:
         net = net - friction.torque(run.v[:-1], run.tau[:-1])

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import JointArray, Vectors, matvec
 from nbs_pin.base.checks import PerJoint, floats, is_usual, told
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import joints_told
 from nbs_pin.dynamics.equations import inverse_dynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.robots.robot import Robot
@@ -131,7 +132,9 @@ def judge(
 def check_joints(model: DynamicsProvider, truth: DynamicsProvider) -> None:
     """Raise ArgumentError unless both models have the same number of joints."""
     if model.nv != truth.nv:
-        raise ArgumentError(f"the model has {model.nv} joints and the truth {truth.nv}; compare models of one arm.")
+        raise ArgumentError(
+            f"the model has {joints_told(model.nv)} and the truth {truth.nv}; compare models of one arm."
+        )
 
 
 def share(error: Any, size: Any) -> Any:

@@ -17,7 +17,7 @@ from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
-from nbs_pin.base.shown import Cells, Shown, joints_told
+from nbs_pin.base.shown import Cells, Shown, counted, joints_told
 from nbs_pin.base.units import JointUnits, measured, units_of
 
 RUN_FORMAT = "nbs_pin run 1"
@@ -150,7 +150,7 @@ class Run(Shown):
 
     def _facts(self) -> Iterable[str]:
         starts = math.prod(self.q.shape[1:-1])
-        several = () if starts == 1 else (f"{starts} starts",)
+        several = () if starts == 1 else (counted(starts, "start"),)
         arm = (self.robot.rsplit("/", 1)[-1],) if self.robot else ()
         length = f"{self.t[-1] - self.t[0]:.6g} s at {1e3 * self.period:.6g} ms"
         return *arm, joints_told(self.nv), length, *several

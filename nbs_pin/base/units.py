@@ -62,6 +62,11 @@ def measured(value: float, unit: str) -> str:
     return f"{text} ({pictured:.{3 if abs(pictured) < 100.0 else 4}g}{sign})"
 
 
+def percent(share: float, digits: int = 0) -> str:
+    """A share in percent, as in "63 %"."""
+    return f"{share:.{digits}%}".replace("%", " %")
+
+
 def with_units(texts: Sequence[str], given: Sequence[str]) -> list[str]:
     """Numbers with the units of their joints, left out if all are alike; "none" has no unit."""
     if len(set(given)) == 1:

@@ -11,6 +11,7 @@ import numpy as np
 from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import tracked
+from nbs_pin.base.units import percent
 from nbs_pin.controllers.registry import build_law
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import DesiredMotion, Sinusoid
@@ -247,8 +248,8 @@ periods with any joint beyond its limit. One draw of starts, one seed: small lea
 
 Every law but the PID has the exact, frictionless model, and all have a look-ahead of half a period. {_edges(rows)}
 
-What is not equal: only NBS has floors, at least {LEAST_SHARE:.0%} of its S, Λ and D₀, and a rate ω that tuning does not
-change; the gains of every other law are free. Its networks are those of one seed ({seed}). The laws start from
+What is not equal: only NBS has floors, at least {percent(LEAST_SHARE)} of its S, Λ and D₀, and a rate ω that tuning
+does not change; the gains of every other law are free. Its networks are those of one seed ({seed}). The laws start from
 different costs, given below each table. Tuning takes one plant step per control period, judging the steps above. The
 motions of the tuning are shorter than those of the table, and its cost hardly depends on the motion inside the mark:
 chattering there, or later, is not penalised.
@@ -311,7 +312,7 @@ def _tables(rows: Sequence[Row]) -> str:
             _number(r.steady_error_rad2, ".1e"),
             _number(r.rms_torque_Nm, ".1f"),
             _number(r.peak_torque_Nm, ".1f"),
-            _number(r.saturated_fraction, ".1%"),
+            percent(r.saturated_fraction, 1) if math.isfinite(r.saturated_fraction) else "not finite",
         )
         for r in sorted(rows, key=lambda r: r.frequency_rad_per_s)
     ]

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.units import SLIDING, column, units
+from nbs_pin.base.units import SLIDING, column, percent, units
 from nbs_pin.commands.results import tell, titled
 from nbs_pin.reports.verdicts import verdict_of
 
@@ -130,7 +130,7 @@ def _design(figures: dict[str, Any]) -> Table:
     design = figures["design"]
     title = (
         f"design: ω = {design['bandwidth_rad_per_s']:.3g} rad/s, control period {1e3 * design['period_s']:g} ms, "
-        f"{design['torque_share'] or 0.0:.0%} of a torque limit at the bound"
+        f"{percent(design['torque_share'] or 0.0)} of a torque limit at the bound"
     )
     slides = [unit == SLIDING.position for unit in figures["certificate"]["units"]]
     columns = [

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import by_quantity, column, units_of
+from nbs_pin.base.units import by_quantity, column, percent, units_of
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.results import Results, drawing, keywords, table, tell
@@ -102,7 +102,7 @@ def plot_coverage(data: Dataset, path: str | Path, robot: Robot, heading: Headin
             states.set_title(short_name(info.name), loc="left", fontsize=8.5, pad=12)
             share = float(np.ptp(data.q[:, joint]) / (info.upper - info.lower))
             if share > 0.0:
-                states.annotate(f"{share:.0%} of its range", (1.0, 1.0), xycoords="axes fraction", ha="right",
+                states.annotate(f"{percent(share)} of its range", (1.0, 1.0), xycoords="axes fraction", ha="right",
                                 va="bottom", fontsize=7, color=LIMIT)  # fmt: skip
             states.set(xlabel=f"q [{of.position}]", ylabel=f"v [{of.velocity}]")
             told = f"limit ±{limit:.4g}" if np.isfinite(limit) else "no limit"
@@ -128,7 +128,7 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     columns = [
         column(name, [f"{x:.3g}" for x in figures[key]], figures["units"][of]) for name, (key, of) in names.items()
     ]
-    columns.append(("at limit", [f"{share:.1%}" for share in figures["at_torque_limit_fraction"]]))
+    columns.append(("at limit", [percent(share, 1) for share in figures["at_torque_limit_fraction"]]))
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)

@@ -16,8 +16,9 @@ from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
+from nbs_pin.base.shown import counted, joints_told, weighed
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import by_quantity, several, units_of
+from nbs_pin.base.units import by_quantity, percent, several, units_of
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.values import SAVED, OptionError
 from nbs_pin.commands.results import Results, drawing, keywords, table, tell
@@ -285,7 +286,9 @@ def _region(options: Compare, robot: Robot) -> dict[str, Any]:
         return {"speed": 2.0 if options.speed is None else options.speed}
     data = load_dataset(options.data)
     if data.nv != robot.nv:
-        raise OptionError(f"--data '{options.data}' has {data.nv} joints and {robot.name} {robot.nv}; give data of it.")
+        raise OptionError(
+            f"--data '{options.data}' has {joints_told(data.nv)} and {robot.name} {robot.nv}; give data of it."
+        )
     lower, upper, fastest = data.q.min(axis=0), data.q.max(axis=0), abs(data.v).max(axis=0)
     return {"box": (lower, upper), "speed": fastest if options.speed is None else options.speed}
 
@@ -312,7 +315,8 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     lines = (
         *verdict.more,
         f"torque nMSE {_number(figures['torque_nmse'])}; least eigenvalue of the model's M "
-        f"{_number(figures['eigenvalue_margin_kgm2'])} kg·m²; {_number(low)} M ≤ model's M ≤ {_number(high)} M",
+        f"{_number(figures['eigenvalue_margin_kgm2'])} kg·m²; {weighed({'M': _number(low)})} ≤ model's M ≤ "
+        f"{weighed({'M': _number(high)})}",
         f"torque × {figures['scale_factor']:.6g} fits best, with a relative error of {_number(figures['scale_error'])}",
         f"free motion: true energy drifts by {_number(figures['energy_drift'])} of the kinetic energy "
         f"(integrator alone {_number(figures['energy_drift_floor'])})",
@@ -325,14 +329,15 @@ def _mismatch_lines(figures: dict[str, Any]) -> list[str]:
     found = figures["mismatch"]
     if found is None:
         return [" ".join(figures["no_closed_loop_because"].split())]
-    constants = (_number(found[name]) for name in ("a_Nm_per_rad", "b_Nms_per_rad", "c_Nm"))
-    torque = several(figures["units"]["torque"])
-    bound = "closed loop: ‖δ‖ ≤ {} ‖q‖ + {} ‖v‖ + {} {}".format(*constants, torque)
+    a, b, c = (_number(found[name]) for name in ("a_Nm_per_rad", "b_Nms_per_rad", "c_Nm"))
+    bound = f"closed loop: ‖δ‖ ≤ {weighed({'‖q‖': a, '‖v‖': b}, c, several(figures['units']['torque']))}"
     if found["violation_chance"] >= 1.0:
-        return [f"{bound} on this run; {found['trajectories']} starts are too few to bound further ones"]
+        few = counted(found["trajectories"], "start is", "starts are")
+        return [f"{bound} on this run; {few} too few to bound further ones"]
     return [
-        f"{bound} on {found['trajectories']} starts; a further one exceeds it with a chance of at most "
-        f"{found['violation_chance']:.2%}, confidence 1 − {found['doubt']:g} (probabilistic, for starts drawn alike)"
+        f"{bound} on {counted(found['trajectories'], 'start')}; a further one exceeds it with a chance of at most "
+        f"{percent(found['violation_chance'], 2)}, confidence 1 − {found['doubt']:g} (probabilistic, for starts drawn "
+        "alike)"
     ]
 
 

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import by_quantity, column, units_of
+from nbs_pin.base.units import by_quantity, column, percent, units_of
 from nbs_pin.cli.excite import Excite
 from nbs_pin.commands.results import Results, drawing, keywords, table, tell
 from nbs_pin.identification.excitation import torque_limits
@@ -118,7 +118,7 @@ def _print(console: Console, arm: str, figures: dict[str, Any], interrupted: boo
         column(name, [f"{x:.3g}" for x in figures[key]], figures["units"][of]) for name, (key, of) in quantities.items()
     ]
     shares = {"of q": "used_range_fraction", "of v": "peak_velocity_fraction", "of τ": "peak_torque_fraction"}
-    columns += [(name, [f"{share:.0%}" for share in figures[key]]) for name, key in shares.items()]
+    columns += [(name, [percent(share) for share in figures[key]]) for name, key in shares.items()]
     title = f"{arm}, exciting motion"
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):

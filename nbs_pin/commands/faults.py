@@ -8,6 +8,7 @@ from rich.console import Console
 
 from nbs_pin.base.files import replaced_together
 from nbs_pin.base.plain import plain
+from nbs_pin.base.shown import counted
 from nbs_pin.base.summaries import SUMMARY, summary_text
 from nbs_pin.base.versions import versions
 from nbs_pin.benchmarks.faults import MATRIX, matrix
@@ -50,6 +51,9 @@ def run(options: Faults, console: Console, notes: Console) -> int:
         (draft / SUMMARY).write_text(summary_text(summary), encoding="utf-8")
     console.print(shown)
     wall = time.perf_counter() - began
-    console.print(f"{len(rows) - failed} of {len(rows)} rows passed, {options.seeds} trials each, in {wall:.0f} s")
+    console.print(
+        f"{len(rows) - failed} of {counted(len(rows), 'row')} passed, {counted(options.seeds, 'trial')} each, "
+        f"in {wall:.0f} s"
+    )
     console.print(str(options.out / SUMMARY), highlight=False, markup=False, soft_wrap=True)
     return STOPPED if failed else 0

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import joints_told
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.train import Train
@@ -69,7 +70,7 @@ def box_or_ball(numbers: list[float], nv: int, *, norm: bool) -> Admissible:
         return Admissible.of(numbers[0], nv)
     if len(numbers) not in (1, nv):
         raise ArgumentError(
-            f"{len(numbers)} torques were given for {nv} joints; give one for all joints, or one per joint "
+            f"{len(numbers)} torques were given for {joints_told(nv)}; give one for all joints, or one per joint "
             "[N·m, N where it slides]."
         )
     return Admissible.of(np.full(nv, numbers, dtype=float), nv)

@@ -5,8 +5,9 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from nbs_pin.base.shown import counted
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import column
+from nbs_pin.base.units import column, percent
 from nbs_pin.commands.results import table, tell
 from nbs_pin.reports.verdicts import verdict_of
 
@@ -66,7 +67,7 @@ def _drives(figures: dict[str, Any]) -> list[Any]:
     )
     found = [column(head, [f"{x:.3g}" for x in figures[name]], unit) for name, head, unit in kinds if figures.get(name)]
     if figures.get("load_friction_share"):
-        found.append(("friction\nover load", [f"{x:.1%}" for x in figures["load_friction_share"]]))
+        found.append(("friction\nover load", [percent(x, 1) for x in figures["load_friction_share"]]))
     parts = [found[k : k + _WIDE] for k in range(0, len(found), _WIDE)]
     return [_per_joint("drives" if k == 0 else "drives, continued", figures, part) for k, part in enumerate(parts)]
 
@@ -78,7 +79,7 @@ def _left(figures: dict[str, Any]) -> list[Any]:
         return []
     columns = [
         ("share of\nvariance", ["—" if x is None else f"{x:.1e}" for x in left["nmse"]]),
-        *((_HEADINGS.get(name, name), [f"{x:.0%}" for x in share]) for name, share in left["explained_by"].items()),
+        *((_HEADINGS.get(name, name), [percent(x) for x in share]) for name, share in left["explained_by"].items()),
     ]
     where = "the data" if figures["test_nmse"] is None else "held-out data"
     title = f"left of the torque on {where}: share of its variance, and of that left, by effect"
@@ -89,9 +90,10 @@ def _lines(figures: dict[str, Any]) -> list[str]:
     train, test = (figures[name] for name in ("train_nmse", "test_nmse"))
     shown, more = figures["unidentifiable"][:3], len(figures["unidentifiable"]) - 3
     return [
-        f"mean squared torque error over the variance of the torque: {_short(train)} on {figures['samples']} samples"
+        f"mean squared torque error over the variance of the torque: {_short(train)} on "
+        + counted(figures["samples"], "sample")
         + ("" if test is None else f", {_short(test)} on {figures['test_samples']} of trajectories held out"),
-        f"{figures['parameters']} numbers learned in {figures['seconds']:.1f} s "
+        f"{counted(figures['parameters'], 'number')} learned in {figures['seconds']:.1f} s "
         f"({_ENDED.get(figures['stopped'], figures['stopped'])})",
         *_masses(figures["details"]),
         *([f"to try next: {figures['next_try']}"] if figures["next_try"] else []),
@@ -114,4 +116,5 @@ def _masses(details: dict[str, Any]) -> list[str]:
         mass.append(f"masses add up to {found:.3g} kg, give or take {deviation:.2g} kg{beside}")
     elif found:
         mass.append("these torques do not show what the bodies weigh in all; those of the model are one choice of many")
-    return mass + ([f"{outliers} torques are far from all others, and count little"] if outliers else [])
+    far = counted(outliers or 0, "torque is", "torques are")
+    return mass + ([f"{far} far from all others, and count little"] if outliers else [])

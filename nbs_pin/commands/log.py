@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from nbs_pin.base.doors import BLANK, option
+from nbs_pin.base.shown import counted, joints_told
 from nbs_pin.base.units import column, units
 from nbs_pin.cli.log import Log
 from nbs_pin.cli.values import OptionError
@@ -55,8 +56,8 @@ def _verdict(options: Log, data: Dataset, found: LogDoubts | None) -> str:
     name = options.data[0].name if len(options.data) == 1 else f"{len(options.data)} logs"
     doubts = 0 if found is None else len(found.doubts)
     judged = "" if found is None else "; no doubts" if not doubts else f"; {doubts} doubt{'s' * (doubts > 1)}"
-    many = f"{data.trajectories} trajector{'y' if data.trajectories == 1 else 'ies'}"
-    return f"{name}: {_seconds(data):.4g} s of motion of {data.nv} joints in {many}{judged}"
+    many = counted(data.trajectories, "trajectory", "trajectories")
+    return f"{name}: {_seconds(data):.4g} s of motion of {joints_told(data.nv)} in {many}{judged}"
 
 
 def _facts(data: Dataset, found: LogDoubts | None) -> list[str]:

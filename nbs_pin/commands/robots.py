@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nbs_pin.base.shown import counted
 from nbs_pin.base.units import TURNING, column, units
 from nbs_pin.cli.robots import Robots
 from nbs_pin.commands.results import next_step
@@ -75,7 +76,8 @@ def _show(robot: Robot, console: Console) -> None:
     mass = sum(body.mass for body in robot.model.inertias)
     mounted = ", ".join(f"{x:.4g}" for x in robot.gravity_vector)
     lines = (
-        f"{robot.name}: {robot.nv} joints that move, {mass:.4g} kg of moving parts, gravity {mounted} m/s².",
+        f"{robot.name}: {counted(robot.nv, 'joint that moves', 'joints that move')}, {mass:.4g} kg of moving parts, "
+        f"gravity {mounted} m/s².",
         f"Frames (--frame): {', '.join(robot.frames)}.",
     )
     for line in lines:

@@ -13,6 +13,7 @@ from rich.text import Text
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.summaries import SUMMARY
+from nbs_pin.base.units import percent
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.certify import certify
 from nbs_pin.cli.exit_codes import STOPPED
@@ -177,7 +178,7 @@ def _tell(display: Display, robot: Robot, latest: _Latest, over: threading.Event
         load = np.abs(seen.tau / robot.effort_limit).max()
         display.update(
             Text(
-                f"t {seen.sample.t:8.3f} s  {seen.mode.name}  largest error {error:.2e}  effort {load:4.0%}  "
+                f"t {seen.sample.t:8.3f} s  {seen.mode.name}  largest error {error:.2e}  effort {percent(load):>5}  "
                 f"held {counters.held}  late {counters.late}  overruns {counters.overruns}"
             ),
             refresh=True,
@@ -195,7 +196,7 @@ def _print(console: Console, title: str, driven: Driven, found: dict[str, Any]) 
         *verdict.more,
         f"guard: {driven.mode.name}" + ("" if driven.report is None else f", {driven.report}"),
         f"held {found['held']}, late {found['late']}, overruns {found['overruns']}, saturated {found['saturated']}",
-        f"periods missed {found['missed_share']:.3%}; work p50 {found['work_p50_us']:.0f} µs, p99 "
+        f"periods missed {percent(found['missed_share'], 3)}; work p50 {found['work_p50_us']:.0f} µs, p99 "
         f"{found['work_p99_us']:.0f} µs, longest {found['work_max_us']:.0f} µs"
         + (", with real-time priority" if found["real_time_priority"] else ""),
     ]

@@ -8,6 +8,7 @@ from rich.text import Text
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.records import Run
+from nbs_pin.base.shown import joints_told
 from nbs_pin.base.units import column
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import OptionError, parse_disturbance, plain_numbers
@@ -92,7 +93,9 @@ def _start(options: Track, nv: int) -> list[float] | None:
     """The configuration to start from [rad], or None; raises OptionError if the number of joints differs."""
     start = None if options.start is None else plain_numbers(options.start)
     if start is not None and len(start) != nv:
-        raise OptionError(f"--start '{options.start}' has {len(start)} numbers for {nv} joints; give one per joint.")
+        raise OptionError(
+            f"--start '{options.start}' has {len(start)} numbers for {joints_told(nv)}; give one per joint."
+        )
     return start
 
 

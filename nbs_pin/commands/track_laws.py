@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from nbs_pin.base.summaries import RUN, SUMMARY, runs_of_laws, summary_in
-from nbs_pin.base.units import measured, several
+from nbs_pin.base.units import measured, percent, several
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.values import SAVED, OptionError
 from nbs_pin.commands.following import Tracked, not_simulated, track
@@ -100,6 +100,6 @@ def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     for name, of in found.items():
         late = " and ".join(measured(error, unit) for error, unit, _ in largest_late_errors(of))
         near = "never" if of["convergence_time_s"] is None else f"{of['convergence_time_s']:.3f} s"
-        cells = near, late, f"{of['peak_torque_Nm']:.4g}", f"{of['saturated_fraction']:.2%}"
+        cells = near, late, f"{of['peak_torque_Nm']:.4g}", percent(of["saturated_fraction"], 2)
         shown.add_row(Text(name), *cells)
     return shown

@@ -10,8 +10,9 @@ from rich.text import Text
 from nbs_pin.base.doors import typed_command
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
+from nbs_pin.base.shown import counted
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import by_quantity, several
+from nbs_pin.base.units import by_quantity, percent, several
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import plain_numbers
 from nbs_pin.commands.inputs import arm_of, law_of
@@ -196,14 +197,14 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     shown.add_row(
         Text(f"RMS torque [{figures['units']['torque']}]"), *(_number(on["rms_torque_Nm"], ".4g") for on in both)
     )
-    shown.add_row(Text("some joint at its limit"), *(_number(on["saturated_fraction"], ".2%") for on in both))
+    shown.add_row(Text("some joint at its limit"), *(_share(on["saturated_fraction"]) for on in both))
     ended = {"epochs": "all done", "patience": "no further progress", "interrupted": "interrupted"}
     verdict = verdict_of(figures, interrupted=interrupted)
     lines = (
         *verdict.more,
         f"converged means ‖error‖ < 0.1 {figures['units']['position']} to the end, "
-        f"over {figures['fresh_starts']} fresh starts",
-        f"{figures['epochs']} epochs in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
+        f"over {counted(figures['fresh_starts'], 'fresh start')}",
+        f"{counted(figures['epochs'], 'epoch')} in {figures['seconds']:.1f} s ({ended[figures['stopped']]}), "
         f"the best after {figures['best_epoch']}",
     )
     tell(console, f"{title}: {verdict.said}", lines, [shown], verbose=verbose)
@@ -211,3 +212,7 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
 
 def _number(value: float | None, form: str) -> str:
     return "not finite" if value is None else format(value, form)
+
+
+def _share(value: float | None) -> str:
+    return "not finite" if value is None else percent(value, 2)

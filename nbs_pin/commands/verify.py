@@ -4,6 +4,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from nbs_pin.base.shown import counted
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.verify import Verify
 from nbs_pin.commands.results import tell, titled
@@ -45,9 +46,8 @@ def _verdict(found: Verification) -> str:
     """One line: what was re-verified, or why the bounds are not confirmed."""
     count = {status: sum(check.status == status for check in found.checks) for status in _TITLES}
     if found.confirmed:
-        return (
-            f"PROVED, and re-verified in {count[VERIFIED]} checks, given the {count[TAKEN]} statements taken as stated"
-        )
+        checks, taken = counted(count[VERIFIED], "check"), counted(count[TAKEN], "statement")
+        return f"PROVED, and re-verified in {checks}, given the {taken} taken as stated"
     parts = [] if found.label == "PROVED" else [f"the file says {found.label}"]
     parts += [f"{count[FALSE]} not shown true"] * (count[FALSE] > 0) + [f"{count[OPEN]} not re-verified"] * (
         count[OPEN] > 0

@@ -14,6 +14,7 @@ from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, f
 from nbs_pin.base.claims import refuse
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
+from nbs_pin.base.shown import counted, joints_told
 from nbs_pin.base.storable import storable
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.lagrangian_network import CompiledTorque, LagrangianNetwork
@@ -63,7 +64,7 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         super().__init__()
         if robot is not None and robot.nv != network.nv:
             raise ArgumentError(
-                f"the network is for {network.nv} joints and {robot.name} has {robot.nv}; give its arm."
+                f"the network is for {joints_told(network.nv)} and {robot.name} has {robot.nv}; give its arm."
             )
         for name, x in network.named_parameters():
             if x.dtype != torch.float64:
@@ -78,7 +79,11 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         return self.network.nv
 
     def _facts(self) -> Iterable[str]:
-        return type(self.network).__name__, *super()._facts(), f"{sum(x.numel() for x in self.parameters())} numbers"
+        return (
+            type(self.network).__name__,
+            *super()._facts(),
+            counted(sum(x.numel() for x in self.parameters()), "number"),
+        )
 
     @property
     def robot(self) -> Robot | None:

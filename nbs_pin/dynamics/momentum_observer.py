@@ -14,7 +14,7 @@ from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import RUN, Run
-from nbs_pin.base.shown import Cells, Shown, joints_told, spread
+from nbs_pin.base.shown import Cells, Shown, counted, joints_told, spread
 from nbs_pin.base.units import JointUnits, measured, units_of
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size, has_viscous_and_coulomb_only
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -86,7 +86,7 @@ class ObservedTorques(Shown):
     """True for joints that slide."""
 
     def _facts(self) -> Iterable[str]:
-        return joints_told(len(self.joint_names)), f"{len(self.t)} rows", spread("gain", self.gain, "1/s")
+        return joints_told(len(self.joint_names)), counted(len(self.t), "row"), spread("gain", self.gain, "1/s")
 
     def _cells(self) -> Cells:
         each = zip(self.joint_names, self.largest, self.units, strict=True)
@@ -259,7 +259,9 @@ class MomentumObserver(Shown):
             ArgumentError: If the run has another number of joints.
         """
         if run.nv != self.nv:
-            raise ArgumentError(f"the run has {run.nv} joints and the observer {self.nv}; give one for the same arm.")
+            raise ArgumentError(
+                f"the run has {joints_told(run.nv)} and the observer {self.nv}; give one for the same arm."
+            )
         torque = self.estimate(run.t, run.q, run.v, run.tau)
         return ObservedTorques(run.t, torque, run.disturbance, run.joint_names, self.gain, run.slides)
 

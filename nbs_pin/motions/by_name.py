@@ -9,6 +9,7 @@ import numpy as np
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import joints_told
 from nbs_pin.motions.references import DesiredMotion, Sinusoid, paper_reference
 from nbs_pin.robots.robot import Robot
 
@@ -86,7 +87,7 @@ def _drawn(kind: str, numbers: str, robot: Robot, period: float, given: dict[str
     held = "hold" if is_held(robot, frame, given.get("orientation")) else "free"
     posture = given.setdefault("posture", tool_posture(robot, frame, orientation=held))
     if np.shape(posture) != (robot.nv,):
-        raise ArgumentError(f"the posture has {len(posture)} numbers for {robot.nv} joints; give one per joint.")
+        raise ArgumentError(f"the posture has {len(posture)} numbers for {joints_told(robot.nv)}; give one per joint.")
     begin = robot.pose(posture, frame)[:3, 3]
     if kind == "line":
         return _led(ToolPath.line(begin, values), robot, period, given)

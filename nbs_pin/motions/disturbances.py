@@ -15,6 +15,7 @@ from nbs_pin.base.arguments import PERIOD, SEED, check_fields, number
 from nbs_pin.base.arrays import Vectors
 from nbs_pin.base.checks import PerJoint, floats, per_joint
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import joints_told
 
 Disturbance: TypeAlias = Callable[[float, np.ndarray, np.ndarray], Any]
 """τ_d(t, q, v) [N·m], shape (..., n)."""
@@ -129,7 +130,9 @@ def _on_joints(torque: Any, q: Any) -> np.ndarray:
     shape = floats("the disturbance: q", q).shape
     count, joints = np.size(torque), shape[-1] if shape else 0
     if joints == 0 or count not in (1, joints):
-        raise ArgumentError(f"the disturbance has {count} torques for {joints} joints; give one, or one per joint.")
+        raise ArgumentError(
+            f"the disturbance has {count} torques for {joints_told(joints)}; give one, or one per joint."
+        )
     return np.zeros(shape) + torque
 
 

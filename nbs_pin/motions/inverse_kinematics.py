@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import counted, joints_told
 from nbs_pin.robots.robot import Robot
 
 _POWER = 12
@@ -104,8 +105,8 @@ class InverseKinematics:
                 f"let the orientation free ({option('orientation', 'free')})" if self.hold else "give another frame"
             )
             raise ArgumentError(
-                f"{joints} joints of {self.robot.name} move '{self.frame}', whose {what} varies in {max(rank, 1)} "
-                f"directions, so that it cannot follow a path; {remedy}."
+                f"{joints_told(joints)} of {self.robot.name} can move '{self.frame}', whose {what} varies in "
+                f"{counted(max(rank, 1), 'direction')}, so that it cannot follow a path; {remedy}."
             )
         basis = np.zeros((rank, 6))
         basis[:, :rows] = left[:, :rank].T

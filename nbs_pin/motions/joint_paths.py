@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline, PPoly, make_interp_spline
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.units import units
+from nbs_pin.base.units import percent, units
 from nbs_pin.motions.inverse_kinematics import InverseKinematics, pose_error
 from nbs_pin.motions.tool_paths import ToolPath
 
@@ -148,7 +148,7 @@ class _Followed:
     def place(self, s: float) -> str:
         """A point of the path, in words."""
         x, y, z = self.poses(s)[:3, 3]
-        at = f"the {self.path.name} at {self.path.travelled(s):.4g} m ({s:.1%} of it)"
+        at = f"the {self.path.name} at {self.path.travelled(s):.4g} m ({percent(s, 1)} of it)"
         return f"{at}, x, y, z = {x:.4g}, {y:.4g}, {z:.4g} m,"
 
     def check(self, s: Float[np.ndarray, " points"], q: Float[np.ndarray, "points n"]) -> None:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.units import units
+from nbs_pin.base.units import percent, units
 from nbs_pin.motions.joint_paths import JointPath
 from nbs_pin.motions.timings import Stepped
 from nbs_pin.robots.robot import Robot
@@ -138,7 +138,7 @@ def _check_weight(robot: Robot, joints: JointPath) -> None:
     k, i = np.argwhere(share >= 1.0)[0]
     (unit,) = units("torque", [robot.joints[i].prismatic])
     raise ArgumentError(
-        f"joint '{robot.joint_names[i]}' needs {weight[k, i]:.4g} {unit} to hold its weight at {s[k]:.1%} of the path, "
-        f"and {robot.effort_limit[i]:.4g} {unit} are left for the motion: {share[k, i] - 1.0:.1%} are missing; choose "
-        "another posture, raise the limit or give a smaller margin."
+        f"joint '{robot.joint_names[i]}' needs {weight[k, i]:.4g} {unit} to hold its weight at {percent(s[k], 1)} of "
+        f"the path, and {robot.effort_limit[i]:.4g} {unit} are left for the motion: {percent(share[k, i] - 1.0, 1)} "
+        "are missing; choose another posture, raise the limit or give a smaller margin."
     )

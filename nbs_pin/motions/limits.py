@@ -8,7 +8,7 @@ import numpy as np
 from nbs_pin.base.arguments import check_fields, checked, joints
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.units import units
+from nbs_pin.base.units import percent, units
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.robots.urdf import JointData
 
@@ -72,8 +72,8 @@ def _less(joint: JointData, position: float, velocity: float, effort: float) -> 
             (unit,) = units(what, [joint.prismatic])
             name = {"position": "half of the range", "velocity": "the velocity limit", "torque": "the effort limit"}
             raise ArgumentError(
-                f"the margin {margin:.4g} {unit} takes {margin / limit:.0%} of {name[what]} of joint '{joint.name}', "
-                f"{limit:.4g} {unit}; give a smaller one."
+                f"the margin {margin:.4g} {unit} takes {percent(margin / limit)} of {name[what]} of joint "
+                f"'{joint.name}', {limit:.4g} {unit}; give a smaller one."
             )
     changed: dict[str, Any] = {
         "lower": joint.lower + position,

@@ -16,7 +16,7 @@ from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
-from nbs_pin.base.shown import Shown, joints_told
+from nbs_pin.base.shown import Shown, counted, joints_told
 from nbs_pin.base.units import units
 from nbs_pin.motions.recordings import (
     Joints,
@@ -69,7 +69,7 @@ class Sampled(Shown):
         object.__setattr__(self, "q", q)
 
     def _facts(self) -> Iterable[str]:
-        return joints_told(self.q.shape[1]), f"{len(self.t)} samples", f"{self.t[0]:.4g} to {self.t[-1]:.4g} s"
+        return joints_told(self.q.shape[1]), counted(len(self.t), "sample"), f"{self.t[0]:.4g} to {self.t[-1]:.4g} s"
 
     @property
     def duration(self) -> float:

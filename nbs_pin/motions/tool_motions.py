@@ -14,7 +14,7 @@ from nbs_pin.base.doors import BLANK, argument, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import Shown
-from nbs_pin.base.units import units
+from nbs_pin.base.units import percent, units
 from nbs_pin.motions.inverse_kinematics import InverseKinematics
 from nbs_pin.motions.joint_paths import JointPath, joint_path
 from nbs_pin.motions.limits import Margins
@@ -199,8 +199,8 @@ def _check_speed(robot: Robot, motion: ToolMotion) -> None:
     slower = float(f"{1.01 * share[k, i] * motion.duration * peak:.3g}")
     raise ArgumentError(
         f"the {motion.path.name} needs the velocity {v[k, i]:.4g} {unit} of joint '{robot.joint_names[i]}' at t = "
-        f"{t[k]:.4g} s, {share[k, i] - 1.0:.0%} above its limit {robot.velocity_limit[i]:.4g} {unit}; give at least "
-        f"{option('duration', slower)} s."
+        f"{t[k]:.4g} s, {percent(share[k, i] - 1.0)} above its limit {robot.velocity_limit[i]:.4g} {unit}; give at "
+        f"least {option('duration', slower)} s."
     )
 
 

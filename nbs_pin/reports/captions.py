@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from nbs_pin.base.records import Run
+from nbs_pin.base.shown import joints_told
 
 _NAMES = {
     "PD": "PD control",
@@ -38,7 +39,7 @@ def law_in_words(run: Run) -> str:
 
 def arm_in_words(run: Run) -> str:
     """The arm of a run, without the folder of its file."""
-    return re.sub(r"\.(urdf|xacro|xml)$", "", run.robot.rsplit("/", 1)[-1]) or f"{run.nv} joints"
+    return re.sub(r"\.(urdf|xacro|xml)$", "", run.robot.rsplit("/", 1)[-1]) or joints_told(run.nv)
 
 
 def settings_in_words(run: Run) -> list[str]:

@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.base.records import Run
-from nbs_pin.base.units import several
+from nbs_pin.base.shown import counted
+from nbs_pin.base.units import percent, several
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, Heading, picture
 from nbs_pin.simulation.metrics import PAPER_THRESHOLD, squared_error
 
@@ -60,7 +61,7 @@ def _draw_costs(
     for name, values, colour in (("training", history, ACTUAL), ("held out", held_out, REFERENCE)):
         axes.plot(values, color=colour, label=name)
     chosen, colour = (held_out, REFERENCE) if held_out.size else (history, ACTUAL)
-    lowered = f"best, {1.0 - chosen[best] / chosen[0]:.0%} lower"
+    lowered = f"best, {percent(1.0 - chosen[best] / chosen[0])} lower"
     axes.plot(best, chosen[best], "o", color=colour, markersize=5, clip_on=False, label=lowered)
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(MaxNLocator(6))
@@ -86,7 +87,9 @@ def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
     axes.annotate("converged", (1.0, mark), xycoords=("axes fraction", "data"), ha="right", va="bottom", color=ERROR)
     axes.set_yscale("log")
     axes.set(xlabel="time [s]", xlim=(0.0, run.t[-1]))
-    axes.set_title(f"‖error‖ of {size.shape[1]} fresh motions [{several(of.position for of in run.units)}]", loc="left")
+    axes.set_title(
+        f"‖error‖ of {counted(size.shape[1], 'fresh motion')} [{several(of.position for of in run.units)}]", loc="left"
+    )
     axes.legend(frameon=False)
 
 

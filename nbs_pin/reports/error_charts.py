@@ -16,7 +16,8 @@ from nbs_pin.accuracy.compare import Growth, ModelErrors
 from nbs_pin.accuracy.energy_drift import FreeMotion
 from nbs_pin.accuracy.error_maps import ErrorMap
 from nbs_pin.accuracy.mismatch import Mismatch
-from nbs_pin.base.units import TURNING, JointUnits, several
+from nbs_pin.base.shown import counted, weighed
+from nbs_pin.base.units import TURNING, JointUnits, percent, several
 from nbs_pin.reports.plotting import (
     ACTUAL,
     ERROR,
@@ -246,7 +247,7 @@ def _draw_samples(axes: Axes, errors: ModelErrors) -> None:
     axes.set_xscale("log")
     _log_ticks(axes.xaxis, *axes.get_xlim())
     axes.set(ylim=(0.0, 1.02), xlabel="relative error (dot: RMS over all)")
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value)))
     axes.set_title("samples with a smaller error", loc="left", color=INK)
     axes.legend(frameon=False)
 
@@ -288,11 +289,13 @@ def _draw_mismatch(axes: Axes, mismatch: Mismatch, unit: str) -> None:
     axes.set_title(f"closed loop: mismatch ‖δ‖ [{unit}]", loc="left", color=INK)
     axes.legend(frameon=False, ncols=3, loc="upper left", bbox_to_anchor=(0.0, 0.87), handlelength=1.4)
     if mismatch.violation < 1.0:
-        sure = f"a further start exceeds it: ≤ {mismatch.violation:.1%} (confidence 1 − {number(mismatch.doubt)})"
+        sure = (
+            f"a further start exceeds it: ≤ {percent(mismatch.violation, 1)} (confidence 1 − {number(mismatch.doubt)})"
+        )
     else:
         sure = "too few starts to bound further ones"
-    told = f"‖δ‖ ≤ {number(mismatch.a)} ‖q‖ + {number(mismatch.b)} ‖v‖ + {number(mismatch.c)}"
-    note = f"{told}   ({mismatch.trajectories} starts)\n{sure}"
+    told = weighed({"‖q‖": number(mismatch.a), "‖v‖": number(mismatch.b)}, number(mismatch.c))
+    note = f"‖δ‖ ≤ {told}   ({counted(mismatch.trajectories, 'start')})\n{sure}"
     axes.annotate(note, (0.02, 0.985), xycoords="axes fraction", va="top", fontsize=7.8, color=INK)
 
 

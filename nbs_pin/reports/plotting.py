@@ -24,6 +24,8 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.files import write_whole
 from nbs_pin.base.picture_kinds import is_svg_wanted, svg_beside
 from nbs_pin.base.records import RUN, Run
+from nbs_pin.base.shown import joints_told
+from nbs_pin.base.units import percent
 from nbs_pin.dynamics.momentum_observer import OBSERVED, ObservedTorques
 from nbs_pin.reports.captions import arm_in_words, law_in_words, settings_in_words
 from nbs_pin.reports.verdicts import BAD, GOOD, WARNING, Verdict, verdict_of
@@ -160,7 +162,7 @@ def plot_tracking(
     """
     one = one_start(run, start)
     if robot is not None and robot.nv != run.nv:
-        raise ArgumentError(f"the run has {run.nv} joints and {robot!r} {robot.nv}; give the robot of the run.")
+        raise ArgumentError(f"the run has {joints_told(run.nv)} and {robot!r} {robot.nv}; give the robot of the run.")
     q, v, q_ref, tau = one.q, one.v, one.q_ref, one.tau
     outside = None if external is None else _observed(external, run, start)
     error = np.abs(configuration_difference(q, q_ref, run.continuous))
@@ -258,7 +260,7 @@ def _draw_stops(axes: Axes, t: Float[np.ndarray, " rows"], q: Float[np.ndarray, 
     for flags, color, what in ((outside, ERROR, "outside its range"), (fast, FAST, "above its velocity limit")):
         bars = [(t[begin], t[min(end, len(t) - 1)] - t[begin]) for begin, end in stretches(flags)]
         axes.broken_barh(bars, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=color, alpha=0.18, linewidth=0)
-        said += [f"{what} {flags.mean():.1%} of the time"] if flags.any() else []
+        said += [f"{what} {percent(flags.mean(), 1)} of the time"] if flags.any() else []
     axes.annotate("; ".join(said), (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom", fontsize=7,
                   color=ERROR)  # fmt: skip
 
@@ -303,7 +305,7 @@ def _draw_torque(axes: Axes, run: Run, joint: int, cut: Bool[np.ndarray, " rows"
     axes.set_ylim(low, high)
     axes.yaxis.set_major_locator(MaxNLocator(4))
     peak = np.nanmax(np.abs(tau), initial=0.0)
-    note = f"limit ±{limit:g} (peak {peak / limit:.0%})" if np.isfinite(limit) else "no limit"
+    note = f"limit ±{limit:g} (peak {percent(peak / limit)})" if np.isfinite(limit) else "no limit"
     axes.annotate(note, (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom", fontsize=7, color=NOTE)
 
 
@@ -321,7 +323,9 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float, observed: boo
     handles = [
         figure.axes[0].plot([], [], color=ACTUAL, label="actual")[0],
         figure.axes[0].plot([], [], **_WIDE, label="reference")[0],
-        figure.axes[2].axvspan(np.nan, np.nan, color=SATURATED, alpha=0.6, label=f"saturated ({cut:.2%} of the time)"),
+        figure.axes[2].axvspan(
+            np.nan, np.nan, color=SATURATED, alpha=0.6, label=f"saturated ({percent(cut, 2)} of the time)"
+        ),
     ]
     if run.disturbance.any():
         handles.append(figure.axes[2].plot([], [], color=VIOLET, label="disturbance")[0])

@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from nbs_pin.base.units import SLIDING, TURNING, by_quantity, measured, several
+from nbs_pin.base.units import SLIDING, TURNING, by_quantity, measured, percent, several
 
 _UNITS = {
     "rad_per_s2": "acceleration",
@@ -240,4 +240,4 @@ def _told(value: float | None, unit: str) -> str:
 
 
 def _share(value: float | None) -> str:
-    return "none" if value is None else f"{value:.2%}"
+    return "none" if value is None else percent(value, 2)

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nbs_pin.base.doors import option
-from nbs_pin.base.units import measured, several
+from nbs_pin.base.shown import counted
+from nbs_pin.base.units import measured, percent, several
 from nbs_pin.simulation.run_figures import LIGHT, load_of
 
 GOOD, WARNING, BAD, NOTE = "good", "warning", "bad", "note"
@@ -110,11 +111,15 @@ def _tracking(figures: Mapping[str, Any]) -> Verdict:
         ]
         more.append(f"'{tool['frame']}' along the {tool['path']} is off in {'; '.join(errors)}")
     cut, late_cut = (float(np.mean(figures[name])) for name in ("saturated_fraction", "saturated_fraction_late"))
-    late = f"{late_cut:.2%} after {figures['late_after_s']:g} s"
-    more.append(f"some joint was at its effort limit {cut:.2%} of the time, {late}" if cut else "no torque was cut")
+    late = f"{percent(late_cut, 2)} after {figures['late_after_s']:g} s"
+    more.append(
+        f"some joint was at its effort limit {percent(cut, 2)} of the time, {late}" if cut else "no torque was cut"
+    )
     excesses = map(_number, figures.get("outside_position_range_rad", [0.0] * len(joints)))
     beyond = zip(joints, excesses, units, strict=True)
-    left = [f"{joint} left its range by {measured(excess, unit)}" for joint, excess, unit in beyond if excess > 0.0]
+    left = [
+        f"joint {joint} left its range by {measured(excess, unit)}" for joint, excess, unit in beyond if excess > 0.0
+    ]
     return Verdict(WARNING if level == GOOD and (left or late_cut) else level, said, (*more, *left))
 
 
@@ -150,7 +155,11 @@ def _convergence(figures: Mapping[str, Any]) -> tuple[str, str]:
         many = f"{never} of {times.size} starts did not converge" if times.size > 1 else "not converged"
         return BAD, f"{many}: ‖error‖ did not stay below {bound} by the end at {duration:g} s"
     if late.size:
-        many = f"{late.size} of {times.size} starts have not shown" if times.size > 1 else "not shown"
+        many = (
+            f"{late.size} of {times.size} starts {'has' if late.size == 1 else 'have'} not shown"
+            if times.size > 1
+            else "not shown"
+        )
         return WARNING, f"{many} to converge: ‖error‖ is below {bound} only since {late.max():.3g} s of {duration:g} s"
     return GOOD, f"converged: from {times.max():.3g} s on, ‖error‖ stays below {bound}"
 
@@ -162,11 +171,11 @@ def _laws(figures: Mapping[str, Any]) -> Verdict:
     lost = [name for name in found if name not in off]
     loads = _loads(next(iter(found.values())))
     if not off:
-        return Verdict(BAD, f"none of {', '.join(found)} converged in the first {_IN_TIME:.0%} of the time", loads)
+        return Verdict(BAD, f"none of {', '.join(found)} converged in the first {percent(_IN_TIME)} of the time", loads)
     told = {name: " and ".join(measured(error, unit) for error, unit, _ in of) for name, of in off.items()}
     least, *others = sorted(off, key=lambda name: off[name])
-    said = f"{least} is off the least, {told[least]} RMS in the last 30 % at its worst joint"
-    more = (f"{', '.join(lost)} did not converge in the first {_IN_TIME:.0%} of the time",) if lost else ()
+    said = f"of the laws, {least} is off the least, {told[least]} RMS in the last 30 % at its worst joint"
+    more = (f"not converged in the first {percent(_IN_TIME)} of the time: {', '.join(lost)}",) if lost else ()
     said = "; ".join([said, *(f"{name} {told[name]}" for name in others)])
     return Verdict(WARNING if lost else GOOD, said, (*more, *loads))
 
@@ -261,7 +270,7 @@ def _attacked(attack: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
     """How near the worst motion that was found came to the bound, and why it is beyond it."""
     worst, bound = attack["error_rad"], found["error_rad"]
     how = f"{attack['found_by']}, {attack['duration_s']:.3g} s at {1e3 * attack['period_s']:g} ms"
-    share = f", {worst / bound:.0%} of the bound" if bound else ""
+    share = f", {percent(worst / bound)} of the bound" if bound else ""
     thorough = "" if attack["thorough"] else f"; waves alone, {option('attack', True)} searches further"
     said = [f"worst found by {how}: {measured(worst, several(found['units']))}{share}{thorough}"]
     exceeded = f"BOUND EXCEEDED; the check of this motion against the certificate: {attack['verdict']}"
@@ -294,9 +303,9 @@ def _trained(figures: Mapping[str, Any]) -> Verdict:
     if share is None:
         cost = "the held-out cost is not finite"
     else:
-        cost = f"held-out cost {'lowered' if share >= 0.0 else 'raised'} by {abs(share):.1%}"
+        cost = f"held-out cost {'lowered' if share >= 0.0 else 'raised'} by {percent(abs(share), 1)}"
     if after is None:
-        then = f"half of the fresh starts or more do not converge in the first {_IN_TIME:.0%} of {duration:g} s"
+        then = f"half of the fresh starts or more do not converge in the first {percent(_IN_TIME)} of {duration:g} s"
         then += "" if before is None else f", where half had converged after {before:.3f} s before training"
         return Verdict(WARNING if before is None and share is not None and share > 0.0 else BAD, f"{cost}; {then}")
     earlier = "fewer did at all" if before is None else f"{before:.3f} s"
@@ -314,25 +323,30 @@ def _compared(figures: Mapping[str, Any]) -> Verdict:
 def _collected(figures: Mapping[str, Any]) -> Verdict:
     covered, count = figures["covered_range_fraction"], figures["trajectories"]
     least = min(range(len(covered)), key=covered.__getitem__)
-    said = f"{figures['samples']} samples of {count} {'trajectory' if count == 1 else 'trajectories'}"
-    said += f"; every joint covers at least {covered[least]:.0%} of its range, {figures['joints'][least]} least"
-    limited = f"at a torque limit in at most {max(figures['at_torque_limit_fraction']):.1%} of the samples of a joint"
+    said = f"{counted(figures['samples'], 'sample')} of {counted(count, 'trajectory', 'trajectories')}"
+    said += f"; every joint covers at least {percent(covered[least])} of its range, {figures['joints'][least]} least"
+    limited = (
+        f"at a torque limit in at most {percent(max(figures['at_torque_limit_fraction']), 1)} of the samples of a joint"
+    )
     return Verdict(GOOD if covered[least] >= 0.5 else WARNING, said, (limited,))
 
 
 def _exciting(figures: Mapping[str, Any]) -> Verdict:
     """How well the parameters are excited, and what that takes of the arm."""
     condition, joints = _number(figures["condition_number"]), figures["joints"]
-    said = f"condition number {condition:.3g} of {figures['unknowns']} unknowns, in {figures['duration_s']:g} s"
+    said = (
+        f"condition number {condition:.3g} of {counted(figures['unknowns'], 'unknown')}, in {figures['duration_s']:g} s"
+    )
     peaks = []
     for what in ("velocity", "torque"):
         shares = [_number(share) for share in figures[f"peak_{what}_fraction"]]
         most = max(range(len(joints)), key=shares.__getitem__)
-        peaks.append(f"{shares[most]:.0%} of the {what} limit of {joints[most]}")
-    more = [f"at most it takes {' and '.join(peaks)}"]
+        if shares[most] > 0.0:  # of an arm without limits of that kind nothing is taken
+            peaks.append(f"{percent(shares[most])} of the {what} limit of {joints[most]}")
+    more = [f"at most it takes {' and '.join(peaks)}"] if peaks else []
     if figures["nearest"]:
         first, second = figures["nearest"]
-        more.append(f"{first} and {second} come nearest to each other, {measured(figures['clearance_m'], 'm')}")
+        more.append(f"links {first} and {second} come nearest to each other, {measured(figures['clearance_m'], 'm')}")
     return Verdict(GOOD if condition < _ILL else WARNING, said, tuple(more))
 
 

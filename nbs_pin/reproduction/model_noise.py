@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from nbs_pin.base.progress import tracked
+from nbs_pin.base.units import percent
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.excitation import torque_limits
@@ -73,14 +74,14 @@ def noise_section(found: Noisy, folder: Path) -> Section:
     parts = {f"{PARTS[name]}: {model}": (name, model) for name, model in product(PARTS, ("identified", "chain"))}
     seconds = {"seconds: chain": ("seconds", "chain"), MLP: ("seconds", MLP)}
     text = f"""
-Excited trajectories of arms with friction (Coulomb {COULOMB:.0%} of each joint's largest torque, viscous {VISCOUS:.0%}
-of it at 1 rad/s), encoders of 2^-16 of a turn, from which v and q̈ come by differentiation, and {NOISE.torque:g} N·m of
-torque noise. Friction is learned with every model. Judged without noise, on fresh excited trajectories and on uniform
-states, by the torque that the motors need, friction included: RMS error ÷ deviation, its root mean square over the
-joints. `identified` knows the geometry; `chain` the order of the joints; `mlp` only that q is an angle ({MLP}: tanh
-layers on sin q, cos q, v, q̈ and the shape of friction). Medians of the seeds {seeds[0]} to {seeds[-1]}. On
-trajectories even the exact model with the exact friction is left with {floors}: in MuJoCo a joint sticks
-before it reverses, with a torque that is not a function of its motion.
+Excited trajectories of arms with friction (Coulomb {percent(COULOMB)} of each joint's largest torque, viscous
+{percent(VISCOUS)} of it at 1 rad/s), encoders of 2^-16 of a turn, from which v and q̈ come by differentiation, and
+{NOISE.torque:g} N·m of torque noise. Friction is learned with every model. Judged without noise, on fresh excited
+trajectories and on uniform states, by the torque that the motors need, friction included: RMS error ÷ deviation, its
+root mean square over the joints. `identified` knows the geometry; `chain` the order of the joints; `mlp` only that q
+is an angle ({MLP}: tanh layers on sin q, cos q, v, q̈ and the shape of friction). Medians of the seeds
+{seeds[0]} to {seeds[-1]}. On trajectories even the exact model with the exact friction is left with {floors}: in
+MuJoCo a joint sticks before it reverses, with a torque that is not a function of its motion.
 
 {_table(medians, torques)}
 
@@ -148,7 +149,7 @@ def _order(medians: _Medians) -> str:
         others = "; ".join(f"{case}: {' < '.join(order)}" for case, order in rankings.items() if order != usual)
         said = f"except {others}" if others else "everywhere"
         told.append(f"Errors of {label} are in the order {' < '.join(usual)} {said}.")
-    return "\n".join([*told, f"Differences below {_TIE:.0%} do not count."])
+    return "\n".join([*told, f"Differences below {percent(_TIE)} do not count."])
 
 
 def _cost_of_geometry(medians: _Medians) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from nbs_pin.base.progress import tracked
+from nbs_pin.base.units import percent
 from nbs_pin.identification.collect import collect
 from nbs_pin.reports.markdown import Section, markdown_table, short
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, TORQUE, picture
@@ -123,5 +124,5 @@ def _lines(trials: Sequence[Trial]) -> list[list[str]]:
         own = chosen(trials, model=model, samples=size)
         share, seconds = column(own, "indefinite").max(), np.median(column(own, "seconds"))
         errors = [spread(column(own, name)) for name in ERRORS]
-        lines.append([f"{model} ({WHAT[model]}), {size:,} samples", *errors, f"{share:.1%}", f"{seconds:.3g}"])
+        lines.append([f"{model} ({WHAT[model]}), {size:,} samples", *errors, percent(share, 1), f"{seconds:.3g}"])
     return lines

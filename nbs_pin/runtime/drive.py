@@ -18,6 +18,7 @@ from nbs_pin.base.arguments import DURATION, a, checked, flag, function, maybe
 from nbs_pin.base.checks import PerJoint, told, whole
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference, Run
+from nbs_pin.base.shown import joints_told
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.dynamics.momentum_observer import OBSERVER, MomentumObserver
@@ -143,7 +144,7 @@ def drive(
         (True, True)
     """
     if arm.nv != robot.nv:
-        raise ArgumentError(f"the arm has {arm.nv} joints and {robot.name} {robot.nv}; give its own description.")
+        raise ArgumentError(f"the arm has {joints_told(arm.nv)} and {robot.name} {robot.nv}; give its own description.")
     guard = guard_for(arm, robot) if guard is None else guard
     if guard.compensated != arm.compensated or abs(guard.period - arm.period) > 1e-9:
         raise ArgumentError("the guard is for another period, or another treatment of gravity; build it for the arm.")

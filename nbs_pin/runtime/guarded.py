@@ -14,6 +14,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import vector_of
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import joints_told
 from nbs_pin.base.units import units_of
 from nbs_pin.controllers.controller import CONTROLLER, Controller, MemorylessController
 from nbs_pin.dynamics.momentum_observer import OBSERVER, MomentumObserver
@@ -158,13 +159,15 @@ class Guarded:
         self.guard = Guard.for_robot(robot) if guard is None else guard
         if not law.nv == robot.nv == self.guard.nv:
             raise ArgumentError(
-                f"the law has {law.nv} joints, the guard {self.guard.nv} and {robot.name} {robot.nv}; build all for one"
-                " arm."
+                f"the law has {joints_told(law.nv)}, the guard {self.guard.nv} and {robot.name} {robot.nv}; build all "
+                "for one arm."
             )
         if observer is None and np.isfinite(self.guard.external_limit).any():
             observer = MomentumObserver.for_robot(robot)
         if observer is not None and observer.nv != robot.nv:
-            raise ArgumentError(f"the observer has {observer.nv} joints and {robot.name} {robot.nv}; give one for it.")
+            raise ArgumentError(
+                f"the observer has {joints_told(observer.nv)} and {robot.name} {robot.nv}; give one for it."
+            )
         self._outside = None if observer is None else Outside(observer, self.guard)
         compiled = law.compile()
         self.law = compiled if isinstance(compiled, Controller) else law

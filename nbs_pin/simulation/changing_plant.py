@@ -10,6 +10,7 @@ from nbs_pin.base.arguments import DURATION, checked, many, number
 from nbs_pin.base.arrays import Vectors
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.shown import joints_told
 from nbs_pin.robots.joint_differences import difference_of_joints
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.plant import PLANT, Plant
@@ -117,7 +118,7 @@ def _check_nested(plant: Plant, what: str) -> None:
 def _check_joints(first: Plant, t: float, plant: Plant) -> None:
     """Raise ArgumentError unless the arm of the plant from time t on has the joints of the first one's."""
     if plant.nv != first.nv:
-        problem = f"it has {plant.nv} joints and the first plant {first.nv}"
+        problem = f"it has {joints_told(plant.nv)} and the first plant {first.nv}"
     elif plant.robot is None or first.robot is None:
         return
     else:

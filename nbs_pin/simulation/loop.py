@@ -10,6 +10,7 @@ from nbs_pin.base.arguments import MOST_PERIODS, MOST_STEPS
 from nbs_pin.base.checks import LARGEST, SMALLEST, floats, is_usual, told, whole
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import ROW_ARRAYS, Reference, Run
+from nbs_pin.base.shown import joints_told
 from nbs_pin.motions.references import DesiredMotion, at_times
 from nbs_pin.simulation.plant import Plant
 
@@ -67,7 +68,9 @@ class Loop:
         It has at most `most` periods (None: `MOST_PERIODS`), each of at most `MOST_STEPS` plant steps.
         """
         if nv != plant.nv:
-            raise ArgumentError(f"the controller has {nv} joints and the plant {plant.nv}; build both for one arm.")
+            raise ArgumentError(
+                f"the controller has {joints_told(nv)} and the plant {plant.nv}; build both for one arm."
+            )
         return cls(
             plant=plant,
             period=period,

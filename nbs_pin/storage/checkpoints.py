@@ -22,6 +22,7 @@ from nbs_pin.base.arguments import a, checked, mapping, maybe, readable, writabl
 from nbs_pin.base.doors import as_loaded, own_arm
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError, RobotError
 from nbs_pin.base.records import Reference
+from nbs_pin.base.shown import joints_told
 from nbs_pin.base.versions import versions
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.provider import DynamicsProvider
@@ -162,7 +163,9 @@ def read_checkpoint(path: str | Path, robot: Robot | None = None) -> Checkpoint:
     with _refusing(path):
         controller = rebuild(settings, _tensors(path, _CONTROLLER, entries), arm)
     if robot is not None and robot.nv != controller.nv:
-        raise ArgumentError(f"{path} is for {controller.nv} joints and {robot.name} has {robot.nv}; give its own arm.")
+        raise ArgumentError(
+            f"{path} is for {joints_told(controller.nv)} and {robot.name} has {robot.nv}; give its own arm."
+        )
     _check_finite(path, controller)
     if f"{_TRAINING}.json" not in entries:
         return Checkpoint(controller, None)
