@@ -8,6 +8,7 @@ import pytest
 import nbs_pin as nbs
 from nbs_pin.base.shown import counted, weighed
 from nbs_pin.base.units import percent
+from nbs_pin.reports.report_tables import numbers_table
 from nbs_pin.reports.verdicts import verdict_of
 from tests.test_report import moving_run, tracking_figures
 
@@ -63,3 +64,10 @@ def test_a_sentence_does_not_change_the_names_of_a_file():
         assert "elbow_0" in text
         assert "elbow_1" in text
         assert "Elbow" not in text
+
+
+def test_a_table_does_not_change_the_names_of_a_file():
+    estimates = {"load at panda_hand_tcp m [kg]": 1.0, "elbow_rms viscous friction [N·m·s/rad]": 2.0}
+    shown = numbers_table({"a": {"peak_torque_rate_Nm_per_s": 3.0, "estimates": estimates}})
+    assert "peak torque rate" in shown
+    assert all(name in shown for name in estimates)

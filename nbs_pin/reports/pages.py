@@ -41,6 +41,17 @@ def _viewer() -> dict[str, str]:
     return {name: (folder / name).read_text(encoding="utf-8") for name in ("main.min.js", "main.min.js.LICENSE.txt")}
 
 
+def written(text: str) -> str:
+    """A text as HTML, in which no number such as 1e-7 is broken at its minus."""
+    return unbroken(html.escape(text))
+
+
+def unbroken(content: str) -> str:
+    """HTML without scripts, with the same done to the numbers between its tags."""
+    keep = r'<span class="number">\g<0></span>'
+    return re.sub(r"[^<>]+(?=<|$)", lambda between: re.sub(r"[-−+]?\d[\d.]*[eE][-+−]\d+", keep, between[0]), content)
+
+
 def encoded(array: np.ndarray, dtype: type[np.floating[Any]] = np.float32) -> str:
     """The numbers as base64, little-endian, for a typed array of the page."""
     return base64.b64encode(np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()

@@ -16,7 +16,7 @@ from nbs_pin.base.files import write_whole
 from nbs_pin.base.records import Run
 from nbs_pin.base.summaries import RUN, SUMMARY, runs_of_laws, summary_in
 from nbs_pin.reports.captions import arm_in_words, law_in_words, settings_in_words
-from nbs_pin.reports.pages import page
+from nbs_pin.reports.pages import page, unbroken, written
 from nbs_pin.reports.replay import shown_run
 from nbs_pin.reports.report_tables import (
     bench_table,
@@ -146,9 +146,9 @@ def _arm(result: _Result) -> str:
 def _card(result: _Result) -> str:
     runs = list(result.runs.values())
     facts = [*dict.fromkeys(map(law_in_words, runs)), *(settings_in_words(runs[0]) if runs else [])]
-    said = html.escape(" · ".join(facts))
+    said = written(" · ".join(facts))
     name = html.escape(result.label)
-    lines = f'<h2>{name}</h2><p>{html.escape(result.verdict.text)}</p><p class="soft">{said}</p>'
+    lines = f'<h2>{name}</h2><p>{written(result.verdict.text)}</p><p class="soft">{said}</p>'
     return f'<section class="card {result.verdict.level}">{lines}</section>'
 
 
@@ -163,7 +163,7 @@ def _details(result: _Result, missing: Mapping[str, str]) -> str:
     parts = [f"<h2>{html.escape(result.label)}</h2>"]
     for name in lost:
         whose = f"{html.escape(name)}: " if len(result.runs) > 1 else ""
-        why = f"The arm is not drawn and the run has no charts: {html.escape(missing[name])}"
+        why = f"The arm is not drawn and the run has no charts: {written(missing[name])}"
         parts.append(f'<p class="warning">{whose}{why}</p>')
     if "certificate" in figures:
         parts.append(certificate_tables(figures))
@@ -204,7 +204,7 @@ def _pictures(folder: Path, left_out: Sequence[str]) -> dict[str, str]:
 
 def _written(page: Path, pictures: dict[str, str]) -> str:
     """A page in Markdown, with those of the pictures that it shows, which are taken out of them."""
-    text = MarkdownIt("js-default", {"html": False}).render(page.read_text(encoding="utf-8"))
+    text = unbroken(MarkdownIt("js-default", {"html": False}).render(page.read_text(encoding="utf-8")))
     return re.sub(r'<img src="([\w.-]+)"[^>]*>', lambda shown: pictures.pop(shown[1], ""), text)
 
 

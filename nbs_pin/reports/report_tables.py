@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from nbs_pin.base.units import SLIDING, TURNING, by_quantity, measured, percent, several
+from nbs_pin.reports.pages import written
 
 _UNITS = {
     "rad_per_s2": "acceleration",
@@ -148,14 +149,14 @@ def bench_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """An HTML table that scrolls sideways on a phone, numbers to the right; all texts are escaped."""
-    head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
+    head = "".join(f"<th>{written(text)}</th>" for text in heads)
     body = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _cell(text: str) -> str:
     is_number = re.match(r"[-−]?[0-9]|none$|$", text)
-    return f"<td{'' if is_number else ' class=text'}>{html.escape(text)}</td>"
+    return f"<td{'' if is_number else ' class=text'}>{written(text)}</td>"
 
 
 def folded(title: str, content: str) -> str:
@@ -229,7 +230,9 @@ def _scalar(name: str, value: float | str | None, whole: Mapping[str, Any]) -> s
 
 
 def _split(name: str) -> tuple[str, str]:
-    """The words of a figure's name, and the unit at its end."""
+    """The words of a figure's name, and the unit at its end; what is words already has names of a file in it."""
+    if " " in name:
+        return name, ""
     end = next((end for end in _ENDS if name.endswith(f"_{end}")), "")
     words = name.removesuffix(f"_{end}") if end else name
     return re.sub(r"\brms\b", "RMS", words.replace("_", " ")), end

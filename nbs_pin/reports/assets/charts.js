@@ -226,8 +226,6 @@ function createCharts(root, runs, clock, shown, height) {
   function choice(what, options, chosenOne, choose) {
     const select = document.createElement("select");
     options.forEach((text, k) => select.add(new Option(text, k, k === chosenOne, k === chosenOne)));
-    select.style.height = "22px";
-    select.style.maxWidth = "70vw";
     select.setAttribute("aria-label", what);
     select.onchange = () => { choose(Number(select.value)); draw(); };
     return select;
