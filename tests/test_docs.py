@@ -15,12 +15,14 @@ import pytest
 import nbs_pin
 from nbs_pin import cli
 from nbs_pin.base import exceptions
-from tests.pages import blocks, commands, run_page, typed_by_hand
+from tests.pages import blocks, commands, lines, run_page, typed_by_hand
 from tools.pictures import CHARTS, RUNS
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 WITH_CODE = [page for page in PAGES if {"sh", "python"} & {kind for kind, *_ in blocks(page)}]
+UNNAMED = {"learn.md", "adapt.md"}
+"""Pages that still use the folders that commands choose."""
 SHORT = [ROOT / "README.md", ROOT / "docs" / "index.md"]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 THEORY = ROOT / "docs" / "theory.md"
@@ -173,6 +175,30 @@ def test_what_no_test_can_type_names_what_exists():
         if words[0] == "pip":
             named = re.search(r"\[(.*)\]", words[-1])
             assert named is None or set(named[1].split(",")) <= extras, (page, words)
+
+
+def test_every_extra_is_in_the_table_of_the_readme():
+    told = re.findall(r"^\| `(\w+)` \|", (ROOT / "README.md").read_text(), flags=re.M)
+    assert set(told) == set(PROJECT["optional-dependencies"])
+
+
+def test_every_how_to_is_linked_from_the_first_page_and_the_list():
+    pages = {page.name for page in (ROOT / "docs" / "howto").glob("*.md")} - {"index.md"}
+    for listing in (ROOT / "docs" / "index.md", ROOT / "docs" / "howto" / "index.md"):
+        assert pages <= {Path(target).name for _, target in links(listing)}, listing
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in UNNAMED], ids=lambda page: page.name)
+def test_results_that_a_page_uses_again_have_a_folder_that_it_names(page):
+    """Without --out they go to another folder if there are results of other settings, and the page reads old ones."""
+    named = set()
+    for kind, _, text in blocks(page):
+        words = [word for line in lines(text) for word in line] if kind == "sh" else re.findall(r'"(out/[^"]+)"', text)
+        for before, word in pairwise(["", *words]):
+            if before == "--out":
+                named.add(word)
+            elif word.startswith("out/") and kind in ("sh", "python"):
+                assert any(f"{word}/".startswith(f"{folder}/") for folder in named), (page, word)
 
 
 EXAMPLES = sorted(file for file in ROOT.glob("nbs_pin/**/*.py") if ">>> " in file.read_text())

@@ -1,6 +1,5 @@
 """Reports: what is on the page of the results of commands, and what a browser makes of it."""
 
-import html
 import json
 import re
 from contextlib import closing
@@ -21,6 +20,7 @@ from nbs_pin.commands.reproduce import PARTS
 from nbs_pin.reports import plotting
 from nbs_pin.reports.captions import settings_in_words
 from nbs_pin.reports.markdown import Section
+from nbs_pin.reports.pages import written
 from nbs_pin.reports.report import report
 from nbs_pin.reports.report_tables import joints_table, numbers_table
 from nbs_pin.reports.scene import positions
@@ -200,7 +200,7 @@ def test_every_command_reports_the_verdict_that_it_prints(command, data, tmp_pat
     told, page = summary(tmp_path / "a[b]"), (tmp_path / "a[b]" / "report.html").read_text()
     with at_the_shell():
         verdict = verdict_of(told["figures"])
-    assert html.escape(verdict.text) in page
+    assert written(verdict.text) in page
     assert verdict.said in printed or command == "reproduce"
     assert f"nbs-pin {words[0]}" in told["command"]
     assert verdict in [heading.verdict for heading in drawn] or command in ("compare", "reproduce")
