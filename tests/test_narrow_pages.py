@@ -1,14 +1,18 @@
 """What a phone shows of the pages: nothing beyond its screen, and no number broken in two."""
 
+import io
 from contextlib import closing
 
+import numpy as np
 import pytest
+from PIL import Image
 
 import nbs_pin as nbs
 from nbs_pin.reports.pages import unbroken, written
 from nbs_pin.reports.replay import replay
 from nbs_pin.reports.report import report
 from tests.browser import Browser, find_chromium
+from tests.test_replay import moving_run
 from tests.test_report import folder_of, open_with_arms
 
 WIDTH = 390
@@ -82,3 +86,17 @@ def test_numbers_are_kept_whole_and_everything_else_is_as_it_was():
     assert written("<a-1e-7>") == '&lt;a<span class="number">-1e-7</span>&gt;'
     assert written("off by 1.2e-07 rad, 0.3") == 'off by <span class="number">1.2e-07</span> rad, 0.3'
     assert unbroken('<img src="1e-7.png"><b>1e-7</b>') == '<img src="1e-7.png"><b><span class="number">1e-7</span></b>'
+
+
+@pytest.mark.browser
+def test_without_its_panels_the_arm_stands_in_the_middle(phone, tmp_path):
+    """As `tools/pictures.py` shows it: panels that are hidden take no room."""
+    phone.resize(800, 600)
+    phone.open(replay(moving_run(nbs.load_robot("two_link")), tmp_path / "replay.html"), "#t=0.2")
+    phone.evaluate("document.querySelectorAll('body > *:not(#scene)').forEach((x) => x.style.display = 'none')")
+    phone.evaluate("dispatchEvent(new Event('resize'))")
+    shown = np.asarray(Image.open(io.BytesIO(phone.screenshot())).convert("HSV"))
+    rows, columns = np.nonzero(shown[..., 1] > 80)  # the arm and its reference have colours, the ground hardly
+    assert len(rows) > 500
+    assert 0.25 < rows.mean() / 600 < 0.75
+    assert 0.25 < columns.mean() / 800 < 0.75

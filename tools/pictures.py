@@ -65,6 +65,7 @@ def frames(page: Path, times: list[float], width: int, height: int) -> list[Imag
     """The scene of a replay page at these times, without its panels."""
     browser = Browser(width, height, patience=300.0)
     try:
+        browser.resize(width, height)  # the page, of which a window may show less
         browser.open(page, f"#t={times[0]}")
         browser.evaluate("document.querySelectorAll('body > *:not(#scene)').forEach((x) => x.style.display = 'none')")
         browser.evaluate("dispatchEvent(new Event('resize'))")
@@ -93,7 +94,7 @@ def main(folder: Path) -> None:
     for name, (command, chart) in CHARTS.items():
         picture = Image.open(folders[command] / f"{chart}.png").convert("RGB")
         picture.thumbnail((1000, 1000), Image.Resampling.LANCZOS)
-        picture.save(IMAGES / f"{name}.webp", quality=88, method=6)
+        picture.save(IMAGES / f"{name}.webp", quality=75, method=6)
     with Image.open(IMAGES / "errors.webp") as picture:
         picture.crop((0, 0, picture.width, 5 * picture.height // 12)).save(IMAGES / "errors-of-a-model.webp", method=6)
 
