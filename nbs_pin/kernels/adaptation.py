@@ -101,10 +101,15 @@ def factor_of(code: int, v_r: float, a_r: float, transition: float) -> float:
 
 
 @inlined
+def nearest(dual: float) -> float:
+    """The dual within ±FARTHEST."""
+    return math.copysign(FARTHEST, dual) if abs(dual) > FARTHEST else dual
+
+
+@inlined
 def value_of(dual: Vec, k: int, w: Vec) -> float:
     """The number of dual k, which is cut at ±FARTHEST in place."""
-    if abs(dual[k]) > FARTHEST:
-        dual[k] = math.copysign(FARTHEST, dual[k])
+    dual[k] = nearest(dual[k])
     return w[LOWEST] + w[WIDTH] / (1.0 + math.exp(-dual[k]))
 
 
@@ -181,6 +186,15 @@ def output_of(state: State, target: Target, v_r: Vec, law: Packed, unknown: Pack
             s[i] = math.nan
 
 
+@inlined
+def within(tau: Vec, limit: Vec) -> bool:
+    """Whether every torque is within its limit."""
+    inside = True
+    for i in range(len(tau)):
+        inside = inside and abs(tau[i]) <= limit[i]
+    return inside
+
+
 @kernel
 def adaptive_step(
     before: Vec, state: State, target: Target, period: float, limit: Vec,
@@ -198,11 +212,10 @@ def adaptive_step(
     own = Packed(tree.layout, weights)
     put_estimates(duals, unknown, own, signals, work)
     tree_torque(Motion(state.q, state.v, v_r, a_r), own, tree_work, tau)
-    free = True
     for i in range(n):
         tau[i] += feedback[i]
-        free = free and abs(tau[i]) <= limit[i]
-    if free and is_finite(before):  # a torque that is cut off does not do what the estimates expect: they wait
+    # A torque that is cut off does not do what the estimates expect: they wait.
+    if within(tau, limit) and is_finite(before):
         move_duals(before, period, unknown, own, signals, work, duals)
     output_of(state, target, v_r, law, unknown, output)
 

@@ -12,7 +12,8 @@ TRIANGLE = 10
 """Numbers of an upper triangle."""
 FARTHEST = 20.72326583694641
 """−log 1e-9: eigenvalues of a dual are kept within ± this, those of its matrix within [1e-9, 1 − 1e-9]."""
-_SWEEPS = 12
+SWEEPS, CONVERGED = 12, 1e-34
+"""Most passes over all entries off the diagonal; the sum of their squares, as a share of that on it, that ends them."""
 
 
 @inlined
@@ -34,13 +35,13 @@ def eigen(a: Vec, v: Vec) -> None:
     """
     for k in range(16):
         v[k] = 1.0 if k % 5 == 0 else 0.0
-    for _ in range(_SWEEPS):
+    for _ in range(SWEEPS):
         off, size = 0.0, 0.0
         for i in range(4):
             size += a[5 * i] * a[5 * i]
             for j in range(i + 1, 4):
                 off += a[4 * i + j] * a[4 * i + j]
-        if not off > 1e-34 * size:
+        if not off > CONVERGED * size:
             return
         for p in range(3):
             for q in range(p + 1, 4):
