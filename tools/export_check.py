@@ -15,13 +15,14 @@ from pathlib import Path
 
 import nbs_pin as nbs
 from nbs_pin.controllers.registry import LAWS, build_law
+from nbs_pin.export.reals import LIBM
 
 HERE = Path(__file__).parent / "export"
 STRICT = (
     "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow",
     "-Wstrict-prototypes", "-Werror",
 )  # fmt: skip
-LIBM = {f"{name}{kind}" for name in ("sin", "cos", "sincos", "sqrt", "tanh", "ceil", "fabs") for kind in ("", "f")}
+CALLED = {f"{name}{kind}" for name in ("sincos", *LIBM) for kind in ("", "f")}
 """sincos is what gcc makes of a sine and a cosine of one angle."""
 MOST_STACK, MOST_BYTES = 16 * 1024, 192 * 1024
 RANGES = {"q": 7.0, "v": 10.0, "q_ref": 7.0, "v_ref": 10.0, "a_ref": 100.0, "last": 1000.0}
@@ -83,7 +84,7 @@ def symbols(folder: Path) -> str:
         _call("gcc", *STRICT, "-O2", "-c", _source(folder), "-o", f"{made}/law.o")
         for line in _call("nm", f"{made}/law.o").splitlines():
             kind, name = line.split()[-2:]
-            if kind in "BbDdCc" or (kind == "U" and name not in LIBM):
+            if kind in "BbDdCc" or (kind == "U" and name not in CALLED):
                 raise Failed(f"{folder.name} has the symbol {name} ({kind})")
             called += [name] if kind == "U" else []
     return f"it calls {', '.join(called) or 'nothing'}"
@@ -146,7 +147,7 @@ def checks(folders: dict[str, Path]) -> Iterator[tuple[str, tuple[str, ...], Cal
                 yield f"{name}, {compiler} {what}", needed, partial(self_test, folder, compiler, flags)
         yield f"{name}, symbols", ("gcc", "nm"), partial(symbols, folder)
         yield f"{name}, size", ("gcc", "size"), partial(_size, folder)
-    for name in ("panda, nbs, double", "panda, nbs, float", "kinova, pid, double"):
+    for name in ("panda, nbs, double", "panda, nbs, float", "panda, adaptive, double", "kinova, pid, double"):
         folder = folders[name]
         aarch64 = partial(self_test, folder, AARCH64_GCC, ["-O2", "-static"], ("qemu-aarch64",))
         yield f"{name}, aarch64", (AARCH64_GCC, "qemu-aarch64"), aarch64
@@ -179,13 +180,14 @@ def main() -> int:
 
 
 def _exported(place: Path) -> dict[str, Path]:
-    """The laws that are checked: all of two_link, whole ones of panda, one with continuous joints."""
-    cases = [("two_link", law, "double") for law in LAWS] + [("panda", "nbs", kind) for kind in ("double", "float")]
-    cases += [("panda", "nbs-paper", "double"), ("kinova", "nbs", "double"), ("kinova", "pid", "double")]
+    """The laws that are checked: all of two_link, whole ones of panda, some with continuous joints."""
+    cases = [("two_link", law, "double") for law in LAWS]
+    cases += [("panda", law, kind) for law in ("nbs", "adaptive") for kind in ("double", "float")]
+    cases += [("panda", "nbs-paper", "double"), *(("kinova", law, "double") for law in ("nbs", "adaptive", "pid"))]
     folders = {}
     for arm, name, precision in cases:
         law = build_law(name, nbs.load_robot(arm), friction=nbs.JointFriction.of(nbs.load_robot(arm)))
-        if law.packable:
+        if law.packable or isinstance(law, nbs.AdaptiveLaw):
             folders[f"{arm}, {name}, {precision}"] = folder = place / f"{arm}_{name}_{precision}"
             law.export(folder, precision=precision, rate_limit=1000.0)
     return folders

@@ -39,6 +39,7 @@ from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.estimates import Estimate, estimate_of
 from nbs_pin.controllers.excitation import excitation
+from nbs_pin.controllers.exported import Parts
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.controllers.neural_backstepping import NeuralBackstepping
@@ -379,6 +380,13 @@ class AdaptiveLaw(Controller, nn.Module):
             return self
         settings = self.rates, self.leak, self.period, self.output
         return CompiledAdaptiveLaw(self.law.packed_law(), self._believed, self.unknowns, *settings, self.robot)
+
+    def parts_in_c(self) -> Parts:
+        """The law inside, the model that it begins with, and what adapts; raises ArgumentError for a subclass."""
+        if not defines(self, "parts_in_c"):
+            return super().parts_in_c()
+        adapting = self.unknowns.adapting(self.rates, self.leak, self.output, self.period)
+        return Parts(self.law.packed_law(), self._believed, self.robot, adapting)
 
 
 def _plain(x: Array) -> np.ndarray:

@@ -14,15 +14,15 @@ from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import joints_told
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.controllers.estimates import estimate_of
+from nbs_pin.controllers.exported import Parts
 from nbs_pin.controllers.passive_outputs import Output
 from nbs_pin.controllers.unknowns import Unknowns
+from nbs_pin.export.adaptation import LATE
 from nbs_pin.kernels.adaptation import adaptive_law, adaptive_workspace, compile_adaptive_law, pack_adaptive
 from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.threads import Scratch
 from nbs_pin.robots.robot import Robot
-
-_LATE = 1.0 + 1e-6  # a period longer than this multiple of the law's own is refused
 
 
 class AdaptiveMemory(NamedTuple):
@@ -85,6 +85,11 @@ class CompiledAdaptiveLaw(Controller):
         """The constants and weights that it was made of, as arrays."""
         return Packed(*self._packed)
 
+    def parts_in_c(self) -> Parts:
+        """The law inside, the model that it begins with, and what adapts."""
+        law, tree, unknowns, rates, leak, period, output, robot = self._given
+        return Parts(law, tree, robot, unknowns.adapting(rates, leak, output, period))
+
     def initial_memory(self, q: Vectors) -> AdaptiveMemory:
         """The first estimates, with the leading axes of q."""
         (q,) = as_vectors(self.nv, q=q)
@@ -146,7 +151,7 @@ class CompiledAdaptiveLaw(Controller):
 def checked_period(period: Any, longest: float) -> float:
     """The period [s]; raises ArgumentError for one longer than γ was made for."""
     period = PERIOD("period", period)
-    if period > _LATE * longest:
+    if period > LATE * longest:
         raise ArgumentError(
             f"period is {period:g} s, expected at most {longest:g} s, for which the law's γ are; make the law with"
             f" period={period:g}."

@@ -13,7 +13,7 @@ from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import Shown, joints_told
-from nbs_pin.controllers.exported import export_law
+from nbs_pin.controllers.exported import Parts, export_law
 from nbs_pin.export.reals import Precision
 from nbs_pin.kernels.layout import Packed
 
@@ -81,6 +81,12 @@ class Controller(Shown, ABC):
         package, a subclass, which may compute another torque, or a network with a user-defined activation.
         """
         return self
+
+    def parts_in_c(self) -> Parts:
+        """What `export` writes; raises ArgumentError for a law that has no form in C."""
+        model: Any = getattr(self, "dynamics", None)
+        robot = getattr(self, "robot", None) if model is None else model.robot
+        return Parts.of(self.packed_law(), model, robot)
 
     @checked(
         folder=path,

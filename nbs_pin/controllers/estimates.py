@@ -10,7 +10,7 @@ from nbs_pin.base.shown import Cells, Shown
 from nbs_pin.base.units import units_of
 from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
-from nbs_pin.controllers.unknowns import LOAD_AT, Unknowns, into_tree, model_body
+from nbs_pin.controllers.unknowns import KINDS, LOAD_AT, NO_MASS, Unknowns, into_tree, model_body
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, inertial_parameters, pseudo_inertia
@@ -19,8 +19,6 @@ from nbs_pin.kernels.symmetric4 import FARTHEST
 from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY
 from nbs_pin.robots.robot import Robot
 
-NO_MASS = 1e-3
-"""Below this mass [kg] a load has no centre to speak of."""
 _KINDS = ("kg", *["kg·m"] * 3, *["kg·m²"] * 6)
 _PARAMETERS = tuple(zip(PARAMETER_NAMES, _KINDS, strict=True))
 
@@ -57,16 +55,9 @@ class Estimate(Shown):
         """What every value is, with its unit."""
         bodies = [f"{body.name} {name} [{unit}]" for body in self.unknowns.bodies for name, unit in _PARAMETERS]
         of = units_of(self.robot.prismatic)
-        kinds = {
-            NumberCode.VISCOUS: ("viscous friction", "damping"),
-            NumberCode.COULOMB: ("Coulomb friction", "torque"),
-            NumberCode.ROTOR: ("rotor inertia", "inertia"),
-            NumberCode.OFFSET: ("constant torque", "torque"),
-            NumberCode.ACCELERATION: ("constant acceleration", "acceleration"),
-        }
         own = []
         for number in self.unknowns.numbers:
-            what, quantity = kinds[number.code]
+            what, quantity = KINDS[number.code]
             own.append(f"{self.robot.joint_names[number.joint]} {what} [{getattr(of[number.joint], quantity)}]")
         return bodies + own
 

@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,10 +14,13 @@ from nbs_pin.base.doors import where_printed
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.versions import versions
+from nbs_pin.export.adaptation import Adapting
 from nbs_pin.export.law import Exported, pid_limit
 from nbs_pin.export.package import Steps, write_package
 from nbs_pin.export.reals import Precision, Real
 from nbs_pin.kernels.layout import JOINTS, LAW, LawCode, Packed
+from nbs_pin.kernels.tree_layout import tree_workspace
+from nbs_pin.kernels.trees import tree_torques
 from nbs_pin.robots.robot import Robot
 
 _TITLES = {
@@ -36,6 +39,37 @@ _SPEED = 2.0
 """Largest speed in the self-test of a joint without a limit [rad/s, m/s]."""
 
 
+class Parts(NamedTuple):
+    """What a law consists of in C."""
+
+    law: Packed
+    """As `Controller.packed_law` has it; the law inside one that adapts."""
+    tree: Packed | None
+    """Its model as a rigid tree; None for a PID."""
+    robot: Robot | None
+    adapting: Adapting | None = None
+
+    @classmethod
+    def of(cls, law: Packed, dynamics: Any, robot: Robot | None) -> "Parts":
+        """Those of a law without estimates; raises ArgumentError for a model that is no rigid tree."""
+        if law.layout[LAW] == LawCode.PID:
+            return cls(law, None, robot)
+        tree: Packed | None = dynamics.packed_tree()
+        if tree is None:
+            raise ArgumentError(
+                f"the law's model is a {type(dynamics).__name__}, which is no rigid tree and has no C form; export a"
+                " law with PinocchioDynamics, IdentifiedDynamics or a learned chain."
+            )
+        return cls(law, tree, robot)
+
+    def numbers(self) -> list[np.ndarray]:
+        """Those of the law, of its model, of what adapts, and of the limits within which the arm moves."""
+        robot = self.robot if self.tree is not None else None
+        limits = () if robot is None else (robot.lower, robot.upper, robot.velocity_limit)
+        adapts = () if self.adapting is None else self.adapting.unknown
+        return [*self.law, *(self.tree or ()), *adapts, *limits]
+
+
 def export_law(
     controller: Any,  # a Controller, whose module imports this one
     folder: Path,
@@ -47,23 +81,26 @@ def export_law(
     certificate: Any,
 ) -> list[Path]:
     """Write the package of `Controller.export` and return its files; raises ArgumentError for what has no C form."""
-    law, n = controller.packed_law(), controller.nv
-    dynamics = getattr(controller, "dynamics", None)
-    robot = getattr(controller, "robot", None) if dynamics is None else dynamics.robot
-    tree, names = _tree(law, dynamics, gravity), tuple(f"joint{i + 1}" for i in range(n))
+    parts, n = controller.parts_in_c(), controller.nv
+    law, tree, robot, adapting = parts
+    names = tuple(f"joint{i + 1}" for i in range(n))
+    if tree is None and not gravity:
+        given = where_printed(python="gravity=False", shell="--without-gravity")
+        raise ArgumentError(f"{given} was given, but a PID has no model whose weight it could leave out; omit it.")
     if rate_limit.shape not in ((), (n,)):
         raise ArgumentError(f"rate_limit has {rate_limit.size} numbers, expected {n}; give one per joint.")
     if certificate is not None:
-        _check_certificate(certificate, controller)
+        _check_certificate(certificate, parts)
     exported = Exported(
         name=_identifier(folder),
         law=law,
         tree=tree,
+        adapting=adapting,
         effort_limit=_effort_limit(law, robot),
         rate_limit=np.full(n, rate_limit),
         gravity=gravity,
         real=Real(precision),
-        title=f"{_TITLES[LawCode(law.layout[LAW])]} for {'an arm without a name' if robot is None else robot.name}",
+        title=_title(parts),
         joint_names=names if robot is None else robot.joint_names,
         prismatic=np.zeros(n, dtype=bool) if robot is None else robot.prismatic,
         robot_sha256="" if robot is None else robot.sha256,
@@ -71,23 +108,13 @@ def export_law(
         versions=versions(),
     )
     writable("export: folder", folder / f"{exported.name}.h")
-    return write_package(folder, exported, _steps(controller, dynamics, robot, exported, period))
+    return write_package(folder, exported, _steps(controller, robot, exported, period))
 
 
-def _tree(law: Packed, dynamics: Any, gravity: bool) -> Packed | None:
-    """The model of a law as a rigid tree; None for a PID, which has no model."""
-    if law.layout[LAW] == LawCode.PID:
-        if not gravity:
-            given = where_printed(python="gravity=False", shell="--without-gravity")
-            raise ArgumentError(f"{given} was given, but a PID has no model whose weight it could leave out; omit it.")
-        return None
-    tree: Packed | None = dynamics.packed_tree()
-    if tree is None:
-        raise ArgumentError(
-            f"the law's model is a {type(dynamics).__name__}, which is no rigid tree and has no C form; export a law"
-            " with PinocchioDynamics, IdentifiedDynamics or a learned chain."
-        )
-    return tree
+def _title(parts: Parts) -> str:
+    law, arm = _TITLES[LawCode(parts.law.layout[LAW])], parts.robot
+    adapts = "" if parts.adapting is None else " with adaptation"
+    return f"{law}{adapts} for {'an arm without a name' if arm is None else arm.name}"
 
 
 def _effort_limit(law: Packed, robot: Robot | None) -> JointArray:
@@ -96,24 +123,14 @@ def _effort_limit(law: Packed, robot: Robot | None) -> JointArray:
     return np.minimum(limit, pid_limit(law)) if law.layout[LAW] == LawCode.PID else limit
 
 
-def _check_certificate(certificate: Any, controller: Any) -> None:
+def _check_certificate(certificate: Any, parts: Parts) -> None:
     """Raise ArgumentError unless it is a certificate, whose class lies above this module, of this law on this arm."""
     if not (hasattr(certificate, "controller") and callable(getattr(certificate, "summary", None))):
         raise ArgumentError(f"certificate is {told(certificate)}; give a Certificate, as certify returns it.")
-    ours, theirs = _numbers(controller), _numbers(certificate.controller)
+    ours, theirs = parts.numbers(), certificate.controller.parts_in_c().numbers()
     same = (np.array_equal(x, y, equal_nan=True) for x, y in zip(ours, theirs, strict=False))
     if len(ours) != len(theirs) or not all(same):
         raise ArgumentError("certificate is for a law or an arm with other numbers; certify the one that is exported.")
-
-
-def _numbers(controller: Any) -> list[np.ndarray]:
-    """Those of a law, of its model, and of the limits within which the arm moves."""
-    dynamics = getattr(controller, "dynamics", None)
-    if dynamics is None:
-        return [*controller.packed_law()]
-    tree, robot = dynamics.packed_tree(), dynamics.robot
-    limits = () if robot is None else (robot.lower, robot.upper, robot.velocity_limit)
-    return [*controller.packed_law(), *(tree or ()), *limits]
 
 
 def _known(certificate: Any) -> tuple[str, ...]:
@@ -136,7 +153,7 @@ def _identifier(folder: Path) -> str:
     return name if "_" in name else f"{name}_law"
 
 
-def _steps(controller: Any, dynamics: Any, robot: Robot | None, exported: Exported, period: float) -> Steps:
+def _steps(controller: Any, robot: Robot | None, exported: Exported, period: float) -> Steps:
     given = _states(exported, robot)
     q, v, *aim = given
     memory = controller.initial_memory(q[0])
@@ -147,9 +164,16 @@ def _steps(controller: Any, dynamics: Any, robot: Robot | None, exported: Export
         for k in range(len(q)):
             reference = Reference(*(x[k] for x in aim))
             torque[k], memory = controller.step(memory, q[k], v[k], reference, period)
-    if not exported.gravity:
-        torque = torque - dynamics.gravity(q)
+    if exported.tree is not None and not exported.gravity:
+        torque = torque - _weight(exported.tree, q)
     return Steps(period, given, torque)
+
+
+def _weight(tree: Packed, q: Float[np.ndarray, "steps n"]) -> Float[np.ndarray, "steps n"]:
+    """G(q) of the model."""
+    weight, still = np.empty_like(q), np.zeros_like(q)
+    tree_torques(q, still, still, still, *tree, np.empty(tree_workspace(tree)), weight)
+    return weight
 
 
 def _states(exported: Exported, robot: Robot | None) -> Float[np.ndarray, "5 steps n"]:

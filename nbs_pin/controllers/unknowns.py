@@ -17,6 +17,7 @@ from nbs_pin.controllers.computed_torque import ComputedTorque
 from nbs_pin.controllers.gains import effective_inertia, gains_for_robot
 from nbs_pin.controllers.model_law import ModelLaw
 from nbs_pin.dynamics.pinocchio_tree import tree_frames
+from nbs_pin.export.adaptation import Adapting, Load
 from nbs_pin.kernels.adaptation import PER_BODY, PER_NUMBER
 from nbs_pin.kernels.layout import NumberCode, Packed
 from nbs_pin.kernels.symmetric4 import FARTHEST
@@ -28,6 +29,16 @@ ADAPTS = ("load", "links", "friction", "rotors", "offsets")
 """What a law can adapt: a load at a frame, bodies of links, joint friction, rotor inertia, constant torques."""
 LOAD_AT = "load at "
 """What the name of a load begins with, before its link."""
+KINDS = {
+    NumberCode.VISCOUS: ("viscous friction", "damping"),
+    NumberCode.COULOMB: ("Coulomb friction", "torque"),
+    NumberCode.ROTOR: ("rotor inertia", "inertia"),
+    NumberCode.OFFSET: ("constant torque", "torque"),
+    NumberCode.ACCELERATION: ("constant acceleration", "acceleration"),
+}
+"""What numbers are, and their quantity in `base/units.py`."""
+NO_MASS = 1e-3
+"""Below this mass [kg] a load has no centre to speak of."""
 UPPER = np.triu_indices(4)
 _LEAST_SHARE = 1e-4  # what every direction of a body begins with, where the model has less, as a share of the largest
 _REACH = 2.0  # a link's largest body, as a multiple of the one that the model has
@@ -99,6 +110,19 @@ class Unknowns(NamedTuple):
             weights.append(np.array([number.lowest, number.width, number.start, number.known, rate]))
             assert len(weights[-1]) == PER_NUMBER
         return Packed(np.array(layout, dtype=np.int64), np.concatenate(weights))
+
+    def adapting(self, rates: np.ndarray, leak: float, output: tuple[int, np.ndarray], period: float) -> Adapting:
+        """For C, with the longest control period [s]."""
+        bodies = [body.name if body.is_load else f"the body of {body.name}" for body in self.bodies]
+        kinds = dict.fromkeys(KINDS[number.code][0] for number in self.numbers)
+        load = next((_load_in_c(k, body) for k, body in enumerate(self.bodies) if body.is_load), None)
+        return Adapting(self.packed(rates, leak, output), self.start, period, (*bodies, *kinds), load)
+
+
+def _load_in_c(k: int, body: UnknownBody) -> Load:
+    back = np.linalg.inv(body.place)
+    known = back @ body.known @ back.T
+    return Load(k, body.name.removeprefix(LOAD_AT), back @ body.factor, known[:, 3], NO_MASS)
 
 
 class Carrier(NamedTuple):

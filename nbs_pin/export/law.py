@@ -8,8 +8,9 @@ from jaxtyping import Bool
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.units import several, units
+from nbs_pin.export.adaptation import Adapting, Load, adaptive_parts, adaptive_torque, load_c
 from nbs_pin.export.networks import damping_c, potential_c
-from nbs_pin.export.reals import Real
+from nbs_pin.export.reals import LIBM, Real
 from nbs_pin.export.statements import statements
 from nbs_pin.export.templates import filled
 from nbs_pin.export.traced_law import traced
@@ -20,7 +21,7 @@ from nbs_pin.kernels.views import damping_in, pid_of, potential_in
 
 _ASCII = {"·": " ", "²": "^2", "τ": "tau", "≤": "<=", "≥": ">=", "‖": "|", "ω": "omega", "Λ": "Lambda", "−": "-"}
 _CLAMPED = "static real clamped(real x, real most)\n{\n    return x > most ? most : (x < -most ? -most : x);\n}\n"
-_LIBM = re.compile(r"\b((?:sin|cos|sqrt|tanh|ceil|fabs)f?)\(")
+_LIBM = re.compile(rf"\b((?:{'|'.join(LIBM)})f?)\(")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,8 @@ class Exported:
     """As `layout.pack_law` or `layout.pack_pid` packs it."""
     tree: Packed | None
     """Its model (`tree_layout.pack_tree`); None for a PID."""
+    adapting: Adapting | None
+    """What it adapts, beginning with that model; None for nothing."""
     effort_limit: JointArray
     """[N·m, N]; inf where there is none."""
     rate_limit: JointArray
@@ -89,21 +92,26 @@ class Exported:
 
 def law_files(exported: Exported) -> dict[str, str]:
     """The header and the source file, by name."""
-    words, remembers = exported.words, exported.code is LawCode.PID
+    words, adapting = exported.words, exported.adapting
     parts, torque = _pid(exported) if exported.tree is None else _on_tree(exported, exported.tree)
     tables, limits, first = _limits(exported)
     source = words | {
         "PARTS": "\n".join([*parts, *tables]),
         "TORQUE": torque,
         "FIRST": first,
-        "START": _inner(["state->integral[i] = 0;", "state->derivative[i] = 0;"] if remembers else []),
-        "LIMITS": _inner(limits),
+        "START": _inner([f"state->{name}[i] = 0;" for name in _remembered(exported)], 2),
+        "ESTIMATES": "" if adapting is None else filled("start.c", adapting.words),
+        "LONGER": "" if adapting is None else f" || period > {exported.real.literal(adapting.longest)}",
+        "LIMITS": _inner(limits, 3),
+        "LOAD": "" if adapting is None else load_c(adapting, exported.real, words),
     }
     text = _without_blanks(filled("law.c", source))
     header = words | {
         "ABOUT": "\n".join(f" * {comment(line)}".rstrip() for line in _about(exported)),
-        "MEMORY": filled("pid_memory.h", words) if remembers else "",
+        "MEMORY": _memory(exported),
         "LIBM": ", ".join(sorted(set(_LIBM.findall(text)))) or "nothing",
+        "LOAD": "" if adapting is None or adapting.load is None else _load(adapting.load, words),
+        "LONGER": "" if adapting is None else f", or above {adapting.period:g} s",
         "LIMITED": "its rate and then its size" if np.isfinite(exported.rate_limit).any() else "its size",
     }
     return {f"{exported.name}.h": filled("law.h", header), f"{exported.name}.c": text}
@@ -134,7 +142,36 @@ def _about(exported: Exported) -> list[str]:
     fed = exported.tree is not None and bool(exported.law.layout[at.FRICTION])
     friction = "feeds joint friction forward" if fed else "feeds no joint friction forward"
     certified = exported.known or ("No certificate was given at the export.",)
-    return ["Joints:", *joints, "", f"The torque {weight} and {friction}.", "", *certified]
+    return ["Joints:", *joints, "", f"The torque {weight} and {friction}.", *_adapts(exported), "", *certified]
+
+
+def _adapts(exported: Exported) -> list[str]:
+    """What the head of the header says of the estimates."""
+    if exported.adapting is None:
+        return []
+    own = "" if exported.has_weight else " Of the weight it holds what the estimates add to that of its model."
+    return [
+        f"It adapts: {', '.join(exported.adapting.names)}.{own}",
+        "The estimates begin as its model has them, and wait while a torque of the law is beyond the effort limit.",
+    ]
+
+
+def _remembered(exported: Exported) -> tuple[str, ...]:
+    """What a state remembers of every joint beside the torque, 0 at first."""
+    if exported.code is LawCode.PID:
+        return "integral", "derivative"
+    return () if exported.adapting is None else ("output", "before")
+
+
+def _memory(exported: Exported) -> str:
+    """The same in the declaration of a state, and the estimates."""
+    if exported.code is LawCode.PID:
+        return filled("pid_memory.h", exported.words)
+    return "" if exported.adapting is None else filled("adaptive_memory.h", exported.words | exported.adapting.words)
+
+
+def _load(load: Load, words: dict[str, object]) -> str:
+    return filled("load.h", words | {"FRAME": comment(load.frame)})
 
 
 def _on_tree(exported: Exported, tree: Packed) -> tuple[list[str], str]:
@@ -143,10 +180,16 @@ def _on_tree(exported: Exported, tree: Packed) -> tuple[list[str], str]:
     if exported.code is LawCode.BACKSTEPPING:
         phi, d = (as_python(view, {})(exported.law) for view in (potential_in, damping_in))
         parts = [potential_c(phi, exported.real), damping_c(d, exported.real)]
-    tape, tau = traced(exported.law, tree, exported.gravity)
     # All laws have the same arguments, though not each needs them all.
     idle = [f"    (void){name};" for name in ("state", "v", "q_ref", "v_ref", "a_ref", "period")]
-    return parts, "\n".join([*idle, statements(tape, {"tau": tau.tolist()}, exported.real)])
+    if exported.adapting is None:
+        tape, tau = traced(exported.law, tree, exported.gravity)
+        return parts, "\n".join([*idle, statements(tape, {"tau": tau.tolist()}, exported.real)])
+    limited = bool(np.isfinite(exported.effort_limit).any())
+    torque = adaptive_torque(
+        exported.law, tree, exported.adapting, exported.real, gravity=exported.gravity, limited=limited
+    )
+    return [*parts, *adaptive_parts(exported.adapting, exported.real)], "\n".join([*idle, torque])
 
 
 def _pid(exported: Exported) -> tuple[list[str], str]:
@@ -176,8 +219,8 @@ def _limits(exported: Exported) -> tuple[list[str], list[str], str]:
     return ([*tables, _CLAMPED] if lines else []), lines, first
 
 
-def _inner(lines: list[str]) -> str:
-    return "\n".join(f"            {line}" for line in lines)
+def _inner(lines: list[str], depth: int) -> str:
+    return "\n".join(f"{'    ' * depth}{line}" for line in lines)
 
 
 def _without_blanks(text: str) -> str:

@@ -6,6 +6,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 Precision: TypeAlias = Literal["double", "float"]
+LIBM = ("sin", "cos", "sqrt", "tanh", "exp", "ceil", "fabs")
+"""All functions of libm that a law may call."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
-from nbs_pin.export.reals import Real
+from nbs_pin.export.reals import LIBM, Real
 from nbs_pin.export.symbols import Call, Number, Remark, Symbol, Tape
 
 Outputs: TypeAlias = Mapping[str, Sequence[Number]]
@@ -92,7 +92,8 @@ class _Writer:
         if x.operation == "negative":
             return _Text(f"-{operands[0].within(_PRODUCT)}", _SUM)
         if len(operands) == 1:
-            return _Text(f"{self.real.function(x.operation)}({operands[0].text})", _ATOM)
+            function = self.real.function(x.operation) if x.operation in LIBM else x.operation
+            return _Text(f"{function}({operands[0].text})", _ATOM)
         strength = _SUM if x.operation in "+-" else _PRODUCT
         # C reads from the left: an operand on the right must hold together more strongly to keep the order.
         left, right = operands[0].within(strength), operands[1].within(strength + 1)

@@ -80,9 +80,13 @@ class Tape:
         self.entries: list[Symbol | Call | Remark] = []
         self._known: dict[tuple[Any, ...], Symbol] = {}
 
+    def variable(self, name: str) -> Symbol:
+        """A number of C."""
+        return self._once("leaf", name)
+
     def variables(self, name: str, count: int) -> np.ndarray:
         """An array of C."""
-        return np.array([self._once("leaf", f"{name}[{i}]") for i in range(count)], dtype=object)
+        return np.array([self.variable(f"{name}[{i}]") for i in range(count)], dtype=object)
 
     def call(self, function: str, inputs: dict[str, Sequence[Number]], outputs: dict[str, int]) -> list[np.ndarray]:
         """The arrays that a function of C writes."""
@@ -94,7 +98,7 @@ class Tape:
         self.entries.append(Remark(text))
 
     def function(self, name: str, x: Number) -> Number:
-        """A function of libm."""
+        """A function of libm, or of a symbol one of the C around it."""
         return self._once(name, x) if isinstance(x, Symbol) else float(getattr(math, name)(x))
 
     def sum(self, x: Number, y: Number) -> Number:

@@ -13,8 +13,21 @@ from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.records import State, Target
 from nbs_pin.kernels.tree_layout import BASE, BODY, PLACE
 
-_LAW = {"errors": "errors", "backstepping": "the law", "linear_law": "the law", "friction": "friction"}
-_TREE = {"place": "place joint", "sweep": "motion and load of body", "gather": "torque of joint"}
+_LAW = {
+    "errors": "errors",
+    "backstepping": "the law",
+    "linear_law": "the law",
+    "friction": "friction",
+    "put_estimates": "estimates",
+    "inertia_bars": "how the power depends on the body, and its next dual",
+    "output_of": "what drives adaptation",
+}
+_TREE = {
+    "place": "place joint",
+    "sweep": "motion and load of body",
+    "gather": "torque of joint",
+    "spread": "motion at what drives adaptation, of body",
+}
 """What kernels do, as remarks in the C; the latter for each joint."""
 
 
@@ -23,12 +36,12 @@ def traced(law: Packed, tree: Packed, gravity: bool) -> tuple[Tape, np.ndarray]:
     tape, n = Tape(), int(law.layout[at.JOINTS])
     q, v, q_ref, v_ref, a_ref = (tape.variables(name, n) for name in ("q", "v", "q_ref", "v_ref", "a_ref"))
     tau, work = np.zeros(n, dtype=object), np.zeros(law_workspace(law, tree), dtype=object)
-    model = _folded(tree, gravity)
-    as_python(torque_of, _hooks(tape, n))(State(q, v), Target(q_ref, v_ref, a_ref), law, model, work, tau)
+    model = folded(tree, gravity)
+    as_python(torque_of, law_hooks(tape, n))(State(q, v), Target(q_ref, v_ref, a_ref), law, model, work, tau)
     return tape, tau
 
 
-def _folded(tree: Packed, gravity: bool) -> Packed:
+def folded(tree: Packed, gravity: bool) -> Packed:
     """The tree with rotations that are 0 up to rounding set to 0, so that they cost nothing; weightless if asked."""
     weights = tree.weights.copy()
     for rotation in weights[BASE:].reshape(-1, BODY)[:, :PLACE]:
@@ -38,7 +51,7 @@ def _folded(tree: Packed, gravity: bool) -> Packed:
     return Packed(tree.layout, weights)
 
 
-def _hooks(tape: Tape, n: int) -> dict[str, Hook]:
+def law_hooks(tape: Tape, n: int) -> dict[str, Hook]:
     """Networks as calls of C functions, and remarks on what everything else does."""
     section = [""]
 
@@ -50,13 +63,13 @@ def _hooks(tape: Tape, n: int) -> dict[str, Hook]:
         (force[:],) = tape.call("damping_force", {"z2": z}, {"force": n})
 
     def of_law(words: str) -> Hook:
-        return lambda plain: _after(lambda *_: tape.remark(words), plain)
+        return lambda plain: after(lambda *_: tape.remark(words), plain)
 
     def of_tree(words: str) -> Hook:
-        return lambda plain: _after(lambda *_: section.__setitem__(0, words), plain)
+        return lambda plain: after(lambda *_: section.__setitem__(0, words), plain)
 
     def of_joint(plain: Callable[..., Any]) -> Callable[..., Any]:
-        return _after(lambda i, *_: tape.remark(f"{section[0]} {i + 1}"), plain)
+        return after(lambda i, *_: tape.remark(f"{section[0]} {i + 1}"), plain)
 
     return {
         "potential": lambda _: potential,
@@ -67,7 +80,9 @@ def _hooks(tape: Tape, n: int) -> dict[str, Hook]:
     }
 
 
-def _after(before: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[..., Any]:
+def after(before: Callable[..., Any], kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """A kernel that runs after something else, which is given the same."""
+
     def run(*given: Any) -> Any:
         before(*given)
         return kernel(*given)

@@ -34,7 +34,7 @@ def as_python(kernel: Callable[..., Any], hooks: Mapping[str, Hook]) -> Callable
 
     def replaced(thing: Any) -> Any:
         if thing is math:
-            return SimpleNamespace(**vars(math) | {"tanh": _tanh})
+            return SimpleNamespace(**vars(math) | {"tanh": _tanh, "exp": _exp, "expm1": _expm1})
         if isinstance(thing, ModuleType) and thing.__name__.startswith(_KERNELS):
             return SimpleNamespace(**{name: replaced(x) for name, x in vars(thing).items() if not name.startswith("_")})
         is_kernel = hasattr(thing, "__wrapped__") and thing.__module__.startswith(_KERNELS)
@@ -45,3 +45,13 @@ def as_python(kernel: Callable[..., Any], hooks: Mapping[str, Hook]) -> Callable
 
 def _tanh(x: Any) -> Any:
     return x.tape.function("tanh", x) if isinstance(x, Symbol) else math.tanh(x)
+
+
+def _exp(x: Any) -> Any:
+    return x.tape.function("exp", x) if isinstance(x, Symbol) else math.exp(x)
+
+
+def _expm1(x: Any) -> Any:
+    """eˣ − 1 for x ≤ 0 by tanh, which loses no digits near 0 either, so that C needs no further function of libm."""
+    t = _tanh(0.5 * x)
+    return 2.0 * t / (1.0 - t)

@@ -7,8 +7,7 @@ import numpy as np
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
 from nbs_pin.base.units import by_quantity
-from nbs_pin.controllers.estimates import NO_MASS
-from nbs_pin.controllers.unknowns import LOAD_AT
+from nbs_pin.controllers.unknowns import LOAD_AT, NO_MASS
 from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation import metrics
 from nbs_pin.simulation.tool_errors import tool_errors, tool_of
