@@ -100,14 +100,8 @@ def bench(
 def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step", against_torch: bool = False) -> Row:
     """Percentiles of a control step [µs], compiled if it can be, its ratio to two RNEA, and eager torch's to it."""
     eager: Any = build_law(law, robot, period=PERIOD)
-    controller = eager.compile()
     states = _states(robot)
-    memory = controller.initial_memory(states[0][0])
-
-    def step(q: np.ndarray, v: np.ndarray, reference: Reference) -> None:
-        controller.step(memory, q, v, reference, PERIOD)
-
-    times = _times(step, [(q, v, Reference(*r)) for q, v, *r in states], calls)
+    times = _step_times(eager.compile(), states, calls)
     p50, p99, p999, longest = np.percentile(times, [50.0, 99.0, 99.9, 100.0]).tolist()
     data = robot.model.createData()
 
@@ -128,7 +122,7 @@ def control_row(robot: Robot, law: str, calls: int, *, what: str = "control step
 
 
 def exported_rows(
-    robot: Robot, calls: int, laws: tuple[str, ...] = ("nbs", "slotine-li"), *, what: str = "step in C"
+    robot: Robot, calls: int, laws: tuple[str, ...] = ("nbs", "adaptive", "slotine-li"), *, what: str = "step in C"
 ) -> Iterator[Row]:
     """A step of laws in C [µs] with bytes of code and data, and how much longer the compiled law takes in Python.
 
@@ -145,7 +139,7 @@ def exported_rows(
         for how, each in cases.items():
             times, size = step_times(each, np.array(states), calls)
             p50, p99 = np.percentile(times, [50.0, 99.0]).tolist()
-            python = _median(each.compile().torque, states, calls)
+            python = float(np.median(_step_times(each.compile(), states, calls)))
             figures = {"joints": float(robot.nv), "p50_us": p50, "p99_us": p99, "python_us": python,
                        "python_over_c": python / p50, "bytes": float(size)}  # fmt: skip
             yield Row(what, robot.name, how, figures)
@@ -323,6 +317,16 @@ def _states(robot: Robot, count: int = 64) -> list[tuple[np.ndarray, ...]]:
     reference = Sinusoid.for_robot(robot)(rng.uniform(0.0, 6.0, count))
     q, v = (x + 0.1 * rng.normal(size=x.shape) for x in reference[:2])
     return list(zip(q, v, *reference, strict=True))
+
+
+def _step_times(controller: Controller, states: list[tuple[np.ndarray, ...]], calls: int) -> np.ndarray:
+    """Wall times of single steps [µs] from the first memory, the states taken in turn."""
+    memory = controller.initial_memory(states[0][0])
+
+    def step(q: np.ndarray, v: np.ndarray, reference: Reference) -> None:
+        controller.step(memory, q, v, reference, PERIOD)
+
+    return _times(step, [(q, v, Reference(*r)) for q, v, *r in states], calls)
 
 
 def _times(function: Callable[..., Any], arguments: list[Any], calls: int) -> np.ndarray:

@@ -21,7 +21,9 @@ _TIMED = """
 
 void timed(const double *states, int count, int calls, double *ns)
 {{
-    {name}_state state = {{0}};
+    const double nothing[{n}] = {{0}};
+    {name}_state state;
+    {name}_start(&state, nothing);
     for (int k = 0; k < calls; k++) {{
         const double *x = states + 5 * {n} * (k % count);
         double tau[{n}];
