@@ -15,6 +15,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.controllers.unknowns import ADAPTS
 from nbs_pin.robots.places import tool_frame
+from tests.commands import refusal
 from tests.imitations import FRANKA, ROS, ROS_DRIVER
 from tests.test_adaptive import OTHERS, stirred
 
@@ -297,12 +298,15 @@ def test_what_has_no_c_form_is_refused(tmp_path):
     assert not (tmp_path / "law").exists()
 
 
-def test_the_command_exports_a_law_that_adapts(tmp_path):
+def test_the_command_exports_a_law_that_adapts(tmp_path, capsys):
     from nbs_pin import cli
 
     folder, file = tmp_path / "arm", tmp_path / "law.nbs"
     assert cli.main(["export", "two_link", "--law", "adaptive", "--out", str(folder)]) == 0
     export_check.self_test(folder, "gcc", ["-O0"])
+    capsys.readouterr()
+    code = cli.main(["export", "two_link", "--law", "adaptive", "--disturbance", "5", "--out", str(tmp_path / "more")])
+    assert "the law is AdaptiveLaw; omit it" in refusal(code, capsys)
     nbs.save(nbs.AdaptiveLaw(nbs.PD.for_robot(nbs.load_robot("two_link")), ["offsets"]), file)
     assert cli.main(["export", str(file), "--out", str(folder), "--force"]) == 0
     export_check.self_test(folder, "gcc", ["-O0"])

@@ -68,7 +68,7 @@ def _certificate(options: Export, controller: Controller) -> Any:
         return None
     if not isinstance(controller, LyapunovLaw):
         raise OptionError(
-            f"--disturbance is for a law with a Lyapunov function, and this is a {type(controller).__name__}; omit it."
+            f"--disturbance is for a law with a Lyapunov function, and the law is {type(controller).__name__}; omit it."
         )
     torques = plain_numbers(options.disturbance) or []
     return certify(controller, torques * controller.nv if len(torques) == 1 else torques)

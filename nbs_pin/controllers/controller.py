@@ -115,7 +115,7 @@ class Controller(Shown, ABC):
             precision: "double" or "float".
             gravity: False leaves G(q) out, for an arm that adds it itself, as Franka's do.
             rate_limit: Largest change of the torque per second [N·m/s], one number or one per joint; inf for none.
-            period: Control period of the self-test [s].
+            period: Control period of the self-test [s]; of an `AdaptiveLaw` at most its own.
             certificate: A `Certificate` of this law, whose bounds the header then states, or None.
 
         Returns:
