@@ -111,7 +111,8 @@ def law_files(exported: Exported) -> dict[str, str]:
         "MEMORY": _memory(exported),
         "LIBM": ", ".join(sorted(set(_LIBM.findall(text)))) or "nothing",
         "LOAD": "" if adapting is None or adapting.load is None else _load(adapting.load, words),
-        "LONGER": "" if adapting is None else f", or above {adapting.period:g} s",
+        "LONGER": "" if adapting is None else f" or above {adapting.period:g} s",
+        "BEGIN": "" if adapting is None else " The estimates become the first ones.",
         "LIMITED": "its rate and then its size" if np.isfinite(exported.rate_limit).any() else "its size",
     }
     return {f"{exported.name}.h": filled("law.h", header), f"{exported.name}.c": text}
