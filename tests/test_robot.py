@@ -201,6 +201,15 @@ def test_gravity_that_is_none_is_refused(gravity):
         load_robot("two_link", gravity=gravity)
 
 
+def test_gravity_that_cannot_be_iterated_over_is_refused():
+    def broken():
+        yield 0.0
+        raise RuntimeError("no number")
+
+    with pytest.raises(ArgumentError, match="gravity is a generator, which cannot be iterated over"):
+        load_robot("two_link", gravity=broken())
+
+
 def test_the_fingerprint_follows_the_dynamics_alone(tmp_path):
     robot = load_robot("three_link")
     text = robot.urdf.path.read_text()

@@ -380,7 +380,12 @@ def _load(entry: Entry, given: dict[str, Any]) -> Robot:
 def _gravity_vector(gravity: float | Iterable[float]) -> Float[np.ndarray, "3"]:
     """The gravity vector in the base frame [m/s²]; raises ArgumentError unless it is one or three finite numbers."""
     if isinstance(gravity, Iterable) and not isinstance(gravity, np.ndarray | str):
-        gravity = list(islice(gravity, 4))
+        try:
+            gravity = list(islice(gravity, 4))
+        except Exception as error:  # an iterable may raise anything
+            raise ArgumentError(
+                f"gravity is {told(gravity)}, which cannot be iterated over; give e.g. 9.81."
+            ) from error
     vector = floats("gravity", gravity)
     if vector.shape not in ((), (3,)) or not is_usual(vector):
         raise ArgumentError(
