@@ -94,6 +94,8 @@ from .motions.tool_postures import tool_posture as tool_posture
 from .reports.estimate_charts import plot_estimates as plot_estimates
 from .reports.plotting import plot_tracking as plot_tracking
 from .reports.replay import replay as replay
+from .reports.run_export import export_run as export_run
+from .reports.run_import import import_run as import_run
 from .robots.catalogue import ROBOT_NAMES as ROBOT_NAMES
 from .robots.robot import Robot as Robot, load_robot as load_robot
 from .runtime.arms import ArmInterface as ArmInterface, PlantArm as PlantArm

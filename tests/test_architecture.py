@@ -53,7 +53,7 @@ HOMES = {
     "jsonschema": {"verification.document"},
     "threadpoolctl": {"identification.chain_fit", "identification.coupling", "identification.explain"},
     "xacro": {"robots.xacro_source"},
-    "rosbags": {"identification.log_bags"},
+    "rosbags": {"identification.log_bags", "reports.run_bags"},
     "numba": {"kernels", "benchmarks.bench"},
     "tyro": {"cli"},
     "rich": {"base.progress", "cli", "commands"},

@@ -240,6 +240,7 @@ def test_times_that_make_no_sense_are_refused_by_the_option(command, words, said
 @pytest.mark.parametrize("command", [
     "train three_link", "collect three_link", "learn data.npz", "compare model.nbs", "certify three_link",
     "export three_link", "replay run.npz", "robots three_link", "log data.csv", "excite three_link",
+    "export-run run.npz",
 ])  # fmt: skip
 def test_other_commands_say_that_they_do_not_simulate_a_load_that_appears(command, capsys):
     line = refusal(cli.main([*command.split(), "--payload=2@tip@5-12"]), capsys)
@@ -249,7 +250,7 @@ def test_other_commands_say_that_they_do_not_simulate_a_load_that_appears(comman
 def test_every_command_with_an_arm_was_asked():
     arms = {name for name, kind in cli.COMMANDS.items() if "arm" in kind.__dataclass_fields__}
     asked = {"train", "collect", "learn", "compare", "certify", "export", "replay", "robots", "log", "excite"}
-    assert arms == asked | {"track", "run"}
+    assert arms == asked | {"export-run", "track", "run"}
 
 
 @pytest.mark.parametrize("plant", PLANTS)

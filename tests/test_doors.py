@@ -78,6 +78,8 @@ def test_an_arm_that_is_gone_is_asked_for_by_the_option_that_takes_it(arm, tmp_p
         ("track two_link --reference nofile.csv", "--reference"),
         ("train two_link --controller nofile.nbs", "--controller"),
         ("replay nofile", "RUN"),
+        ("replay nofile.mcap", "RUN"),
+        ("export-run nofile", "RUN"),
         ("learn nofile.npz", "DATA"),
         ("compare nofile.nbs", "MODEL"),
         ("compare two_link --against two_link --data nofile.npz", "--data"),

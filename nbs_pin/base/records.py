@@ -181,12 +181,10 @@ class Run(Shown):
             ArgumentError: If `load` would refuse the file: a number is not finite, times do not increase, a limit is
                 not > 0, or `info` or `robot_options` cannot be stored as JSON. `head` gives the rows before a number.
         """
-        for name, (fault, row) in _number_faults(vars(self)).items():
-            kept = f"save the rows before it, head({row})" if row else "correct it"
-            raise ArgumentError(f"Run.save: {name} has {fault}{f' in row {row}' if row else ''}; {kept}.")
+        check_numbers("Run.save", self)
         values = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         values = {name: value for name, value in values.items() if value is not None}
-        texts = {name: _dumped(name, values[name]) for name in _JSON} | {"format": RUN_FORMAT}
+        texts = {name: as_json(name, values[name]) for name in _JSON} | {"format": RUN_FORMAT}
         write_npz(path, {name: np.asarray(value) for name, value in (values | texts).items()})
 
     @checked(rows=count(1, of="rows"))
@@ -229,6 +227,13 @@ RUN = a(Run, "what simulate returned or Run.load read")
 """The check of an argument that is a run."""
 
 
+def check_numbers(function: str, run: Run) -> None:
+    """Raise ArgumentError, naming the function that was to write it, for a run that no file may have."""
+    for name, (fault, row) in _number_faults(vars(run)).items():
+        kept = f"save the rows before it, head({row})" if row else "correct it"
+        raise ArgumentError(f"{function}: {name} has {fault}{f' in row {row}' if row else ''}; {kept}.")
+
+
 def _check_shapes(path: str | Path, data: dict[str, np.ndarray]) -> None:
     shape = data["q"].shape
     joints = (*_PER_JOINT, *(["prismatic"] if "prismatic" in data else []))
@@ -259,7 +264,8 @@ def _number_faults(arrays: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
     return faults
 
 
-def _dumped(name: str, value: dict[str, Any]) -> str:
+def as_json(name: str, value: dict[str, Any]) -> str:
+    """The text of `info` or `robot_options` in files; raises ArgumentError if JSON cannot store it."""
     try:
         return json.dumps(value, allow_nan=False)
     except (TypeError, ValueError) as error:

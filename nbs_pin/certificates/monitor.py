@@ -3,11 +3,13 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nbs_pin.base.arguments import a, checked, count, maybe
+from nbs_pin.base.arguments import a, checked, count, maybe, writable
+from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import RUN, Run
 from nbs_pin.base.shown import Shown
@@ -38,6 +40,9 @@ from nbs_pin.certificates.energy_balance import Balance, LoopSamples, balance, s
 from nbs_pin.certificates.glance import Glance, labels
 from nbs_pin.certificates.seen_torque import SeenTorque, seen_torque
 from nbs_pin.certificates.window_watch import UNEXPLAINED, WindowWatch
+
+COLUMNS = ("t", "V", "V_bound")
+"""The first columns of what `Monitored.save` writes."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,6 +97,13 @@ class Monitored(Shown):
 
     def _facts(self) -> Iterable[str]:
         return f"{len(self.t)} rows", self.verdict
+
+    @checked(path=writable)
+    def save(self, path: str | Path) -> Path:
+        """Write times, V and its bound, and each joint's |z1| with its bound as a CSV file; returns its path."""
+        joints = [f"{kind}_{name}" for kind in ("error", "bound") for name in self.joint_names]
+        rows = np.column_stack([self.t, self.storage, self.promise, self.joint_errors, self.joint_bounds])
+        return write_csv(Path(path), [*COLUMNS, *joints], rows.tolist())
 
     @cached_property
     def exceeded(self) -> Bool[np.ndarray, " rows"]:

@@ -135,7 +135,7 @@ class Certify(FileUnits, Reported):
     attack: bool = False
     """Search for the worst disturbance along gradients through the closed loop, not only among waves."""
     monitor: Annotated[Path | None, tyro.conf.arg(metavar="RUN.npz"), default("none")] = None
-    """Check this run against the certificate, and write monitor.png."""
+    """Check this run against the certificate, and write monitor.png and monitor.csv."""
     seed: Annotated[int, integer("--seed", most=2**31 - 1)] = 0
     """Seed of network weights, starts and disturbances."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), default("out/certify-ROBOT")] = None

@@ -18,7 +18,7 @@ class Replay:
     """
 
     run_file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """A run.npz, or the folder that contains one."""
+    """A run.npz, the folder that contains one, or a .mcap or .csv file of nbs-pin export-run."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), default("replay.html beside the run")] = None
     """The page to write."""
     robot: Annotated[str | None, tyro.conf.arg(metavar="ROBOT"), default("the one the run names")] = None

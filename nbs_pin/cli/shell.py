@@ -28,6 +28,7 @@ from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.excite import Excite
 from nbs_pin.cli.exit_codes import BAD_INPUT, NO_PROMISE, SIGNALLED
 from nbs_pin.cli.export import Export
+from nbs_pin.cli.export_run import ExportRun
 from nbs_pin.cli.faults import Faults
 from nbs_pin.cli.learn import Learn
 from nbs_pin.cli.log import Log
@@ -55,6 +56,7 @@ COMMANDS: dict[str, type] = {
     "verify": Verify,
     "export": Export,
     "replay": Replay,
+    "export-run": ExportRun,
     "report": Report,
     "reproduce": Reproduce,
     "run": Run,
@@ -62,7 +64,7 @@ COMMANDS: dict[str, type] = {
     "bench": Bench,
     "robots": Robots,
 }
-"""The options class of every command. The module of the same name in `nbs_pin.commands` does the work in `run`."""
+"""The options class of every command. The module of its name in `nbs_pin.commands`, _ for -, does the work in `run`."""
 _DESCRIPTION = (
     "Tracking control for any URDF arm. `nbs-pin COMMAND --help` lists the options of a command, "
     "`nbs-pin --version` prints the version, `nbs-pin --tyro-print-completion bash` (or zsh) a script for completion. "
@@ -127,7 +129,7 @@ def _run(arguments: list[str], notes: Console, stops: list[int], begin: Callable
     os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is rendered by MuJoCo, which would look for a window system
     if command is not None:
         with notes.status("loading"):
-            body = import_module(f"nbs_pin.commands.{arguments[0]}")
+            body = import_module(f"nbs_pin.commands.{arguments[0].replace('-', '_')}")
         begin()
         if stops:  # a library that is being imported may swallow the interrupt
             raise KeyboardInterrupt

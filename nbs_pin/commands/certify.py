@@ -37,7 +37,8 @@ from nbs_pin.storage.checkpoints import load, load_with, save
 
 FILES = ("certificate.png", "run.npz", SUMMARY)
 """Files of `write_results`; run.npz only if a worst motion was found."""
-MONITOR, DESIGNED, CERTIFICATE, ARM = "monitor.png", "controller.nbs", "certificate.json", "arm.urdf"
+MONITOR, WATCHED = "monitor.png", "monitor.csv"
+DESIGNED, CERTIFICATE, ARM = "controller.nbs", "certificate.json", "arm.urdf"
 """Further files, for a monitored run, for a design and for `nbs-pin verify`."""
 
 
@@ -55,7 +56,9 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         robot = arm_of(controller, task)
         watched = None if options.monitor is None else Run.load(options.monitor)
     results = Results.of(options, robot.name, robot, against=robot.source)
-    results = results.check((*FILES, MONITOR, DESIGNED, CERTIFICATE, ARM), options.force, whose="another certificate")
+    results = results.check(
+        (*FILES, MONITOR, WATCHED, DESIGNED, CERTIFICATE, ARM), options.force, whose="another certificate"
+    )
     with results.made() as folder:
         proposal = None
         if options.wanted is not None:
@@ -217,9 +220,11 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
     given, folder = results.facts["settings"], results.folder
     saved = given["controller"].endswith(SAVED)
     found = {"law": Path(given["controller"]).name if saved else "a law built for it"} | figures(result)
-    with results.replaced((FILES[1], DESIGNED, CERTIFICATE, ARM, FILES[0], MONITOR), found) as draft:
+    with results.replaced((FILES[1], WATCHED, DESIGNED, CERTIFICATE, ARM, FILES[0], MONITOR), found) as draft:
         if result.attack is not None:
             result.attack.run.save(draft / FILES[1])
+        if result.watched is not None:
+            result.watched.save(draft / WATCHED)
         if result.proposal is not None:
             save(result.proposal.controller, draft / DESIGNED)
         if as_file:
@@ -236,7 +241,7 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
         with drawing(folder / MONITOR) as path:
             title = f"{found['arm'] or 'a run'}: a run against its certificate"
             plot_monitor(result.watched, path, units=result.certificate.joint_units, title=title, settings=settings)
-    written = (FILES[0], FILES[1], MONITOR, DESIGNED, CERTIFICATE, ARM, SUMMARY)
+    written = (FILES[0], FILES[1], MONITOR, WATCHED, DESIGNED, CERTIFICATE, ARM, SUMMARY)
     return found, [name for name in written if (folder / name).exists()]
 
 

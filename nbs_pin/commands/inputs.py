@@ -1,6 +1,7 @@
 """Inputs of several commands: an arm with its limits, a law by name or from a file."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,11 @@ def arm_of(options: Track | Train) -> Robot:
         effort = {"effort": options.effort_limit or math.inf}
         given["limits"] = {**limits, ALL: {**limits.get(ALL, {}), **effort}}
     return load_robot(options.robot, **given)
+
+
+def run_file(given: Path) -> Path:
+    """The file of a run, or that in a folder of results."""
+    return given / "run.npz" if given.is_dir() else given
 
 
 def law_of(name: str, robot: Robot, **settings: Any) -> Controller:

@@ -4,16 +4,19 @@ import webbrowser
 
 from rich.console import Console
 
+from nbs_pin.base.exports import KINDS
 from nbs_pin.base.records import Run
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.values import OptionError
+from nbs_pin.commands.inputs import run_file
 from nbs_pin.reports.replay import replay
+from nbs_pin.reports.run_import import import_run
 from nbs_pin.robots.robot import load_robot
 
 
 def run(options: Replay, console: Console, notes: Console) -> None:
     """Write the page and print its path; raises NbsPinError or OSError."""
-    source = options.run_file / "run.npz" if options.run_file.is_dir() else options.run_file
+    source = run_file(options.run_file)
     page = options.out or source.with_name("replay.html")
     if page.is_dir():
         raise OptionError(f"--out '{page}' is a folder; give a file such as '{page / 'replay.html'}'.")
@@ -23,7 +26,9 @@ def run(options: Replay, console: Console, notes: Console) -> None:
         if options.robot is None:
             options.arm.refuse_without_arm("the run names its arm; give it with --robot")
         robot = None if options.robot is None else load_robot(options.robot, **options.arm.given())
-        replay(Run.load(source), page, robot, start=options.start)
+        exported = source.suffix.lower().removeprefix(".") in KINDS
+        played = import_run(source, robot) if exported else Run.load(source)
+        replay(played, page, robot, start=options.start)
     console.print(str(page), soft_wrap=True, highlight=False, markup=False)
     if options.open and not webbrowser.open(page.resolve().as_uri()):
         notes.print(f"nbs-pin: no browser could be opened; open {page} yourself.", soft_wrap=True, markup=False)

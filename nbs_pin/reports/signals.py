@@ -6,10 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nbs_pin.base.records import Run
-from nbs_pin.dynamics.friction import JointFriction
-from nbs_pin.dynamics.momentum_observer import MomentumObserver
-from nbs_pin.reports.captions import friction_of
 from nbs_pin.reports.estimate_panels import panels_of
+from nbs_pin.reports.external import external_torque
 from nbs_pin.reports.pages import encoded
 from nbs_pin.reports.plotting import stretches
 from nbs_pin.reports.scene import positions, tips_of
@@ -29,8 +27,7 @@ def signals_of(run: Run, robot: Robot, most: int = MAX_ROWS) -> dict[str, Any]:
     if rows[-1] == len(run.t) - 1 and len(rows) > 1:  # the last torque was computed, but never applied
         picked["tau"][-1], asked = picked["tau"][-2], np.concatenate([asked[:-1], asked[-2:-1]])
         picked["disturbance"][-1] = picked["disturbance"][-2]
-    friction = JointFriction.of(robot) if friction_of(run) == "keep" else None
-    picked["external"] = MomentumObserver.for_robot(robot, friction=friction).observe(run).torque[rows]
+    picked["external"] = external_torque(run, robot)[rows]
     cut = np.abs(run.tau_command[:-1]) > run.effort_limit
     ends, t = tips_of(run, robot), run.t
     gap = positions(robot, ends, picked["q"]) - positions(robot, ends, picked["q_ref"])
