@@ -113,12 +113,15 @@ def samples(folder: Path) -> None:
     q = np.column_stack([1.0 - np.cos(np.pi * t), 0.5 * np.cos(np.pi * t)])  # from rest to rest
     v, a = np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis=0)
     zero = np.zeros_like(q)
-    nbs.Run(
+    run = nbs.Run(
         t=t, q=q, v=v, tau=zero, tau_command=zero, disturbance=zero, q_ref=q, v_ref=v, a_ref=a,
         effort_limit=robot.effort_limit, continuous=robot.continuous, joint_names=robot.joint_names, period=t[1],
         robot=robot.source, robot_sha256=robot.sha256, robot_options=robot.options, info={"seed": 1},
         prismatic=robot.prismatic,
-    ).save(folder / "run.npz")  # fmt: skip
+    )  # fmt: skip
+    run.save(folder / "run.npz")
+    for kind in ("mcap", "csv"):
+        nbs.export_run(run, folder / f"exported.{kind}")
     trajectory = np.arange(40) // 20
     about = {"robot": {"source": robot.source, "options": {}}}
     nbs.Dataset(q, v, a, a + q, t, trajectory, robot.parents, robot.prismatic, "two_link", about).save(
@@ -163,7 +166,7 @@ offset="0"/>
 
 
 def _run(path: Path) -> Iterator[Any]:
-    run = nbs.Run.load(path)
+    run = nbs.Run.load(path) if path.suffix == ".npz" else nbs.import_run(path, nbs.load_robot("two_link"))
     yield from (run.t, run.q, run.v, run.tau, run.q_ref, run.period)
     replay(run, path.with_name("page.html"))
 
@@ -195,6 +198,8 @@ def _mesh(path: Path) -> Iterator[Any]:
 
 READERS: dict[str, Callable[[Path], Iterator[Any]]] = {
     "run.npz": _run,
+    "exported.mcap": _run,
+    "exported.csv": _run,
     "data.npz": _data(nbs.load_dataset),
     "log.npz": _data(nbs.load_log),
     "log.csv": _data(nbs.load_log),

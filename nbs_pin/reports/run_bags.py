@@ -1,6 +1,6 @@
 """Runs as MCAP: a message of ROS 2 for each instant and topic, in CDR with its schema, in chunks packed by zstd."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,15 +97,17 @@ def instants(stamps: Int[np.ndarray, " rows"], period: float, begins: float) -> 
     return np.where(np.abs(multiples - t) < 1e-9, multiples, t)
 
 
-def read_bag(path: Path) -> tuple[dict[str, tuple[Int[np.ndarray, " rows"], Topic]], dict[str, str]]:
-    """The times in [ns] and the joint states of every topic of a bag, and the texts that were sent first, by topic.
+def read_bag(
+    path: Path, topics: Collection[str]
+) -> tuple[dict[str, tuple[Int[np.ndarray, " rows"], Topic]], dict[str, str]]:
+    """Of the topics of a bag, times in [ns] and joint states, and the texts that were sent first, by topic.
 
     Raises:
         MissingExtra: If the extra `logs` is not installed.
         FileFormatError: If the bag is damaged, or the names or sizes in a topic change.
     """
     with opened(path) as reader:
-        wanted = [connection for connection in reader.connections if connection.msgtype in (STATES, _TEXT)]
+        wanted = [c for c in reader.connections if c.msgtype in (STATES, _TEXT) and c.topic in topics]
         found: dict[str, list[tuple[int, Any]]] = {connection.topic: [] for connection in wanted}
         for connection, stamp, raw in reader.messages(connections=wanted):
             found[connection.topic].append((stamp, reader.deserialize(raw, connection.msgtype)))

@@ -18,6 +18,9 @@ from nbs_pin.robots.robot import ARM, Robot
 
 _STATED = ("effort_limit", "continuous", "prismatic", "robot", "robot_sha256", "robot_options", "info")
 """What a run has besides its rows and its period."""
+_ESTIMATES = "/estimates"
+_NEEDED, _FURTHER = (MEASURED, "/reference", FACTS), ("/command", "/disturbance", _ESTIMATES)
+"""Topics that a run is made of; others can be computed from them."""
 
 
 @checked(path=readable, robot=maybe(ARM))
@@ -62,8 +65,8 @@ def import_run(path: str | Path, robot: Robot | None = None) -> Run:
 
 def _of_bag(path: Path) -> Run:
     """The run in a .mcap file."""
-    topics, texts = read_bag(path)
-    absent = [topic for topic in (MEASURED, "/reference", FACTS) if topic not in topics and topic not in texts]
+    topics, texts = read_bag(path, (*_NEEDED, *_FURTHER))
+    absent = [topic for topic in _NEEDED if topic not in topics and topic not in texts]
     if absent:
         raise FileFormatError(f"{path}: no {absent[0]} of a run; export it with states and reference.")
     stated = parse_json(path, FACTS, texts[FACTS])
@@ -73,8 +76,7 @@ def _of_bag(path: Path) -> Run:
     stamps, states = topics[MEASURED]
     parts: dict[str, Any] = {}
     for topic, (own, of) in topics.items():
-        of_joints = topic not in ("/estimates", "/certificate")
-        if not np.array_equal(own, stamps) or (of_joints and of.names != states.names):
+        if not np.array_equal(own, stamps) or (topic != _ESTIMATES and of.names != states.names):
             raise FileFormatError(f"{path}: {topic} has other rows or joints than {MEASURED}; export the run again.")
         parts |= {f"{topic}/{part}": values for part, values in of.parts.items()}
     lacking = [name for name in ("position", "velocity", "effort") if name not in states.parts]
@@ -96,7 +98,7 @@ def _of_bag(path: Path) -> Run:
         a_ref=np.gradient(v_ref, stamps / 1e9, axis=0) if len(stamps) > 1 else np.zeros_like(v_ref),
         joint_names=tuple(states.names),
         period=period,
-        estimates=parts.get("/estimates/position"),
+        estimates=parts.get(f"{_ESTIMATES}/position"),
         **{name: _inf(stated[name]) if name == "effort_limit" else stated[name] for name in _STATED},
     )
 
