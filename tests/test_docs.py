@@ -93,7 +93,9 @@ def test_pictures_are_of_the_commands_beside_them():
         for command in made_by(runs[name])
     ]
     assert len(shown) > 12
-    is_there = [bool(re.search(rf"{re.escape(command)}( --out \S+)? *(`|#|$)", text, re.M)) for _, command, text in shown]
+    is_there = [
+        bool(re.search(rf"{re.escape(command)}( --out \S+)? *(`|#|$)", text, re.M)) for _, command, text in shown
+    ]
     assert [(page, command) for (page, command, _), there in zip(shown, is_there, strict=True) if not there] == []
 
 
