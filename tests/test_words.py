@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 import nbs_pin as nbs
-from nbs_pin.base.shown import counted, weighed
-from nbs_pin.base.units import percent
+from nbs_pin.base.units import counted, percent, weighed
 from nbs_pin.reports.report_tables import numbers_table
 from nbs_pin.reports.verdicts import verdict_of
 from tests.test_report import moving_run, tracking_figures

@@ -15,7 +15,8 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import RUN, Run
-from nbs_pin.base.shown import Cells, Shown, counted
+from nbs_pin.base.shown import Cells, Shown
+from nbs_pin.base.units import counted
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider
 

@@ -17,8 +17,8 @@ from nbs_pin.base.arrays import Array, JointArray
 from nbs_pin.base.checks import floats, told
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
-from nbs_pin.base.shown import Cells, Shown, counted, joints_told
-from nbs_pin.base.units import JointUnits, measured, units_of
+from nbs_pin.base.shown import Cells, Shown, joints_told
+from nbs_pin.base.units import JointUnits, counted, measured, units_of
 
 RUN_FORMAT = "nbs_pin run 1"
 """Value of the entry `format` in a run file."""

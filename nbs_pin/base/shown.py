@@ -1,10 +1,12 @@
 """How objects are shown: in one line at a prompt, and as a small table in a notebook."""
 
 import html
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from nbs_pin.base.units import counted
 
 
 class Cells(NamedTuple):
@@ -47,20 +49,9 @@ def mixture(parts: Any, names: Sequence[str]) -> str:
     return " ".join(f"{parts[k]:+.2f} {names[k]}" for k in largest)
 
 
-def counted(count: int, noun: str, plural: str = "") -> str:
-    """A number of things in words: "1 start", "2 starts"; plural: of a noun that takes more than an s."""
-    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
-
-
 def joints_told(count: int) -> str:
     """A number of joints in words."""
     return counted(count, "joint")
-
-
-def weighed(factors: Mapping[str, str], constant: str = "0", unit: str = "") -> str:
-    """A sum of numbers times symbols and a constant: "2 a + b + 3 N" for {"a": "2", "b": "1", "c": "0"}, "3", "N"."""
-    terms = [of if factor == "1" else f"{factor} {of}" for of, factor in factors.items() if factor != "0"]
-    return " + ".join([*terms, *([f"{constant} {unit}".rstrip()] if constant != "0" or not terms else [])])
 
 
 def spread(name: str, values: Any, unit: str) -> str:

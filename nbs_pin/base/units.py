@@ -1,7 +1,7 @@
 """Units of joints: rad and N·m where a joint turns, m and N where it slides; all that shows numbers asks here."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 
@@ -65,6 +65,17 @@ def measured(value: float, unit: str) -> str:
 def percent(share: float, digits: int = 0) -> str:
     """A share in percent, as in "63 %"."""
     return f"{share:.{digits}%}".replace("%", " %")
+
+
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """A number of things in words: "1 start", "2 starts"; plural: of a noun that takes more than an s."""
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
+
+
+def weighed(factors: Mapping[str, str], constant: str = "0", unit: str = "") -> str:
+    """A sum of numbers times symbols and a constant: "2 a + b + 3 N" for {"a": "2", "b": "1", "c": "0"}, "3", "N"."""
+    terms = [of if factor == "1" else f"{factor} {of}" for of, factor in factors.items() if factor != "0"]
+    return " + ".join([*terms, *([f"{constant} {unit}".rstrip()] if constant != "0" or not terms else [])])
 
 
 def with_units(texts: Sequence[str], given: Sequence[str]) -> list[str]:

@@ -11,7 +11,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from nbs_pin.base.exceptions import NbsPinError
-from nbs_pin.base.shown import joints_told
+from nbs_pin.base.units import counted
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INTEGER = re.compile(r"[0-9]+")
@@ -177,8 +177,8 @@ class DisturbanceText:
 
         if len(self.sizes) not in (0, 1, nv):
             raise OptionError(
-                f"--disturbance '{self.text}' has {len(self.sizes)} torques for {joints_told(nv)}; give one or one "
-                "per joint."
+                f"--disturbance '{self.text}' has {len(self.sizes)} torques for {counted(nv, 'joint')}; give one or "
+                "one per joint."
             )
         size = self.sizes[0] if len(self.sizes) == 1 else list(self.sizes)
         match self.kind:

@@ -16,9 +16,9 @@ from nbs_pin.base.exceptions import ArgumentError, SimulationDiverged
 from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Run
-from nbs_pin.base.shown import counted, joints_told, weighed
+from nbs_pin.base.shown import joints_told
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import by_quantity, percent, several, units_of
+from nbs_pin.base.units import by_quantity, counted, percent, several, units_of, weighed
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.values import SAVED, OptionError
 from nbs_pin.commands.results import Results, drawing, keywords, table, tell

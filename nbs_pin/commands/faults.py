@@ -8,8 +8,8 @@ from rich.console import Console
 
 from nbs_pin.base.files import replaced_together
 from nbs_pin.base.plain import plain
-from nbs_pin.base.shown import counted
 from nbs_pin.base.summaries import SUMMARY, summary_text
+from nbs_pin.base.units import counted
 from nbs_pin.base.versions import versions
 from nbs_pin.benchmarks.faults import MATRIX, matrix
 from nbs_pin.cli.exit_codes import STOPPED

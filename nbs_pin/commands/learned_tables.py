@@ -5,9 +5,8 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from nbs_pin.base.shown import counted
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import column, percent
+from nbs_pin.base.units import column, counted, percent
 from nbs_pin.commands.results import table, tell
 from nbs_pin.reports.verdicts import verdict_of
 

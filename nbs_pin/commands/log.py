@@ -10,8 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from nbs_pin.base.doors import BLANK, option
-from nbs_pin.base.shown import counted, joints_told
-from nbs_pin.base.units import column, units
+from nbs_pin.base.shown import joints_told
+from nbs_pin.base.units import column, counted, units
 from nbs_pin.cli.log import Log
 from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.results import next_step, table, tell

@@ -9,8 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.shown import counted
-from nbs_pin.base.units import TURNING, column, units
+from nbs_pin.base.units import TURNING, column, counted, units
 from nbs_pin.cli.robots import Robots
 from nbs_pin.commands.results import next_step
 from nbs_pin.robots.catalogue import ROBOT_NAMES

@@ -10,9 +10,8 @@ from rich.text import Text
 from nbs_pin.base.doors import typed_command
 from nbs_pin.base.plain import plain
 from nbs_pin.base.records import Run
-from nbs_pin.base.shown import counted
 from nbs_pin.base.summaries import SUMMARY
-from nbs_pin.base.units import by_quantity, percent, several
+from nbs_pin.base.units import by_quantity, counted, percent, several
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import plain_numbers
 from nbs_pin.commands.inputs import arm_of, law_of

@@ -4,7 +4,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from nbs_pin.base.shown import counted
+from nbs_pin.base.units import counted
 from nbs_pin.cli.exit_codes import NO_PROMISE
 from nbs_pin.cli.verify import Verify
 from nbs_pin.commands.results import tell, titled

@@ -14,8 +14,9 @@ from nbs_pin.base.arrays import Array, Matrices, Scalars, Vectors, as_vectors, f
 from nbs_pin.base.claims import refuse
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
-from nbs_pin.base.shown import counted, joints_told
+from nbs_pin.base.shown import joints_told
 from nbs_pin.base.storable import storable
+from nbs_pin.base.units import counted
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size
 from nbs_pin.dynamics.lagrangian_network import CompiledTorque, LagrangianNetwork
 from nbs_pin.dynamics.provider import DynamicsProvider

@@ -14,8 +14,8 @@ from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import RUN, Run
-from nbs_pin.base.shown import Cells, Shown, counted, joints_told, spread
-from nbs_pin.base.units import JointUnits, measured, units_of
+from nbs_pin.base.shown import Cells, Shown, joints_told, spread
+from nbs_pin.base.units import JointUnits, counted, measured, units_of
 from nbs_pin.dynamics.friction import JointFriction, friction_of_size, has_viscous_and_coulomb_only
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import MODEL, DynamicsProvider

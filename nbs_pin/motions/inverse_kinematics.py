@@ -21,7 +21,8 @@ from jaxtyping import Bool, Float
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.base.shown import counted, joints_told
+from nbs_pin.base.shown import joints_told
+from nbs_pin.base.units import counted
 from nbs_pin.robots.robot import Robot
 
 _POWER = 12

@@ -16,8 +16,8 @@ from nbs_pin.base.csv_files import joint_columns, joint_order, read_csv
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require
 from nbs_pin.base.records import Reference
-from nbs_pin.base.shown import Shown, counted, joints_told
-from nbs_pin.base.units import units
+from nbs_pin.base.shown import Shown, joints_told
+from nbs_pin.base.units import counted, units
 from nbs_pin.motions.recordings import (
     Joints,
     degrees_fault,

@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from nbs_pin.base.records import Run
-from nbs_pin.base.shown import counted
-from nbs_pin.base.units import percent, several
+from nbs_pin.base.units import counted, percent, several
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, SATURATED, TORQUE, Heading, picture
 from nbs_pin.simulation.metrics import PAPER_THRESHOLD, squared_error
 

@@ -16,8 +16,7 @@ from nbs_pin.accuracy.compare import Growth, ModelErrors
 from nbs_pin.accuracy.energy_drift import FreeMotion
 from nbs_pin.accuracy.error_maps import ErrorMap
 from nbs_pin.accuracy.mismatch import Mismatch
-from nbs_pin.base.shown import counted, weighed
-from nbs_pin.base.units import TURNING, JointUnits, percent, several
+from nbs_pin.base.units import TURNING, JointUnits, counted, percent, several, weighed
 from nbs_pin.reports.plotting import (
     ACTUAL,
     ERROR,

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nbs_pin.base.doors import option
-from nbs_pin.base.shown import counted
-from nbs_pin.base.units import measured, percent, several
+from nbs_pin.base.units import counted, measured, percent, several
 from nbs_pin.simulation.run_figures import LIGHT, load_of
 
 GOOD, WARNING, BAD, NOTE = "good", "warning", "bad", "note"
