@@ -24,12 +24,10 @@ from nbs_pin.commands.results import Results, drawing, sha256_of
 from nbs_pin.dynamics.friction import DriveFriction, JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
-from nbs_pin.identification.coupling import settled_with
+from nbs_pin.identification.coupling import Coupling
 from nbs_pin.identification.datasets import Dataset
-from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.fit import fit, split_data
 from nbs_pin.identification.fit_report import FitReport, torque_errors
-from nbs_pin.identification.identify import rotors_wanted
 from nbs_pin.identification.logs import load_log
 from nbs_pin.reports.captions import chosen
 from nbs_pin.reports.plotting import ACTUAL, ERROR, LIMIT, REFERENCE, Heading, picture
@@ -161,12 +159,10 @@ def data_and_arm(
 def learn(data: Dataset, model: str, robot: Robot | None, seed: int = 0, **settings: Any) -> Learned:
     """The model that `fit` learns from the data, with its settings and errors, and the data held out as a test."""
     train, test = split_data(data, settings.pop("held_out", None), seed)
-    if model == "identified" and robot is not None:
-        rotors = rotors_wanted(settings.get("rotor_inertia"), robot)
-        wanted = Wanted(settings.get("friction"), settings.get("offset"), rotors, settings.get("transition", 0.01))
-        train, test, coupled = settled_with(train, test, robot, settings.get("coupling"), wanted)
-        settings["coupling"] = coupled or False
     found = fit(train, model, seed, robot=robot, held_out=0.0 if test is None else test, **settings)
+    coupled = Coupling.of_plain(found.report.details)
+    if coupled is not None and coupled.at_motors:
+        train, test = coupled.of_joints(train), None if test is None else coupled.of_joints(test)
     joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
     return Learned(found, found.report, found.friction, train, test, joints, tuple(data.prismatic.tolist()))
 
@@ -194,7 +190,7 @@ def figures(result: Learned) -> dict[str, Any]:
             "viscous_friction": None if friction is None else friction.viscous,
             "coulomb_friction_Nm": None if friction is None else friction.coulomb,
             "rotor_inertia": _rotors(result.model),
-            "coupling": getattr(result.model, "coupling", None),
+            "coupling": report["details"].get("coupling"),
             **_others(friction),
             "curves": curves,
         }

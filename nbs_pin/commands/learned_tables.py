@@ -8,6 +8,7 @@ from rich.text import Text
 from nbs_pin.base.summaries import SUMMARY
 from nbs_pin.base.units import column, counted, percent
 from nbs_pin.commands.results import table, tell
+from nbs_pin.identification.coupling import Coupling
 from nbs_pin.reports.verdicts import verdict_of
 
 _WIDE = 4
@@ -94,6 +95,7 @@ def _lines(figures: dict[str, Any]) -> list[str]:
         + ("" if test is None else f", {_short(test)} on {figures['test_samples']} of trajectories held out"),
         f"{counted(figures['parameters'], 'number')} learned in {figures['seconds']:.1f} s "
         f"({_ENDED.get(figures['stopped'], figures['stopped'])})",
+        *_coupling(figures),
         *_masses(figures["details"]),
         *([f"to try next: {figures['next_try']}"] if figures["next_try"] else []),
         *(f"the data do not determine: {text}" for text in shown),
@@ -103,6 +105,12 @@ def _lines(figures: dict[str, Any]) -> list[str]:
 
 def _short(value: float | None) -> str:
     return "none" if value is None else f"{value:.2e}"
+
+
+def _coupling(figures: dict[str, Any]) -> list[str]:
+    """How the motors turn with the joints, where some turn several."""
+    coupled = Coupling.of_plain(figures["details"])
+    return [] if coupled is None else [coupled.said(figures["joints"])]
 
 
 def _masses(details: dict[str, Any]) -> list[str]:

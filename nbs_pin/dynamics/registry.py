@@ -20,11 +20,13 @@ PROVIDERS: dict[str, Entry] = {
     "pinocchio": Entry(f"{_DYNAMICS}.pinocchio:PinocchioDynamics"),
     "analytic": Entry(f"{_DYNAMICS}.analytic:AnalyticDynamics"),
     "identified": Entry(f"{_DYNAMICS}.identified:IdentifiedDynamics"),
+    "coupled": Entry(f"{_DYNAMICS}.coupled:CoupledDynamics"),
     "lagrangian": Entry(f"{_DYNAMICS}.lagrangian:LagrangianDynamics"),
     "residual": Entry(f"{_DYNAMICS}.residual:ResidualDynamics"),
     "chain": Entry(f"{_DYNAMICS}.chain:Chain"),
+    "rotors": Entry(f"{_DYNAMICS}.coupled_network:CoupledNetwork"),
 }
-"""Model classes by name, and the chain network, which `fit` trains by a method of its own."""
+"""Model classes by name, and the networks that `fit` trains by a method of its own."""
 
 
 def make_network(name: str, prismatic: Sequence[bool], seed: int = 0, **options: Any) -> "LagrangianNetwork":

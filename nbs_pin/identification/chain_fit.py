@@ -19,19 +19,23 @@ import torch
 from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import positive, told
 from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.chain import Chain, random_tree
+from nbs_pin.dynamics.coupled_network import CoupledNetwork
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pseudo_inertia import coordinates
+from nbs_pin.identification.coupling import Coupling, geometry_of, in_motors, matrix_of
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.drive_terms import DriveTerms
 from nbs_pin.identification.explain import Bodies, IdentificationReport, contradicted, explain
 from nbs_pin.identification.levenberg_marquardt import Descent, levenberg_marquardt
 from nbs_pin.identification.physical_tree import PhysicalTree
+from nbs_pin.identification.regressor import Geometry
 from nbs_pin.identification.tree_search import Measurements, TreeEstimate
 from nbs_pin.kernels.threads import cores
 
@@ -63,7 +67,8 @@ _LEAST = 1e-9
 class ChainFit:
     """A fitted chain network and the record of its fit."""
 
-    network: Chain
+    network: Chain | CoupledNetwork
+    """A chain; with rotors beside it where several joints turn them."""
     friction: JointFriction | None
     """Friction and offsets, None if there are none."""
     history: Float[np.ndarray, " steps"]
@@ -88,6 +93,7 @@ def fit_chain(
     friction: bool | None = None,
     offset: bool | None = None,
     rotor_inertia: bool | None = None,
+    coupled: Coupling | None = None,
     transition: float = 0.01,
     regularisation: float = 0.3,
     starts: int = 64,
@@ -103,6 +109,8 @@ def fit_chain(
         friction: Terms of friction to find, as in `identify`.
         offset: Constant torques to find, as in `identify`.
         rotor_inertia: Inertias of rotors behind gears to find, which a tree of bodies cannot represent; likewise.
+        coupled: Motors that turn several joints; friction and rotors are then theirs. The data have the torques of the
+            joints.
         transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
         regularisation: γ, as in `identify`.
         starts: Most random trees; fewer if one explains the data to rounding or enough find the best minimum.
@@ -129,24 +137,25 @@ def fit_chain(
     rng = np.random.default_rng(seed)
     # BLAS threads inside the threads of the search would only compete; the limit applies to the whole process.
     with _ONE_AT_A_TIME, threadpool_limits(1, "blas"):
-        wanted, scaled, descents, interrupted = _searched(data, wanted, layout, starts, rng, progress)
+        wanted, scaled, descents, interrupted = _searched(data, wanted, coupled, layout, starts, rng, progress)
         tries: list[_Try] = []
         for descent in sorted(descents, key=_cost)[:_TRIES]:
             polished = _polished(descent.at, scaled)
-            bodies = explain(TreeGeometry(polished.at), data, wanted, regularisation, others=_AXIS * data.nv)
-            chosen = _measured(data, bodies.terms, _needed(polished.at, bodies, data))
+            geometry = geometry_of(TreeGeometry(polished.at), coupled)
+            bodies = explain(geometry, in_motors(data, coupled), wanted, regularisation, others=_AXIS * data.nv)
+            chosen = _measured(data, bodies.terms, coupled, _needed(geometry, bodies, in_motors(data, coupled)))
             physical = _physical(polished.at, bodies, chosen, regularisation, right_angles)
             cost = physical.whole().cost(chosen)
             tries.append(_Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(scaled) + _EXACT))
             if tries[-1].reached:
                 break
     best = min(tries, key=lambda found: found.cost)
-    _write(best.physical, network, best.bodies.terms)
+    _write(best.physical, network)
     costs = np.array([_cost(descent) for descent in descents])
     converged = tries[-1].reached and _settled(costs)
     return ChainFit(
-        network=network,
-        friction=best.bodies.terms.friction(best.physical.drag),
+        network=_with_rotors(network, best.bodies.terms.rotors(best.physical.drag), coupled),
+        friction=best.bodies.terms.friction(best.physical.drag, matrix_of(coupled)),
         history=np.array(best.descent.history),
         evaluations=sum(len(descent.history) for descent in descents),
         costs=costs,
@@ -190,20 +199,23 @@ class TreeGeometry:
         return self.guess.regressor(q, v, a)
 
 
-def _needed(guess: TreeEstimate, bodies: Bodies, data: Dataset) -> Float[np.ndarray, "samples n"]:
+def _needed(geometry: Geometry, bodies: Bodies, data: Dataset) -> Float[np.ndarray, "samples n"]:
     """The torque that bodies and rotors need [N·m]."""
     own = coordinates(bodies.factors @ bodies.factors.swapaxes(1, 2)).ravel()
-    needed = TreeGeometry(guess).regressor(data.q, data.v, data.a) @ own
+    needed = geometry.regressor(data.q, data.v, data.a) @ own
     return needed if bodies.rotors is None else needed + bodies.rotors * data.a
 
 
-def _measured(data: Dataset, terms: DriveTerms, needed: np.ndarray | None = None) -> Measurements:
-    """The data, every joint scaled by its torque's standard deviation, at least 1e-3 of the largest RMS torque."""
-    least = 1e-3 * np.sqrt(np.square(data.tau).mean(axis=0).max())
-    scale = np.maximum(data.tau.std(axis=0), least)
-    kinds = terms.factors(data, needed)
-    q, v, a, tau = (np.ascontiguousarray(x) for x in (data.q, data.v, data.a, data.tau))
-    return Measurements(q, v, a, tau, scale, kinds)
+def _measured(
+    data: Dataset, terms: DriveTerms, coupled: Coupling | None, needed: np.ndarray | None = None
+) -> Measurements:
+    """The data, every motor scaled by its torque's standard deviation, at least 1e-3 of the largest RMS torque."""
+    moved = in_motors(data, coupled)
+    least = 1e-3 * np.sqrt(np.square(moved.tau).mean(axis=0).max())
+    scale = np.maximum(moved.tau.std(axis=0), least)
+    kinds = terms.factors(moved, needed)
+    q, v, a, tau = (np.ascontiguousarray(x) for x in (data.q, data.v, data.a, moved.tau))
+    return Measurements(q, v, a, tau, scale, kinds, None if coupled is None else np.linalg.inv(coupled.matrix))
 
 
 def _in_units_of_random_trees(data: Measurements, layout: np.ndarray) -> Measurements:
@@ -228,7 +240,13 @@ def _cost(descent: Descent[TreeEstimate]) -> float:
 
 
 def _searched(
-    data: Dataset, wanted: Wanted, layout: np.ndarray, starts: int, rng: np.random.Generator, progress: bool
+    data: Dataset,
+    wanted: Wanted,
+    coupled: Coupling | None,
+    layout: np.ndarray,
+    starts: int,
+    rng: np.random.Generator,
+    progress: bool,
 ) -> tuple[Wanted, Measurements, list[Descent[TreeEstimate]], bool]:
     """The terms still wanted after the search, the data in its units, its descents, and whether Ctrl-C ended it.
 
@@ -237,7 +255,7 @@ def _searched(
     """
 
     def scaled(terms: DriveTerms) -> Measurements:
-        return _in_units_of_random_trees(_measured(data, terms), layout)
+        return _in_units_of_random_trees(_measured(data, terms, coupled), layout)
 
     if not wanted.is_settled:
         bare = wanted.settled()
@@ -348,14 +366,21 @@ def _fair(start: PhysicalTree, bodies: Bodies, data: Measurements) -> tuple[Meas
     return fair, renewed
 
 
-def _write(tree: PhysicalTree, network: Chain, terms: DriveTerms) -> None:
+def _write(tree: PhysicalTree, network: Chain) -> None:
     """Copy the tree into the parameters of the network."""
     with torch.no_grad():
         for name, value in tree.guess.tree(_triangular(tree.factors))._asdict().items():
             getattr(network, name).copy_(torch.from_numpy(value))
-        rotors = terms.rotors(tree.drag)
-        if rotors is not None:
-            network.rotors.copy_(torch.from_numpy(np.sqrt(rotors)))
+
+
+def _with_rotors(network: Chain, rotors: JointArray | None, coupled: Coupling | None) -> Chain | CoupledNetwork:
+    """The network with these rotor inertias, which several joints turn where the drives are coupled."""
+    if rotors is None:
+        return network
+    whole = network if coupled is None else CoupledNetwork(network, coupled.matrix)
+    with torch.no_grad():
+        whole.rotors.copy_(torch.from_numpy(np.sqrt(rotors)))
+    return whole
 
 
 def _triangular(factors: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:

@@ -7,15 +7,16 @@ may hold the torques of the joints, or those of the motors.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 from threadpoolctl import threadpool_limits
 
+from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.doors import where_printed
 from nbs_pin.dynamics.friction import coupling_of
 from nbs_pin.identification.datasets import Dataset
@@ -53,7 +54,7 @@ class Coupling(NamedTuple):
     matrix: Float[np.ndarray, "n n"]
     """N."""
     at_motors: bool
-    """Whether the torques of the data are those of the motors."""
+    """Whether the torques of the data, or of the log that they are from, are those of the motors."""
 
     def of_joints(self, data: Dataset) -> Dataset:
         """The data with the torques of the joints."""
@@ -62,7 +63,29 @@ class Coupling(NamedTuple):
     def of_motors(self, data: Dataset) -> Dataset:
         """Data with the torques of the joints in coordinates of the motors, but for q."""
         n = self.matrix
-        return replace(data, v=data.v @ n.T, a=data.a @ n.T, tau=data.tau @ np.linalg.inv(n))
+        return replace(data, v=data.v @ n.T, a=data.a @ n.T, tau=self.torques_of_motors(data.tau))
+
+    def torques_of_motors(self, tau: Float[np.ndarray, "samples n"]) -> Float[np.ndarray, "samples n"]:
+        """N⁻ᵀ τ, for torques of the joints."""
+        return np.asarray(tau @ np.linalg.inv(self.matrix))
+
+    def misfit(self, left: JointArray) -> float:
+        """Minus the logarithm of the likelihood per sample, less a constant, of torques that leave this to the motors.
+
+        Σ log σ of these residuals, and the change of variables where the torques of the data are those of the joints.
+        """
+        change = 0.0 if self.at_motors else float(np.linalg.slogdet(self.matrix)[1])
+        return float(np.log(np.maximum(left, 1e-300)).sum()) + change
+
+    def plain(self) -> dict[str, Any]:
+        """The coupling for the details of a `FitReport`."""
+        return {"coupling": self.matrix.tolist(), "torques_of_motors": self.at_motors}
+
+    @classmethod
+    def of_plain(cls, details: Mapping[str, Any]) -> "Coupling | None":
+        """The coupling in these details, None without."""
+        matrix = details.get("coupling")
+        return None if matrix is None else cls(np.array(matrix), details["torques_of_motors"])
 
     def said(self, joints: Sequence[str]) -> str:
         """The coupling in words, without a full stop."""
@@ -99,6 +122,21 @@ class CoupledGeometry:
         """Derivatives of the motors' torques, for speeds and accelerations of the motors."""
         back = np.linalg.inv(self.matrix)
         return np.einsum("jk,rju->rku", back, self.inner.regressor(q, v @ back.T, a @ back.T))
+
+
+def in_motors(data: Dataset, coupled: Coupling | None) -> Dataset:
+    """Data with the torques of the joints in coordinates of the motors, but for q; as they are without coupling."""
+    return data if coupled is None else coupled.of_motors(data)
+
+
+def matrix_of(coupled: Coupling | None) -> Float[np.ndarray, "n n"] | None:
+    """N, None without coupling."""
+    return None if coupled is None else coupled.matrix
+
+
+def geometry_of(inner: Geometry, coupled: Coupling | None) -> Geometry:
+    """The geometry in coordinates of the motors; as it is without coupling."""
+    return inner if coupled is None else CoupledGeometry(inner, coupled.matrix)
 
 
 def find_coupling(geometry: Geometry, data: Dataset, wanted: Wanted) -> Coupling | None:
@@ -146,27 +184,40 @@ def settled(
         found = _settle(data, robot, given, wanted)
     if given is None and found is not None:
         warnings.warn(f"{found.said(robot.joint_names)}; give {_none()} if that cannot be.", stacklevel=stacklevel)
-    return (data, None) if found is None else (found.of_joints(data), Coupling(found.matrix, at_motors=False))
+    return (data if found is None else found.of_joints(data)), found
+
+
+def possible(
+    data: Dataset, others: Dataset | None, robot: Robot | None, given: Given, wanted: Wanted, stacklevel: int = 3
+) -> list[tuple[Dataset, Dataset | None, Coupling | None]]:
+    """What `settled` tells, with `others`, held-out data whose torques are of the same kind.
+
+    Without a robot no coupling is looked for, and for a matrix there are two answers: torques of joints, and of motors.
+    """
+    if given is False or isinstance(given, Coupling) or (given is None and robot is None):
+        return [(data, others, given or None)]
+    found = _sides(given, data) if robot is None else [settled(data, robot, given, wanted, stacklevel + 1)[1]]
+    return [
+        (data, others, None)
+        if side is None
+        else (side.of_joints(data), None if others is None else side.of_joints(others), side)
+        for side in found
+    ]
 
 
 def _settle(data: Dataset, robot: Robot, given: Given, wanted: Wanted) -> Coupling | None:
     """The coupling looked for, or which torques the data hold for a given one."""
-    geometry = RobotGeometry(robot)
+    geometry, some = RobotGeometry(robot), data.thinned(_SOME)
     if given is None:
         return find_coupling(geometry, data, wanted)
-    matrix, some = coupling_of(given, data.nv), data.thinned(_SOME)
-    sides = [Coupling(matrix, at_motors) for at_motors in (False, True)]
-    return min(sides, key=lambda side: _value(geometry, some, wanted, side))
+    sides = _sides(given, data)
+    return sides[0] if len(sides) == 1 else min(sides, key=lambda side: _value(geometry, some, wanted, side))
 
 
-def settled_with(
-    data: Dataset, others: Dataset | None, robot: Robot, given: Given, wanted: Wanted, stacklevel: int = 3
-) -> tuple[Dataset, Dataset | None, Coupling | None]:
-    """The same, with `others`, held-out data whose torques are of the same kind."""
-    whole, found = settled(data, robot, given, wanted, stacklevel + 1)
-    if found is not None and others is not None and whole is not data:
-        others = Coupling(found.matrix, at_motors=True).of_joints(others)
-    return whole, others, found
+def _sides(given: Given, data: Dataset) -> list[Coupling]:
+    """A given matrix with the torques as those of the joints and of the motors, which are one where all are zero."""
+    matrix = coupling_of(given, data.nv)
+    return [Coupling(matrix, at_motors) for at_motors in ((False, True) if data.tau.any() else (False,))]
 
 
 def _none() -> str:
@@ -213,11 +264,8 @@ def _explained(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coup
 
 
 def _value(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coupling) -> float:
-    """Less a constant, minus the logarithm of the likelihood per sample: Σ log σ of the motors' torques, and of the
-    change of variables from those of the joints.
-    """
-    change = 0.0 if coupling.at_motors else float(np.linalg.slogdet(coupling.matrix)[1])
-    return float(np.log(_deviations(geometry, data, wanted, coupling)).sum()) + change
+    """The misfit of arbitrary bodies in this geometry."""
+    return coupling.misfit(_deviations(geometry, data, wanted, coupling))
 
 
 def _deviations(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Coupling) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 import time
 import warnings
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,12 @@ from nbs_pin.base.registry import entry
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.compatibility import arm_fault, other_data_fault
-from nbs_pin.identification.coupling import Coupling, Given, settled_with
+from nbs_pin.identification.coupling import Given, possible
 from nbs_pin.identification.datasets import DATA, Dataset
 from nbs_pin.identification.doubts import doubts, doubts_of_report
 from nbs_pin.identification.drive_choice import Wanted
-from nbs_pin.identification.fit_report import FitReport, torque_nmse, zero_torque_nmse
-from nbs_pin.identification.fitters import FitTask, LearnedDynamics
+from nbs_pin.identification.fit_report import FitReport, torque_errors, torque_nmse, zero_torque_nmse
+from nbs_pin.identification.fitters import FitTask, Fitted, LearnedDynamics
 from nbs_pin.identification.identify import rotors_wanted, sign_fault
 from nbs_pin.identification.registry import MODELS
 from nbs_pin.identification.remainder import next_try, remainder
@@ -69,7 +71,10 @@ def fit(
         offset: Learn constant torques, of sensors or a pull; None those that the data show.
         rotor_inertia: Learn rotor inertias; None those that the robot states or the data show. Networks without a
             nominal model have them in M.
-        coupling: Motors that turn several joints, for "identified", as in `identify`; the other models have none.
+        coupling: Motors that turn several joints, as in `identify`: friction, offsets and rotors are then theirs. None
+            looks for some only where there is a robot, whose geometry counts even if the model does not take it. A
+            matrix without a robot is fitted with the torques of the data as those of the joints and of the motors, and
+            the better fit counts; `report.details` tells which.
         progress: Show a progress bar. Ctrl-C ends the fit of a network and keeps the best iterate.
         **settings: Options of the model, see `fit_network`, `fit_chain` and `identify`; widths of a network.
 
@@ -91,9 +96,9 @@ def fit(
     train, test = split_data(data, held_out, seed)
     rotors = rotors_wanted(rotor_inertia, robot)
     wanted = Wanted(friction, offset, rotors, settings.get("transition", 0.01))
-    train, test, coupled = _uncoupled(model, train, test, robot, coupling, wanted)
-    settings |= {"coupling": coupled or False} if model == "identified" else {}
-    fitted = fitter(FitTask(model, train, test, seed, robot, (friction, offset, rotors), progress, settings))
+    task = FitTask(model, train, test, seed, robot, None, (friction, offset, rotors), progress, settings)
+    task, fitted = _fitted(fitter, task, coupling, wanted)
+    train, test, coupled = task.data, task.held_out, task.coupled
     bare, asked = fitted.assemble(None), {"friction": friction, "offset": offset, "rotor_inertia": rotors}
     left = remainder(bare, train if test is None else test, fitted.friction) if data.tau.any() else None
     joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
@@ -108,7 +113,7 @@ def fit(
         unidentifiable=_useless(bare, train, fitted.friction) + fitted.unidentifiable,
         left={} if left is None else left.plain(),
         next_try="" if left is None else next_try(left, joints, asked),
-        **fitted.record(),
+        **fitted.record(coupled),
     )
     for doubt in (*doubts(train, robot, left, asked, joints), *doubts_of_report(report)):
         warnings.warn(f"{doubt}.", stacklevel=2)
@@ -122,15 +127,24 @@ def _check(data: Dataset, robot: Robot | None) -> None:
         raise ArgumentError(f"{fault}.")
 
 
-def _uncoupled(
-    model: str, train: Dataset, test: Dataset | None, robot: Robot | None, given: Given, wanted: Wanted
-) -> tuple[Dataset, Dataset | None, Coupling | None]:
-    """Data with the torques of the joints, and the coupling of the drives, which only "identified" knows."""
-    if model == "identified" and robot is not None:
-        return settled_with(train, test, robot, given, wanted, stacklevel=5)
-    if given is not None and given is not False:
-        raise ArgumentError(f"model '{model}' takes no coupling; fit 'identified' with the arm's geometry.")
-    return train, test, None
+def _fitted(fitter: Callable[[FitTask], Fitted], task: FitTask, given: Given, wanted: Wanted) -> tuple[FitTask, Fitted]:
+    """The task with the torques of the joints and the coupling of the drives, and its result.
+
+    A matrix without the geometry that tells whether the torques are those of joints or motors is fitted both ways.
+    """
+    done = []
+    for data, held_out, coupled in possible(task.data, task.held_out, task.robot, given, wanted, stacklevel=5):
+        own = replace(task, data=data, held_out=held_out, coupled=coupled)
+        done.append((own, fitter(own)))
+    return done[0] if len(done) == 1 else min(done, key=lambda pair: _misfit(*pair))
+
+
+def _misfit(task: FitTask, fitted: Fitted) -> float:
+    """Minus the logarithm of the likelihood per sample of the torques that were recorded, but for a constant."""
+    assert task.coupled is not None
+    data = task.data if task.held_out is None else task.held_out
+    left = torque_errors(fitted.assemble(None), data, fitted.friction)
+    return task.coupled.misfit(np.sqrt(np.square(task.coupled.torques_of_motors(left)).mean(axis=0)))
 
 
 def split_data(data: Dataset, held_out: Dataset | float | None = None, seed: int = 0) -> tuple[Dataset, Dataset | None]:

@@ -17,6 +17,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.registry import NETWORKS, make_network
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.identification.chain_fit import fit_chain
+from nbs_pin.identification.coupling import Coupling, in_motors
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted, terms_of_rest
 from nbs_pin.identification.fit_report import FitReport
@@ -41,6 +42,8 @@ class FitTask:
     held_out: Dataset | None
     seed: int
     robot: Robot | None
+    coupled: Coupling | None
+    """Motors that turn several joints; the data have the torques of the joints."""
     drives: tuple[bool | None, bool | None, bool | None]
     """Friction, offsets and rotor inertias wanted (`Wanted`)."""
     progress: bool
@@ -84,10 +87,11 @@ class Fitted:
     unidentifiable: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
-    def record(self) -> dict[str, Any]:
-        """What a `FitReport` takes as it is."""
-        names = ("evaluations", "parameters", "history", "held_out", "details")
-        return {name: getattr(self, name) for name in names}
+    def record(self, coupled: Coupling | None) -> dict[str, Any]:
+        """What a `FitReport` takes as it is, with the coupling of the drives."""
+        names = ("evaluations", "parameters", "history", "held_out")
+        details = {**self.details, **({} if coupled is None else coupled.plain())}
+        return {name: getattr(self, name) for name in names} | {"details": details}
 
 
 def _few(data: Dataset) -> Dataset:
@@ -110,6 +114,7 @@ def fit_family(task: FitTask) -> Fitted:
         task.held_out,
         seed=task.seed,
         wanted=wanted,
+        coupled=task.coupled,
         progress=task.progress,
         **settings,
     )
@@ -122,7 +127,7 @@ def fit_rigid_tree(task: FitTask) -> Fitted:
     """Fit a rigid tree of which only the joint tree of the data is known."""
     settings = task.known("transition", "regularisation", "starts", "epsilon", "right_angles")
     names = () if task.robot is None else task.robot.joint_names
-    found = fit_chain(task.data, task.seed, progress=task.progress, **task.wanted(), **settings)
+    found = fit_chain(task.data, task.seed, progress=task.progress, coupled=task.coupled, **task.wanted(), **settings)
     network, bodies = found.network, found.bodies
     return Fitted(
         assemble=lambda report: LagrangianDynamics(network, task.robot, found.friction, report),
@@ -153,13 +158,20 @@ def fit_residual(task: FitTask) -> Fitted:
             "model 'residual' corrects the masses of a URDF, and of this only the geometry was taken; fit 'identified'."
         )
     wanted, prismatic = task.beside(settings), task.data.prismatic.tolist()
-    nominal = PinocchioDynamics(_with_rotors(_needed(task), task.data, wanted))
+    nominal = _nominal(_needed(task), task.data, wanted, task.coupled)
 
     def make(seed: int) -> LagrangianNetwork:
         return ResidualNetwork(nominal, prismatic, seed=seed, **options)
 
     found = fit_network(
-        make, task.data, task.held_out, seed=task.seed, wanted=wanted, progress=task.progress, **settings
+        make,
+        task.data,
+        task.held_out,
+        seed=task.seed,
+        wanted=wanted,
+        coupled=task.coupled,
+        progress=task.progress,
+        **settings,
     )
 
     def assemble(report: FitReport | None) -> LearnedDynamics:
@@ -170,14 +182,21 @@ def fit_residual(task: FitTask) -> Fitted:
     return _of_network(task, found, assemble)
 
 
-def _with_rotors(robot: Robot, data: Dataset, wanted: Wanted) -> Robot:
-    """The arm with rotor inertias that its URDF leaves out, if they are wanted or the torques show them."""
-    if wanted.rotor_inertia is False or robot.armature.any():
-        return robot
-    left = data.tau - PinocchioDynamics(robot).reference_torque(data.q, data.v, data.v, data.a)
-    terms, numbers = terms_of_rest(wanted, data, left)
-    rotors = terms.rotors(numbers)
-    return robot if rotors is None or not rotors.any() else robot.with_armature(rotors)
+def _nominal(robot: Robot, data: Dataset, wanted: Wanted, coupled: Coupling | None) -> PinocchioDynamics:
+    """The arm's model, with rotor inertias that its URDF leaves out if they are wanted or the torques show them."""
+    rotors = robot.armature
+    if wanted.rotor_inertia is not False and not rotors.any():
+        left = data.tau - PinocchioDynamics(robot).reference_torque(data.q, data.v, data.v, data.a)
+        moved = in_motors(replace(data, tau=left), coupled)
+        terms, numbers = terms_of_rest(wanted, in_motors(data, coupled), moved.tau)
+        found = terms.rotors(numbers)
+        rotors = rotors if found is None else found
+    if not rotors.any() or (rotors is robot.armature and coupled is None):
+        return PinocchioDynamics(robot)
+    if coupled is None:
+        return PinocchioDynamics(robot.with_armature(rotors))
+    bodies = np.stack([body.toDynamicParameters() for body in list(robot.model.inertias)[1:]])
+    return CoupledDynamics(robot, bodies, coupled.matrix, motor_inertia=rotors)
 
 
 def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport | None], LearnedDynamics]) -> Fitted:
@@ -198,8 +217,8 @@ def _of_network(task: FitTask, found: NetworkFit, assemble: Callable[[FitReport 
 
 def fit_identified(task: FitTask) -> Fitted:
     """Identify inertial parameters for the arm's geometry."""
-    settings = task.known("transition", "regularisation", "coupling")
-    found = identify(task.data, _needed(task), **task.wanted(), **settings)
+    settings = task.known("transition", "regularisation")
+    found = identify(task.data, _needed(task), coupling=task.coupled or False, **task.wanted(), **settings)
     numbers, report = found.parameters.size, found.report
 
     def assemble(own: FitReport | None) -> LearnedDynamics:

@@ -14,7 +14,7 @@ from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
 from nbs_pin.identification.compatibility import arm_fault
 from nbs_pin.identification.consistent_fit import consistent_fit
-from nbs_pin.identification.coupling import CoupledGeometry, Given, settled
+from nbs_pin.identification.coupling import Given, geometry_of, in_motors, settled
 from nbs_pin.identification.datasets import DATA, Dataset
 from nbs_pin.identification.drive_choice import Wanted
 from nbs_pin.identification.drive_terms import DriveTerms
@@ -96,14 +96,11 @@ def identify(
     if fault:
         raise ArgumentError(f"{in_words(data, 'the data')}: {fault}.")
     data, coupled = settled(data, robot, coupling, wanted)
+    bodies = explain(geometry_of(RobotGeometry(robot), coupled), in_motors(data, coupled), wanted, regularisation)
+    parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
     if coupled is not None:
-        moved, geometry = coupled.of_motors(data), CoupledGeometry(RobotGeometry(robot), coupled.matrix)
-        bodies = explain(geometry, moved, wanted, regularisation)
-        parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
         drag = bodies.terms.friction(bodies.scalars, coupled.matrix)
         return CoupledDynamics(robot, parameters, coupled.matrix, drag, bodies.rotors, bodies.report)
-    bodies = explain(RobotGeometry(robot), data, wanted, regularisation)
-    parameters = inertial_parameters(bodies.factors @ bodies.factors.swapaxes(1, 2))
     return IdentifiedDynamics(robot, parameters, bodies.friction, bodies.rotors, bodies.report)
 
 

@@ -11,12 +11,13 @@ from jaxtyping import Float, Int
 from torch import nn
 from torch.func import functional_call, jacrev, vmap
 
-from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.arrays import JointArray, constant_like
 from nbs_pin.base.doors import option
 from nbs_pin.base.exceptions import ArgumentError
-from nbs_pin.dynamics.friction import JointFriction
+from nbs_pin.dynamics.friction import DriveFriction, JointFriction
 from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
 from nbs_pin.dynamics.residual import ResidualNetwork, Terms, nominal_terms
+from nbs_pin.identification.coupling import Coupling, in_motors, matrix_of
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_terms import DriveTerms
 
@@ -29,15 +30,21 @@ _FLAT = 1e-6
 
 
 class Equation(nn.Module):
-    """The residual of one sample: a network, and the terms of the drives, which are linear in their numbers."""
+    """The residual of one sample: a network, and the terms of the drives, which are linear in their numbers.
 
-    def __init__(self, network: LagrangianNetwork, loss: Loss, terms: DriveTerms | None) -> None:
+    Torques are those of the motors; `coupled` tells how they turn with the joints, None is one for each.
+    """
+
+    def __init__(
+        self, network: LagrangianNetwork, loss: Loss, terms: DriveTerms | None, coupled: Coupling | None = None
+    ) -> None:
         super().__init__()
         if loss == "acceleration" and isinstance(network, ResidualNetwork):
             raise ArgumentError(
                 f"loss 'acceleration' needs derivatives that a nominal model lacks; use {option('loss', 'torque')}."
             )
         self.network, self.loss, self.terms = network, loss, terms
+        self.coupled = coupled
         kinds = 0 if terms is None else len(terms.kinds)
         self.numbers = nn.Parameter(torch.zeros(kinds, network.nv, dtype=torch.float64)) if kinds else None
 
@@ -47,7 +54,8 @@ class Equation(nn.Module):
         if friction is None:
             return cls(network, loss, None)
         terms, numbers = DriveTerms.of_friction(friction)
-        equation = cls(network, loss, terms)
+        turns = friction.coupling if isinstance(friction, DriveFriction) else None
+        equation = cls(network, loss, terms, None if turns is None else Coupling(turns, at_motors=False))
         equation.write_numbers(numbers)
         return equation
 
@@ -63,11 +71,16 @@ class Equation(nn.Module):
         """Residual of the torque [N·m] or acceleration [rad/s²], predicted minus measured."""
         net = tau if self.numbers is None else tau - (self.numbers * factors).sum(-2)
         if self.loss == "acceleration":
-            return self.network.acceleration(q, v, net) - a
-        return self.torque(q, v, a, *nominal) - net
+            of_joints = net if self.coupled is None else net @ constant_like(net, self.coupled.matrix)
+            return self.network.acceleration(q, v, of_joints) - a
+        return self.of_motors(self.needed(q, v, a, *nominal)) - net
 
-    def torque(self, q: torch.Tensor, v: torch.Tensor, a: torch.Tensor, *nominal: torch.Tensor) -> torch.Tensor:
-        """The network's torque [N·m]."""
+    def of_motors(self, tau: torch.Tensor) -> torch.Tensor:
+        """N⁻ᵀ τ, for torques of the joints."""
+        return tau if self.coupled is None else tau @ constant_like(tau, np.linalg.inv(self.coupled.matrix))
+
+    def needed(self, q: torch.Tensor, v: torch.Tensor, a: torch.Tensor, *nominal: torch.Tensor) -> torch.Tensor:
+        """The network's torque of the joints [N·m]."""
         if nominal:
             return cast(ResidualNetwork, self.network).torque(q, v, v, a, Terms(*nominal))
         return self.network.torque(q, v, v, a)
@@ -82,7 +95,7 @@ class Equation(nn.Module):
         """The fitted friction, None without."""
         if self.terms is None or self.numbers is None:
             return None
-        return self.terms.friction(self.numbers.detach().numpy(force=True))
+        return self.terms.friction(self.numbers.detach().numpy(force=True), matrix_of(self.coupled))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,16 +104,18 @@ class Equations:
 
     equation: Equation
     columns: tuple[torch.Tensor, ...]
-    """q, v, a, τ, factors of the drives (kinds, n) and the terms of a nominal model, if any; one row per sample."""
+    """q, v, a of the joints, τ and factors (kinds, n) of the motors and the terms of a nominal model, if any; one row
+    per sample."""
     unit: Float[torch.Tensor, " n"]
     """Standard deviation of the measured torque or acceleration [N·m or rad/s²]."""
 
     @classmethod
     def of(cls, equation: Equation, data: Dataset, unit: Float[torch.Tensor, " n"] | None = None) -> "Equations":
-        """The equations of a dataset; `unit` of another dataset makes the costs of both comparable."""
-        q, v, a, tau = (torch.from_numpy(x) for x in (data.q, data.v, data.a, data.tau))
+        """The equations of data with the torques of the joints; `unit` of others makes the costs of both comparable."""
+        moved = in_motors(data, equation.coupled)
+        q, v, a, tau = (torch.from_numpy(x) for x in (data.q, data.v, data.a, moved.tau))
         network, terms = equation.network, equation.terms
-        kinds = np.zeros((0, *data.v.shape)) if terms is None else terms.factors(data)
+        kinds = np.zeros((0, *data.v.shape)) if terms is None else terms.factors(moved)
         factors = torch.from_numpy(np.ascontiguousarray(kinds.swapaxes(0, 1)))
         nominal = nominal_terms(network.nominal, q) if isinstance(network, ResidualNetwork) else ()
         return cls(
@@ -122,11 +137,12 @@ class Equations:
                 p.copy_(part)
 
     def torque_left(self, theta: Theta) -> Float[np.ndarray, "m n"]:
-        """The torque that the network leaves to the drives [N·m]."""
+        """The torque of the motors that the network leaves to the drives [N·m]."""
         self.write(theta)
         q, v, a, tau, _, *nominal = self.columns
         with torch.no_grad():
-            return np.asarray((tau - self.equation.torque(q, v, a, *nominal)).numpy(force=True))
+            needed = self.equation.needed(q, v, a, *nominal)
+            return np.asarray((tau - self.equation.of_motors(needed)).numpy(force=True))
 
     def solved(self, theta: Theta) -> Theta:
         """The parameters with the numbers of the drives by least squares beside the network."""
@@ -143,8 +159,9 @@ class Equations:
         """Mean square of the torque residual in units of its deviation, with the network as it is and this friction."""
         q, v, a, tau, _, *nominal = self.columns
         with torch.no_grad():
-            needed = self.equation.torque(q, v, a, *nominal)
-            left = needed - tau if friction is None else needed + friction.feedforward(v, needed) - tau
+            needed = self.equation.needed(q, v, a, *nominal)
+            whole = needed if friction is None else needed + friction.feedforward(v, needed)
+            left = self.equation.of_motors(whole) - tau
         return float((left / deviation(tau)).square().mean())
 
     def residual(self, theta: Theta, rows: Int[torch.Tensor, " m"] | None = None) -> Float[torch.Tensor, "m n"]:

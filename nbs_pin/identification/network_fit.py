@@ -15,6 +15,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.progress import tracked
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.lagrangian_network import LagrangianNetwork
+from nbs_pin.identification.coupling import Coupling, in_motors, matrix_of
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted, terms_of_rest
 from nbs_pin.identification.drive_terms import DriveTerms
@@ -121,6 +122,7 @@ def fit_network(
     optimiser: FitOptimiser | str | None = None,
     iterations: int | None = None,
     wanted: Wanted | None = None,
+    coupled: Coupling | None = None,
     progress: bool = False,
 ) -> NetworkFit:
     """Minimise the mean of (residual/deviation)² over samples and joints; Ctrl-C ends it and keeps the best.
@@ -130,13 +132,14 @@ def fit_network(
 
     Args:
         make: Returns an untrained network for a seed. "lm" tries up to two more seeds if a start makes no progress.
-        data: Training samples.
+        data: Training samples, with the torques of the joints.
         held_out: Samples that select the iterate, so that a wide network does not fit noise. None selects by `data`.
         seed: Seed of the first network, the subset and the batches.
         loss: See `Loss`.
         optimiser: See `FitOptimiser`. None takes "lm" up to `LARGEST_FOR_LM` parameters, "lbfgs" above.
         iterations: None takes those of `ITERATIONS`.
         wanted: Friction and offsets to fit; None for none. Rotor inertias are part of M̂.
+        coupled: Motors that turn several joints; friction and offsets are then theirs.
         progress: Show a progress bar.
 
     Raises:
@@ -153,7 +156,7 @@ def fit_network(
     first = wanted.first(data.nv) if data.tau.any() else None
 
     def begin(start: int) -> _Search:
-        equation = Equation(copy.deepcopy(make(start)).requires_grad_(True), cast(Loss, loss), first)
+        equation = Equation(copy.deepcopy(make(start)).requires_grad_(True), cast(Loss, loss), first, coupled)
         equations = Equations.of(equation, data)
         checked = None if held_out is None else Equations.of(equation, held_out, equations.unit)
         search = _Search(equations, checked, equations.theta)
@@ -185,12 +188,13 @@ def fit_network(
 
 def _friction(found: _Search, wanted: Wanted, data: Dataset) -> JointFriction | None:
     """The friction beside the trained network, with the terms that the torque it leaves shows (`drive_choice`)."""
-    fitted = found.equations.equation.friction()
+    equation = found.equations.equation
+    fitted = equation.friction()
     if wanted.is_settled:
         return fitted
     left = found.equations.torque_left(found.best)
-    terms, numbers = terms_of_rest(wanted, data, left)
-    chosen = terms.friction(numbers)
+    terms, numbers = terms_of_rest(wanted, in_motors(data, equation.coupled), left)
+    chosen = terms.friction(numbers, matrix_of(equation.coupled))
     judged = found.equations if found.held_out is None else found.held_out
     costs = [judged.torque_cost(friction) for friction in (chosen, fitted)]
     return chosen if costs[0] <= (1.0 if found.is_untrained else _AS_GOOD) * costs[1] else fitted

@@ -37,6 +37,14 @@ class Measurements:
     """Unit of the residuals [N·m]."""
     kinds: Float[np.ndarray, "kinds rows n"]
     """Factors of the numbers of the drives (`drive_terms`)."""
+    back: Float[np.ndarray, "n n"] | None = None
+    """N⁻¹ if torques, their scale and the factors are those of motors that turn by N q; None for those of joints."""
+
+    def of_motors(self, table: Float[np.ndarray, "rows n *columns"]) -> Float[np.ndarray, "rows n *columns"]:
+        """Torques of the joints, or derivatives of these, as those of the motors."""
+        if self.back is None:
+            return table
+        return (self.back.T @ table.reshape(*table.shape[:2], -1)).reshape(table.shape)
 
     def some(self, rows: np.ndarray) -> "Measurements":
         """The given rows."""
@@ -93,7 +101,7 @@ class TreeEstimate:
             tree_torques(q, v, v, a, *tree, np.empty(tree_workspace(tree)), tau[part])
 
         _by_chunks(evaluate, len(tau))
-        return data.tau - tau - self._dragged(data.kinds)
+        return data.tau - data.of_motors(tau) - self._dragged(data.kinds)
 
     def cost(self, data: Measurements) -> float:
         """Mean square of the weighted residuals."""
@@ -105,6 +113,7 @@ class TreeEstimate:
         def evaluate(part: slice) -> tuple[float, np.ndarray, np.ndarray]:
             kinds = data.kinds[:, part]
             tau, table = self._derivatives(data.q[part], data.v[part], data.a[part])
+            tau, table = data.of_motors(tau), data.of_motors(table)
             left = ((data.tau[part] - tau - self._dragged(kinds)) / data.scale).ravel()
             own = np.einsum("ksj,ij->sikj", kinds, np.eye(len(self.drag.T))).reshape(*tau.shape, -1)
             rows = (np.concatenate([table, own], axis=-1) / data.scale[:, None]).reshape(len(left), -1)
