@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.base.arguments import a, checked, maybe
@@ -116,12 +117,14 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
         return finite_result("the torque", self._machine_code(*rows), *vectors).reshape(vectors[0].shape)
 
     def forward_dynamics(self, q: Vectors, v: Vectors, tau: Vectors) -> Vectors:
-        """v̇ [rad/s²] under the torque τ [N·m], for numpy arrays by machine code where the network is a rigid tree."""
+        """v̇ [rad/s²] under the torque τ [N·m], for numpy arrays by machine code where the network has it."""
         vectors = as_vectors(self.nv, q=q, v=v, tau=tau)
-        tree = None if is_torch_array(vectors[0]) else self._tree
-        if tree is None:
+        if is_torch_array(vectors[0]) or self._machine_code is None or not self.network.quadratic:
             return self._evaluate(self.network.acceleration, q=q, v=v, tau=tau)
-        rows = [np.ascontiguousarray(x).reshape(-1, self.nv) for x in vectors]
+        rows, tree = [np.ascontiguousarray(x).reshape(-1, self.nv) for x in vectors], self._tree
+        if tree is None:
+            found = _accelerations(self._machine_code, *rows).reshape(vectors[0].shape)
+            return finite_result("the acceleration", found, *vectors)
         a, factor = np.empty(rows[0].shape), np.empty((self.nv, self.nv))
         tree_accelerations(*rows, *tree, np.empty(tree_workspace(tree)), factor, a)
         return finite_result("the acceleration", a, *vectors).reshape(vectors[0].shape)
@@ -168,6 +171,24 @@ class LagrangianDynamics(DynamicsProvider, nn.Module):
                     f"the model has no M ≻ 0 for these {names} ({error!s:.80}); give others."
                 ) from error
         return finite_result("the result", result, *vectors)
+
+
+def _accelerations(
+    torque: CompiledTorque,
+    q: Float[np.ndarray, "rows n"],
+    v: Float[np.ndarray, "rows n"],
+    tau: Float[np.ndarray, "rows n"],
+) -> Float[np.ndarray, "rows n"]:
+    """v̇ from the torque alone, which is M a + C v + G with M of its columns."""
+    rows, n = q.shape
+    still, unit = np.zeros((rows * n, n)), np.tile(np.eye(n), (rows, 1))
+    rest = torque(q, still[:rows], still[:rows], still[:rows])
+    lifted = torque(np.repeat(q, n, axis=0), still, still, unit).reshape(rows, n, n)
+    bias = torque(q, v, v, still[:rows])
+    try:
+        return np.asarray(np.linalg.solve((lifted - rest[:, None]).swapaxes(1, 2), (tau - bias)[..., None])[..., 0])
+    except np.linalg.LinAlgError as error:
+        raise ArgumentError(f"the model has no M ≻ 0 for these q, v, tau ({error!s:.80}); give others.") from error
 
 
 def _forget_machine_code(module: nn.Module, keys: Any) -> None:
