@@ -109,8 +109,7 @@ def fit_chain(
         friction: Terms of friction to find, as in `identify`.
         offset: Constant torques to find, as in `identify`.
         rotor_inertia: Inertias of rotors behind gears to find, which a tree of bodies cannot represent; likewise.
-        coupled: Motors that turn several joints; friction and rotors are then theirs. The data have the torques of the
-            joints.
+        coupled: Motors that turn several joints; friction and rotors are theirs, the torques of the data the joints'.
         transition: Speed scale of the Coulomb friction [rad/s] (`JointFriction`).
         regularisation: γ, as in `identify`.
         starts: Most random trees; fewer if one explains the data to rounding or enough find the best minimum.
@@ -140,13 +139,7 @@ def fit_chain(
         wanted, scaled, descents, interrupted = _searched(data, wanted, coupled, layout, starts, rng, progress)
         tries: list[_Try] = []
         for descent in sorted(descents, key=_cost)[:_TRIES]:
-            polished = _polished(descent.at, scaled)
-            geometry = geometry_of(TreeGeometry(polished.at), coupled)
-            bodies = explain(geometry, in_motors(data, coupled), wanted, regularisation, others=_AXIS * data.nv)
-            chosen = _measured(data, bodies.terms, coupled, _needed(geometry, bodies, in_motors(data, coupled)))
-            physical = _physical(polished.at, bodies, chosen, regularisation, right_angles)
-            cost = physical.whole().cost(chosen)
-            tries.append(_Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(scaled) + _EXACT))
+            tries.append(_tried(descent, data, scaled, coupled, wanted, regularisation, right_angles))
             if tries[-1].reached:
                 break
     best = min(tries, key=lambda found: found.cost)
@@ -174,6 +167,25 @@ class _Try(NamedTuple):
     physical: PhysicalTree
     reached: bool
     """Whether they explain the data about as well as arbitrary symmetric bodies."""
+
+
+def _tried(
+    descent: Descent[TreeEstimate],
+    data: Dataset,
+    scaled: Measurements,
+    coupled: Coupling | None,
+    wanted: Wanted,
+    strength: float,
+    right_angles: bool,
+) -> _Try:
+    """The physical bodies for the tree of a descent; `scaled` are the data of the search."""
+    polished, moved = _polished(descent.at, scaled), in_motors(data, coupled)
+    geometry = geometry_of(TreeGeometry(polished.at), coupled)
+    bodies = explain(geometry, moved, wanted, strength, others=_AXIS * data.nv)
+    chosen = _measured(data, bodies.terms, coupled, _needed(geometry, bodies, moved))
+    physical = _physical(polished.at, bodies, chosen, strength, right_angles)
+    cost = physical.whole().cost(chosen)
+    return _Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(scaled) + _EXACT)
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,26 +98,33 @@ def fit(
     wanted = Wanted(friction, offset, rotors, settings.get("transition", 0.01))
     task = FitTask(model, train, test, seed, robot, None, (friction, offset, rotors), progress, settings)
     task, fitted = _fitted(fitter, task, coupling, wanted)
-    train, test, coupled = task.data, task.held_out, task.coupled
-    bare, asked = fitted.assemble(None), {"friction": friction, "offset": offset, "rotor_inertia": rotors}
-    left = remainder(bare, train if test is None else test, fitted.friction) if data.tau.any() else None
-    joints = tuple(f"joint {i + 1}" for i in range(data.nv)) if robot is None else robot.joint_names
-    report = FitReport(
-        model=model,
-        seed=seed,
+    report = _reported(task, fitted, time.perf_counter() - start)
+    for doubt in doubts_of_report(report):
+        warnings.warn(f"{doubt}.", stacklevel=2)
+    return fitted.assemble(report)
+
+
+def _reported(task: FitTask, fitted: Fitted, seconds: float) -> FitReport:
+    """The report of a fit; warns of what its data make doubtful."""
+    train, test, robot, asked = task.data, task.held_out, task.robot, task.wanted()
+    bare, judged = fitted.assemble(None), train if test is None else test
+    left = remainder(bare, judged, fitted.friction) if train.tau.any() else None
+    joints = tuple(f"joint {i + 1}" for i in range(train.nv)) if robot is None else robot.joint_names
+    for doubt in doubts(train, robot, left, asked, joints):
+        warnings.warn(f"{doubt}.", stacklevel=3)
+    return FitReport(
+        model=task.model,
+        seed=task.seed,
         samples=len(train),
-        seconds=time.perf_counter() - start,
-        stopped=_ended(fitted.stopped, bare, train if test is None else test, fitted.friction),
+        seconds=seconds,
+        stopped=_ended(fitted.stopped, bare, judged, fitted.friction),
         train_nmse=torque_nmse(bare, train, fitted.friction),
         test_nmse=None if test is None else torque_nmse(bare, test, fitted.friction),
         unidentifiable=_useless(bare, train, fitted.friction) + fitted.unidentifiable,
         left={} if left is None else left.plain(),
         next_try="" if left is None else next_try(left, joints, asked),
-        **fitted.record(coupled),
+        **fitted.record(task.coupled),
     )
-    for doubt in (*doubts(train, robot, left, asked, joints), *doubts_of_report(report)):
-        warnings.warn(f"{doubt}.", stacklevel=2)
-    return fitted.assemble(report)
 
 
 def _check(data: Dataset, robot: Robot | None) -> None:
