@@ -17,15 +17,9 @@ from nbs_pin.dynamics.registry import NETWORKS, make_network
 from nbs_pin.identification.fit_report import torque_nmse
 from nbs_pin.identification.network_equations import Equation, Equations
 from tests.commands import summary
-from tests.test_drives import REAL, ROTORS, TWO, UR5, WRIST, driven, gears, moved
+from tests.test_drives import ROTORS, TWO, UR5, WRIST, driven, gears, moved, wrists
 
 BOTH = np.array([[1.0, 0.0], [1.0, 1.0]])
-
-
-def coupled(data, drives, rotors):
-    """The same motions with the torques of the joints of an arm with these drives and rotors."""
-    needed = data.tau + data.a @ (drives.coupling.T * rotors @ drives.coupling)
-    return replace(data, tau=needed + drives.feedforward(data.v, needed))
 
 
 def at_motors(data, matrix):
@@ -33,21 +27,13 @@ def at_motors(data, matrix):
     return replace(data, tau=data.tau @ np.linalg.inv(matrix))
 
 
-@pytest.fixture(scope="module")
-def wrist():
-    """Noisy motions of ur5, of which motor 6 turns q5 + q6, and the same without coupling; fresh ones of both."""
-    alone = replace(gears(), coupling=None)
-    noisy, fresh = moved(UR5, 1_500, noise=REAL, duration=3.0), moved(UR5)
-    joined = [coupled(data, gears(), ROTORS) for data in (noisy, fresh)]
-    return joined, [driven(data, alone, ROTORS) for data in (noisy, fresh)]
-
-
 @cache
 def small():
     """Noisy motions of two_link, of which motor 2 turns q1 + q2, and fresh ones."""
     drives = nbs.DriveFriction([2.0, 1.0], [1.5, 1.0], offset=[0.0, 0.3], coupling=BOTH)
     noisy, fresh = moved(TWO, 400, noise=nbs.Noise(torque=0.1)), moved(TWO, 200, seed=9)
-    return [coupled(data, drives, np.array([0.3, 0.1])) for data in (noisy, fresh)]
+    rotors = BOTH.T * [0.3, 0.1] @ BOTH
+    return [driven(replace(data, tau=data.tau + data.a @ rotors), drives) for data in (noisy, fresh)]
 
 
 def judged(model, fresh):
@@ -55,8 +41,8 @@ def judged(model, fresh):
 
 
 @pytest.mark.parametrize("motors", [False, True], ids=["torques of joints", "torques of motors"])
-def test_a_corrected_arm_finds_the_coupling_and_is_as_good_as_an_uncoupled_one(wrist, motors, tmp_path):
-    (joined, fresh), (alone, fresh_alone) = wrist
+def test_a_corrected_arm_finds_the_coupling_and_is_as_good_as_an_uncoupled_one(motors, tmp_path):
+    (joined, alone), (fresh, fresh_alone) = wrists()
     few = {"robot": UR5, "held_out": 0.0, "widths": (4,), "iterations": 3}
     with pytest.warns(UserWarning, match="motor of wrist_3_joint also turns .* with wrist_2_joint"):
         model = nbs.fit(at_motors(joined, WRIST) if motors else joined, "residual", **few)
@@ -73,8 +59,8 @@ def test_a_corrected_arm_finds_the_coupling_and_is_as_good_as_an_uncoupled_one(w
     assert_allclose(judged(again, fresh), judged(model, fresh))
 
 
-def test_a_tree_beside_a_coupled_wrist_is_as_good_as_beside_an_uncoupled_one(wrist, tmp_path):
-    (joined, fresh), (alone, fresh_alone) = wrist
+def test_a_tree_beside_a_coupled_wrist_is_as_good_as_beside_an_uncoupled_one(tmp_path):
+    (joined, alone), (fresh, fresh_alone) = wrists()
     with pytest.warns(UserWarning, match="motor of wrist_3_joint also turns .* with wrist_2_joint"):
         model = nbs.fit(joined, "chain", robot=UR5, held_out=0.0)
     usual = nbs.fit(alone, "chain", robot=UR5, held_out=0.0)
@@ -99,6 +85,14 @@ def test_without_an_arm_the_better_fit_tells_whose_torques_a_log_holds(name, opt
     plant = nbs.DynamicsPlant(model, friction=model.friction)
     run = nbs.simulate(plant, law, nbs.Sinusoid.for_robot(TWO), duration=0.3, period=0.002)
     assert np.abs(run.q - run.q_ref).max() < 1e-3
+
+
+def test_rotors_that_the_arm_states_are_those_of_its_motors():
+    arm = TWO.with_armature([0.3, 0.1])
+    model = nbs.fit(small()[0], "residual", robot=arm, coupling=BOTH, widths=(4,), iterations=1)
+    assert_allclose(model.nominal.motor_inertia, [0.3, 0.1])
+    added = model.nominal.mass_matrix([0.2, 0.4]) - nbs.PinocchioDynamics(TWO).mass_matrix([0.2, 0.4])
+    assert_allclose(added, BOTH.T * [0.3, 0.1] @ BOTH, atol=1e-12)
 
 
 def test_no_coupling_is_looked_for_without_an_arm_or_where_there_is_to_be_none():

@@ -250,8 +250,8 @@ def gears():
     return nbs.DriveFriction([8.0, 7.0, 5.0, 2.0, 1.5, 1.0], [6.0, 5.0, 4.0, 2.0, 1.5, 1.2], offset=0.1, coupling=WRIST)
 
 
-@pytest.fixture(scope="module")
-def wrist():
+@cache
+def wrists():
     """Noisy motions of ur5, of which motor 6 turns q5 + q6, and the same without coupling; fresh ones of both."""
     alone = replace(gears(), coupling=None)
 
@@ -261,6 +261,11 @@ def wrist():
         return joined, driven(data, alone, ROTORS)
 
     return made(moved(UR5, 1_500, noise=REAL, duration=3.0)), made(moved(UR5))
+
+
+@pytest.fixture(scope="module")
+def wrist():
+    return wrists()
 
 
 @pytest.mark.parametrize("at_motors", [False, True], ids=["torques of joints", "torques of motors"])

@@ -40,8 +40,8 @@ class Learn(LogOptions, Reported):
     rotors: Literal["auto", "on", "off"] = "auto"
     """Rotor inertias to learn; networks without a URDF have them in M."""
     coupling: Annotated[str, couplings("--coupling")] = "auto"
-    """Motors that turn with several joints, for identified: 6.5=1 where motor 6 also turns with joint 5; auto looks for
-    such neighbours, off is none."""
+    """Motors that turn with several joints: 6.5=1 where motor 6 also turns with joint 5; auto looks for such neighbours
+    if the arm is known, off is none."""
     transition: Annotated[float, number("--transition", above=0.0, most=10.0, unit="rad/s")] = 0.01
     """Speed within which Coulomb friction changes its sign [rad/s]."""
     held_out: Annotated[float, number("--held-out", least=0.0, most=0.9, unit="")] = 0.2

@@ -2,8 +2,8 @@
 
 Motor k turns by φ_k = Σ_j N_kj q_j, in angles of the joint side, so that the torques of the joints are Nᵀ times those
 of the motors. In coordinates of the motors the equations are those of an arm without coupling: the torque of motor k is
-row k of N⁻ᵀ Y(q, v, v̇) π and its own friction, offset and rotor inertia, functions of N v and N v̇ (`explain`). A log
-may hold the torques of the joints, or those of the motors.
+row k of N⁻ᵀ Y(q, v, v̇) π and its own friction, offset and rotor inertia, functions of N v and N v̇ (`explain`). Beside
+a network its torque takes the place of Y π. A log may hold the torques of the joints, or those of the motors.
 """
 
 import warnings
