@@ -236,13 +236,16 @@ def test_gradients_pass_to_rates_and_leak(robot, leak):
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 30.0))
-def test_no_training_makes_a_step_cost_all_of_the_damping(seed, size):
+def test_no_rates_make_a_step_cost_all_of_the_damping_that_there_was(seed, size):
     law = law_for(nbs.load_robot("two_link"), ["load", "friction", "rotors"], gain=0.4, leak=0.5)
     first, leak, motions = law.rates, law.leak, UsualMotions.of(law.law, law.output, law.unknowns, *law._tree)
     law.speed.change.data[:] = torch.as_tensor(np.random.default_rng(seed).normal(scale=size, size=len(first) + 1))
     assert (law.rates >= 0.0).all()
     assert (law.rates <= first / 0.4 * (1.0 + 1e-12)).all()
     assert law.period * motions.cost(law.rates) <= 1.0 + 1e-9
+    assert law.step_cost() == pytest.approx(law.period * motions.cost(law.rates))
+    law.law.damping.floor.change.data[:] = -50.0  # half of D₀: the same rates cost more of what is left
+    assert law.step_cost() > law.period * motions.cost(law.rates)
     assert law.leak == pytest.approx(leak * np.exp(float(law.speed.change.detach()[-1])))
 
 

@@ -14,6 +14,7 @@ from hypothesis import given, settings, strategies as st
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.known_code import foreign_code
+from nbs_pin.base.records import ROW_ARRAYS
 from nbs_pin.certificates.adaptive_storage import Beginning
 from nbs_pin.certificates.error_bounds import radians
 from nbs_pin.certificates.fixed_beside import loaded_model
@@ -399,5 +400,56 @@ def test_a_number_that_is_not_finite_breaks_the_promise():
 def test_a_run_of_another_law_is_not_checked():
     law = law_for("two_link")
     fixed = nbs.simulate(nbs.DynamicsPlant.for_robot(law.robot), law.law, nbs.Hold([0.1, 0.2]), 0.1, 0.001)
-    with pytest.raises(ArgumentError, match=r"no estimates, expected .* give a run of the law that was bounded"):
+    with pytest.raises(ArgumentError, match=r"has 0 estimates, expected .* give a run of the law that was bounded"):
         nbs.transient_bound(law, 0.5).check(fixed)
+
+
+def test_runs_of_other_joints_laws_and_beginnings_are_told():
+    law = law_for("two_link")
+    bound, run = nbs.transient_bound(law, 0.5), checked_run(law, 0.5, 0.3)
+    with pytest.raises(ArgumentError, match=r"of the joints a, b and has 10 estimates, expected joint1, joint2 and 10"):
+        bound.check(dataclasses.replace(run, joint_names=("a", "b")))
+    more = nbs.AdaptiveLaw(law.law, ["load", "friction"], load_mass=0.5)
+    with pytest.raises(ArgumentError, match=r"has 14 estimates, expected joint1, joint2 and 10; give a run of the law"):
+        bound.check(checked_run(more, 0.5, 0.1))
+    for wrong, words in ((run.head(1), r"has 1 row and 1 start"), (run, r"has 301 rows and 1 start, .* the start 2")):
+        with pytest.raises(ArgumentError, match=words):
+            bound.check(wrong, 2)
+    later = {name: getattr(run, name)[200:] for name in ("t", *ROW_ARRAYS, "estimates")}
+    assert "the estimates did not begin as those of the law" in bound.check(dataclasses.replace(run, **later)).failures
+    cut = bound.check(dataclasses.replace(run, tau=0.5 * run.tau))
+    assert cut.failures == {"a torque was cut off": 0.0}
+    slow = bound.check(dataclasses.replace(run, t=2.0 * run.t, v_ref=0.5 * run.v_ref, a_ref=0.25 * run.a_ref))
+    assert "a period was longer than the law's" in slow.failures
+    jumped = run.q_ref + 0.2 * (np.arange(301) > 100)[:, None]
+    jump = bound.check(dataclasses.replace(run, q_ref=jumped))
+    assert jump.failures["the reference contradicts its own derivatives"] == pytest.approx(0.101)
+
+
+def test_each_start_of_a_batch_is_checked_alone():
+    law = law_for("two_link")
+    begin = nbs.Sinusoid.for_robot(law.robot)(0.0)
+    run = checked_run(law, 0.5, 0.3, q0=begin.q + np.array([[0.0, 0.0], [0.05, 0.0]]), v0=np.tile(begin.v, (2, 1)))
+    bound = nbs.transient_bound(law, 0.5)
+    on, beside = (bound.check(run, k) for k in range(2))
+    assert on.is_kept
+    assert not beside.is_kept
+    assert on.joint_errors[0].max() < 1e-12 < beside.joint_errors[0].max()
+
+
+def test_where_nothing_is_known_the_verdict_says_so():
+    law = nbs.AdaptiveLaw(
+        nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link"), damping="bounded"), load_mass=0.5
+    )
+    bound = nbs.transient_bound(law, 0.5, disturbance=[0.1, 0.1], duration=0.2)
+    assert bound.check(checked_run(law, 0.5, 0.3)).verdict.endswith("(none is known after t = 0.2 s)")
+
+
+def test_sliding_joints_are_checked_in_metres():
+    robot = nbs.load_robot(Path(__file__).parent / "data" / "gantry.urdf")
+    law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), load_mass=0.5)
+    plant = nbs.DynamicsPlant.for_robot(robot.with_payload("", 0.5))
+    run = nbs.simulate(plant, law, nbs.Sinusoid.for_robot(robot), 0.3, 0.001)
+    seen = nbs.transient_bound(law, 0.5).check(run)
+    assert seen.is_kept
+    assert seen.joint_units == tuple("m" if slides else "rad" for slides in robot.prismatic)

@@ -281,17 +281,27 @@ def test_middleware_drives_a_law_that_adapts(tmp_path):
     assert "or above 0.001 s" in text
 
 
+def test_the_self_test_has_the_period_of_the_law(tmp_path):
+    law = nbs.AdaptiveLaw.for_robot(nbs.load_robot("two_link"), period=0.0005)
+    folder = law.export(tmp_path / "fast_law").parent
+    assert "0.0005" in "".join(path.read_text() for path in folder.glob("*selftest*"))
+
+
 def test_what_has_no_c_form_is_refused(tmp_path):
     robot = nbs.load_robot("two_link")
     inner = nbs.SlotineLi.for_robot(robot)
     law = nbs.AdaptiveLaw(inner)
     other = type("Other", (nbs.AdaptiveLaw,), {})(inner)
-    sliding = nbs.AdaptiveLaw(nbs.SlidingMode.for_robot(robot))
+    sliding, wild = nbs.AdaptiveLaw(nbs.SlidingMode.for_robot(robot)), nbs.AdaptiveLaw(inner)
+    wild.speed.change.data[0] = np.nan
+    with pytest.raises(ArgumentError, match="γ or σ is not finite"):
+        wild.compile()
     for each, options, words in (
         (other, {}, "Other has no compiled form"),
         (sliding, {}, "SlidingMode has no compiled form"),
         (law, {"period": 0.002}, "expected at most 0.001 s"),
-        (law, {"certificate": nbs.certify(inner, [5.0, 5.0])}, "other numbers"),
+        (law, {"certificate": nbs.certify(inner, [5.0, 5.0])}, "a law that adapts, of which none is; leave it out"),
+        (wild, {}, "not finite; take the law as it was before this training"),
     ):
         with pytest.raises(ArgumentError, match=re.escape(words)):
             each.export(tmp_path / "law", **options)

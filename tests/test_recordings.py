@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import nbs_pin as nbs
 from nbs_pin import cli
-from nbs_pin.base.csv_files import write_csv
+from nbs_pin.base.csv_files import read_cells, write_csv
 from nbs_pin.base.doors import at_the_shell, option
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import write_npz
@@ -505,3 +505,18 @@ def test_joints_that_slide_are_in_metres_in_every_sentence_about_a_motion(tmp_pa
     np.savez(tmp_path / "m.npz", t=1e3 * t, q=q, v=0.3 * np.cos(t)[:, None])
     with pytest.raises(FileFormatError, match="t looks like milliseconds"):
         nbs.load_reference(tmp_path / "m.npz", arm)
+
+
+@pytest.mark.parametrize(
+    ("first", "cells"),
+    [
+        ("t,q1 [rad; wrapped],q2", ["t", "q1 [rad; wrapped]", "q2"]),
+        ("0,5;1,25;-2,0", ["0.5", "1.25", "-2.0"]),
+        ("t;q1 [rad, wrapped];q2", ["t", "q1 [rad. wrapped]", "q2"]),
+        ("t\tq1\tq2", ["t", "q1", "q2"]),
+        ("t q1 q2", ["t", "q1", "q2"]),
+    ],
+)
+def test_the_separator_is_the_most_frequent_mark(tmp_path, first, cells):
+    (tmp_path / "a.csv").write_text(first + "\n")
+    assert read_cells(tmp_path / "a.csv") == [cells]

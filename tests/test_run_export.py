@@ -286,6 +286,8 @@ def test_what_cannot_be_exported_is_refused(runs, arms, tmp_path):
     seen = nbs.monitor(run, nbs.certify(nbs.NeuralBackstepping.for_robot(arms["two_link"]), [5.0, 5.0]))
     with pytest.raises(ArgumentError, match="monitored is of another run"):
         nbs.export_run(run.head(9), tmp_path / "run.csv", monitored=seen)
+    with pytest.raises(ArgumentError, match="monitored is of another run"):
+        nbs.export_run(runs["pushed"], tmp_path / "run.csv", monitored=seen)  # at the same times
     assert list(tmp_path.iterdir()) == []
 
 

@@ -35,7 +35,7 @@ _SEPARATORS = (";", ",", "\t", "|")
 def read_cells(path: Path) -> list[list[str]]:
     """The cells of a table in a text file, *.csv or *.csv.gz, by rows; empty lines are left out.
 
-    Columns are separated by semicolons or, where the first line has none, by commas, tabs, bars or blanks.
+    Columns are separated by semicolons, commas, tabs, bars or blanks, as the first line shows.
 
     Raises:
         FileFormatError: If it is too large or no text.
@@ -52,7 +52,7 @@ def read_cells(path: Path) -> list[list[str]]:
                 raise too_large
         text = _without_remarks(data.decode("utf-8-sig"))
         first = text.partition("\n")[0]
-        mark = next((mark for mark in _SEPARATORS if mark in first), "")
+        mark = _separator(first)
         if not mark and len(first.split()) > 1:
             return [line.split() for line in text.splitlines() if line.strip()]
         lines = [line for line in csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=mark or ",") if line]
@@ -62,6 +62,14 @@ def read_cells(path: Path) -> list[list[str]]:
         raise FileFormatError(f"{path}: not a UTF-8 CSV file ({error}); export it again.") from error
     # where semicolons separate numbers, a comma is the decimal point of another language
     return [[cell.replace(",", ".") for cell in line] for line in lines] if mark == ";" else lines
+
+
+def _separator(first: str) -> str:
+    """What separates the columns: of numbers with decimal commas the semicolon, else the most frequent mark."""
+    if ";" in first and all(_is_number(cell.replace(",", ".")) for cell in first.split(";") if cell.strip()):
+        return ";"
+    mark = max(_SEPARATORS, key=first.count)
+    return mark if mark in first else ""
 
 
 def header_of(cells: Sequence[str]) -> list[str]:

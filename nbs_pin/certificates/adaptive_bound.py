@@ -123,7 +123,8 @@ class TransientBound(Shown):
     def check(self, run: Run, start: int = 0) -> TransientCheck:
         """The errors of a run of the law, simulated or logged, beside their bounds, and the assumptions that failed.
 
-        Raises ArgumentError for a run that is not of such a law.
+        Raises ArgumentError for a run of other joints or estimates; that γ and the gains were those of the law is not
+        checked.
 
         Example:
             >>> import nbs_pin as nbs

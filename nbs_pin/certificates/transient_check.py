@@ -10,7 +10,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.base.shown import Shown
-from nbs_pin.base.units import measured
+from nbs_pin.base.units import counted, measured
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.assumptions import LARGEST
 from nbs_pin.certificates.sampled_motion import unexplained_steps
@@ -73,6 +73,8 @@ class TransientCheck(Shown):
         failed = ", ".join(f"{name} (t = {t:.4g} s)" for name, t in self.failures.items() if t <= until)
         if not over.any():
             said = f"promise kept: {self.joint_names[joint]} came nearest, {error} of {bound}"
+            unknown = ~np.isfinite(self.joint_bounds).all(axis=1)
+            said += f" (none is known after t = {self.t[~unknown].max(initial=0.0):.4g} s)" if unknown.any() else ""
             return f"{said}, though {failed}" if failed else said
         said = f"promise broken at t = {self.t[row]:.4g} s: {self.joint_names[joint]} was {error} off, beyond {bound}"
         return f"{said}, as {failed or 'the load, the model or a torque from outside is not as stated'}"
@@ -106,10 +108,15 @@ class Assumed:
         t = run.t - run.t[0]
         z1 = self.law.law.dynamics.difference(rows["q"], rows["q_ref"])
         bounds = np.where((t <= self.duration * _ROUNDING)[:, None], self.joint_errors, self.joint_errors_always)
-        return TransientCheck(t, np.abs(z1), bounds, self.law.robot.joint_names, joint_units, self._failed(t, rows))
+        assert run.estimates is not None
+        failed = self._failed(t, rows, run.estimates.reshape(len(t), -1, run.estimates.shape[-1])[0, start])
+        return TransientCheck(t, np.abs(z1), bounds, self.law.robot.joint_names, joint_units, failed)
 
-    def _failed(self, t: Float[np.ndarray, " rows"], rows: dict[str, np.ndarray]) -> dict[str, float]:
+    def _failed(
+        self, t: Float[np.ndarray, " rows"], rows: dict[str, np.ndarray], began: Float[np.ndarray, " k"]
+    ) -> dict[str, float]:
         """What was not so, and since when."""
+        known = self.law.estimate().values
         lost = ~(np.abs(np.stack(list(rows.values()))) <= LARGEST).all(axis=(0, 2))
         begin = self._storage(rows)
         outside = np.array([not self.admissible.contains(x) for x in rows["disturbance"]])
@@ -121,6 +128,7 @@ class Assumed:
             "a torque was cut off": (rows["tau"] != rows["tau_command"]).any(axis=1),
             "the recorded disturbance was larger than stated": outside & ~lost,
             "the reference contradicts its own derivatives": jumped,
+            "the estimates did not begin as those of the law": np.array([not np.allclose(began, known)]),
             "a period was longer than the law's": np.diff(t, prepend=t[0]) > self.law.period * (1.0 + 1e-6),
             f"the start has V = {begin:.3g} J or more, above the stated {self.start:.3g} J": np.array(
                 [not begin <= self.start * _ROUNDING + 1e-12]
@@ -137,10 +145,15 @@ class Assumed:
 
     def _refuse(self, run: Run, start: int) -> None:
         robot = self.law.robot
-        starts = int(np.prod(run.q.shape[1:-1], dtype=int))
-        if run.nv != robot.nv or len(run.t) < 2 or not 0 <= start < starts or run.estimates is None:
-            has = "no estimates" if run.estimates is None else "estimates"
+        starts, count = int(np.prod(run.q.shape[1:-1], dtype=int)), self.law.estimate().values.size
+        found = 0 if run.estimates is None else run.estimates.shape[-1]
+        if tuple(run.joint_names) != robot.joint_names or found != count:
             raise ArgumentError(
-                f"the run has {run.nv} joints, {len(run.t)} rows, {starts} starts and {has}, expected {robot.nv} "
-                f"joints, at least two rows, the start {start} and estimates; give a run of the law that was bounded."
+                f"the run is of the joints {', '.join(run.joint_names)} and has {found} estimates, expected "
+                f"{', '.join(robot.joint_names)} and {count}; give a run of the law that was bounded."
+            )
+        if len(run.t) < 2 or not 0 <= start < starts:
+            raise ArgumentError(
+                f"the run has {counted(len(run.t), 'row')} and {counted(starts, 'start')}, expected at least two rows "
+                f"and the start {start}; give a longer run or another start."
             )

@@ -101,7 +101,7 @@ class AdaptiveLaw(Controller, nn.Module):
             of these four takes less where the model's inertia is so small that the sampled law would shake the arm
             with estimates of that size (docs/theory.md §10); what is given and too large for it warns.
         gain: Speed of adaptation, the share of the damping's work that a sampled step costs at most in usual motions.
-            Training raises γ by less than 1/gain (`update_rates.TrainedRates`), so that it never costs all of it.
+            Training raises γ by less than 1/gain (`update_rates.TrainedRates`).
         leak: σ [1/s], at which estimates return to the first ones; 0 for none.
         period: Longest control period h [s] that γ is stable for.
         rates: γ of every unknown, in place of those that `gain` gives; for these `gain` only limits training.
@@ -378,14 +378,14 @@ class AdaptiveLaw(Controller, nn.Module):
         """The law as machine code (`Controller.compile`); itself for a subclass, or around a law that has none."""
         if not (defines(self, "compile") and self.law.packable):
             return self
-        settings = self.rates, self.leak, self.period, self.output
+        settings = *self.speed.settled(), self.period, self.output
         return CompiledAdaptiveLaw(self.law.packed_law(), self._believed, self.unknowns, *settings, self.robot)
 
     def parts_in_c(self) -> Parts:
         """The law inside, the model that it begins with, and what adapts; raises ArgumentError for a subclass."""
         if not defines(self, "parts_in_c"):
             return super().parts_in_c()
-        adapting = self.unknowns.adapting(self.rates, self.leak, self.output, self.period)
+        adapting = self.unknowns.adapting(*self.speed.settled(), self.output, self.period)
         return Parts(self.law.packed_law(), self._believed, self.robot, adapting)
 
 

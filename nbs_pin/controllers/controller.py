@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nbs_pin.base.arguments import PERIOD, a, checked, choice, flag, joints, path
+from nbs_pin.base.arguments import PERIOD, a, checked, choice, flag, joints, maybe, path
 from nbs_pin.base.arrays import Array, Vectors
 from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.exceptions import ArgumentError
@@ -93,7 +93,7 @@ class Controller(Shown, ABC):
         precision=choice("double", "float"),
         gravity=flag,
         rate_limit=joints(above=0.0, unit="N·m/s", infinite=True),
-        period=PERIOD,
+        period=maybe(PERIOD),
     )
     def export(
         self,
@@ -102,7 +102,7 @@ class Controller(Shown, ABC):
         precision: Precision = "double",
         gravity: bool = True,
         rate_limit: PerJoint = np.inf,
-        period: float = 0.001,
+        period: float | None = None,
         certificate: Any = None,
     ) -> Path:
         """Write the law as C99 without heap and globals, with self-test and what middleware needs (docs/export.md).
@@ -115,7 +115,7 @@ class Controller(Shown, ABC):
             precision: "double" or "float".
             gravity: False leaves G(q) out, for an arm that adds it itself, as Franka's do.
             rate_limit: Largest change of the torque per second [N·m/s], one number or one per joint; inf for none.
-            period: Control period of the self-test [s]; of an `AdaptiveLaw` at most its own.
+            period: Control period of the self-test [s]; of an `AdaptiveLaw` at most its own. None takes that, or 1 ms.
             certificate: A `Certificate` of this law, whose bounds the header then states, or None.
 
         Returns:

@@ -23,6 +23,7 @@ from nbs_pin.kernels.tree_layout import tree_workspace
 from nbs_pin.kernels.trees import tree_torques
 from nbs_pin.robots.robot import Robot
 
+_PERIOD = 0.001  # of the self-test of a law that has none of its own [s]
 _TITLES = {
     LawCode.BACKSTEPPING: "Neural backstepping",
     LawCode.SLOTINE_LI: "Slotine and Li's law",
@@ -77,13 +78,15 @@ def export_law(
     precision: Precision,
     gravity: bool,
     rate_limit: JointArray,
-    period: float,
+    period: float | None,
     certificate: Any,
 ) -> list[Path]:
     """Write the package of `Controller.export` and return its files; raises ArgumentError for what has no C form."""
     parts, n = controller.parts_in_c(), controller.nv
     law, tree, robot, adapting = parts
     names = tuple(f"joint{i + 1}" for i in range(n))
+    if period is None:
+        period = _PERIOD if adapting is None else adapting.period
     if tree is None and not gravity:
         given = where_printed(python="gravity=False", shell="--without-gravity")
         raise ArgumentError(f"{given} was given, but a PID has no model whose weight it could leave out; omit it.")
@@ -125,6 +128,8 @@ def _effort_limit(law: Packed, robot: Robot | None) -> JointArray:
 
 def _check_certificate(certificate: Any, parts: Parts) -> None:
     """Raise ArgumentError unless it is a certificate, whose class lies above this module, of this law on this arm."""
+    if parts.adapting is not None:
+        raise ArgumentError("certificate was given for a law that adapts, of which none is; leave it out.")
     if not (hasattr(certificate, "controller") and callable(getattr(certificate, "summary", None))):
         raise ArgumentError(f"certificate is {told(certificate)}; give a Certificate, as certify returns it.")
     ours, theirs = parts.numbers(), certificate.controller.parts_in_c().numbers()

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import nn
 
 from nbs_pin.base.arrays import Array, array_namespace, is_torch_array
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import known_code
 from nbs_pin.controllers.adapting_model import AdaptingModel
 from nbs_pin.controllers.gains import sample_configurations
@@ -111,7 +112,7 @@ class TrainedRates(nn.Module):
     """γ(s) = γ₀/(g + (1 − g)e^−s) of every unknown [1/J] and σ(s) = σ₀eˢ [1/s], with s = `change`, initially zero.
 
     γ(0) = γ₀, and γ(s) < γ₀/g for every s: where γ₀ makes a step cost at most the share g of the damping's work in
-    usual motions, no s makes it cost all of it. A rate or leak of 0 stays 0.
+    usual motions, no s makes it cost all of that damping's work. A rate or leak of 0 stays 0.
 
     Args:
         rates: γ₀.
@@ -135,6 +136,13 @@ class TrainedRates(nn.Module):
         rates, leak, s = (x.numpy(force=True) for x in parts) if numpy else parts
         xp = array_namespace(s)
         return rates / (1.0 + (1.0 - self.gain) * xp.expm1(-s[:-1])), leak * xp.exp(s[-1])  # the first is exact at 0
+
+    def settled(self) -> tuple[Float[np.ndarray, " unknowns"], float]:
+        """γ and σ of a law that is to run; raises ArgumentError unless they are finite."""
+        rates, leak = self.value(numpy=True)
+        if not (np.isfinite(rates).all() and np.isfinite(leak)):
+            raise ArgumentError("AdaptiveLaw: γ or σ is not finite; take the law as it was before this training.")
+        return np.asarray(rates), float(leak)
 
     def like(self, x: Array) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
         """γ and σ with the array type of x."""

@@ -174,11 +174,15 @@ def _certificate(run: Run, monitored: Monitored | str | Path) -> _Signal:
     """V and its bound along the run."""
     if isinstance(monitored, Monitored):
         t, values = monitored.t, np.column_stack([monitored.storage, monitored.promise])
+        errors = monitored.joint_errors
     else:
-        header, table = read_csv(Path(monitored), COLUMNS)
+        joints = [f"error_{name}" for name in run.joint_names]
+        header, table = read_csv(Path(monitored), (*COLUMNS, *joints))
+        errors = table[:, [header.index(name) for name in joints]]
         t, *of = (table[:, header.index(name)] for name in COLUMNS)
         values = np.column_stack(of)
-    if not np.array_equal(t, run.t):
+    own = np.abs(configuration_difference(run.q, run.q_ref, run.continuous))
+    if not np.array_equal(t, run.t) or not np.allclose(errors, own, rtol=1e-6, atol=1e-12, equal_nan=True):
         raise ArgumentError(
             f"{argument('export_run', 'monitored', monitored)} is of another run; give what was made of this one."
         )

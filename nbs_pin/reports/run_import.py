@@ -38,6 +38,8 @@ def import_run(path: str | Path, robot: Robot | None = None) -> Run:
         FileFormatError: If it is damaged or no such file.
         MissingExtra: If the extra `logs` is not installed, which .mcap needs.
 
+    A .csv file does not say which joints turn without limit: without `robot` whole turns count as errors.
+
     Example:
         >>> import tempfile
         >>> import nbs_pin as nbs
