@@ -21,8 +21,6 @@ from tools.pictures import CHARTS, RUNS
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 WITH_CODE = [page for page in PAGES if {"sh", "python"} & {kind for kind, *_ in blocks(page)}]
-UNNAMED = {"learn.md", "adapt.md"}
-"""Pages that still use the folders that commands choose."""
 SHORT = [ROOT / "README.md", ROOT / "docs" / "index.md"]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 THEORY = ROOT / "docs" / "theory.md"
@@ -61,7 +59,7 @@ def anchors(page: Path) -> set[str]:
 
 def made_by(run: str) -> list[str]:
     """The commands behind a picture, in order, as a page has them."""
-    folders = {name: f"out/{name}-three_link" for name in ("collect", "learn")} | {"arm": "my_arm.urdf"}
+    folders = {"collect": "out/motions", "learn": "out/learned", "arm": "my_arm.urdf"}
     before = [line for name in re.findall(r"{(\w+)}", RUNS[run]) if name in RUNS for line in made_by(name)]
     return [*before, f"nbs-pin {RUNS[run].format(**folders)}"]
 
@@ -190,7 +188,7 @@ def test_every_how_to_is_linked_from_the_first_page_and_the_list():
         assert pages <= {Path(target).name for _, target in links(listing)}, listing
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in UNNAMED], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_results_that_a_page_uses_again_have_a_folder_that_it_names(page):
     """Without --out they go to another folder if there are results of other settings, and the page reads old ones."""
     named = set()

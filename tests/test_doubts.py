@@ -1,5 +1,6 @@
 """What a fit says of data that contradict the arm: signs and units of torques, friction left out, worthless models."""
 
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -144,3 +145,17 @@ def test_the_shell_refuses_a_wrong_sign_and_writes_no_model(tmp_path, capsys):
     assert cli.main([*arguments, "--force", "--friction", "off"]) == 0
     assert "leave out --friction off to learn it" in capsys.readouterr().err
     assert summary(tmp_path / "out")["figures"]["stopped"] == "converged"
+
+
+def test_a_network_that_knows_less_than_the_urdf_is_told():
+    """After two iterations on a few samples of an arm with friction, its URDF with friction leaves far less."""
+    robot = nbs.load_robot("three_link")
+    friction = nbs.JointFriction(np.full(3, 0.5), np.full(3, 0.5))
+    train, test = (nbs.collect(robot, "excited", 300, seed, friction=friction) for seed in (0, 1))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = nbs.fit(train, "cholesky", robot=robot, held_out=test, iterations=2)
+    said = " ".join(str(warning.message) for warning in caught)
+    assert "the arm's own URDF with friction and rotors leaves" in said
+    assert "; model='residual' or model='identified' begins with it or its geometry." in said
+    assert model.report.details["urdf_nmse"] < 1e-2 < model.report.test_nmse

@@ -212,8 +212,8 @@ def test_bad_options_are_refused(options, words):
 @pytest.mark.parametrize(
     ("robot", "words"),
     [
-        (lambda: TWO.with_effort_limit([0.01, 9.0]), "'joint1' cannot hold the arm with 80% of its effort, 0.008 N·m"),
-        (lambda: TWO.with_friction(coulomb=[1.0, 90.0]), "Coulomb friction 90 N·m of joint 'joint2' takes all of 80%"),
+        (lambda: TWO.with_effort_limit([0.01, 9.0]), "'joint1' cannot hold the arm with 80 % of its effort, 0.008 N·m"),
+        (lambda: TWO.with_friction(coulomb=[1.0, 90.0]), "Coulomb friction 90 N·m of joint 'joint2' takes all of 80 %"),
     ],
 )
 def test_arms_that_cannot_move_are_refused(robot, words):

@@ -18,7 +18,7 @@ from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, told
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.shown import Shown
-from nbs_pin.base.units import measured, several, units
+from nbs_pin.base.units import measured, percent, several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.comparison_system import ComparisonSystem, level, reach
@@ -75,7 +75,7 @@ class Proposal(Shown):
         robot = self.controller.dynamics.robot
         unit = "rad" if robot is None else several(units("position", robot.prismatic))
         error, rate = f"‖z1‖ ≤ {measured(self.error, unit)}", f"ω = {self.gains.bandwidth:.3g} rad/s"
-        return error, rate, f"period {1e3 * self.period:.4g} ms", f"{self.share:.0%} of a torque limit"
+        return error, rate, f"period {1e3 * self.period:.4g} ms", f"{percent(self.share)} of a torque limit"
 
 
 @checked(

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbs_pin.base.shown import Cells, Shown
-from nbs_pin.base.units import units_of
+from nbs_pin.base.units import counted, units_of
 from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
 from nbs_pin.controllers.unknowns import KINDS, LOAD_AT, NO_MASS, Unknowns, into_tree, model_body
@@ -68,8 +68,10 @@ class Estimate(Shown):
             centre = ", ".join(f"{1e3 * x:z.0f}" for x in self.load_centre)
             there = f"load {float(self.load_mass):.3g} kg at ({centre}) mm of {name}"
             own = [there if abs(self.load_mass) > NO_MASS else f"no load at {name}"]
-        hidden = [f"{len(self.unexcited)} directions not excited"] if self.unexcited else []
-        counts = f"{len(self.unknowns.bodies)} bodies, {len(self.unknowns.numbers)} numbers"
+        hidden = [f"{counted(len(self.unexcited), 'direction')} not excited"] if self.unexcited else []
+        counts = (
+            f"{counted(len(self.unknowns.bodies), 'body', 'bodies')}, {counted(len(self.unknowns.numbers), 'number')}"
+        )
         return self.robot.name, *own, counts, *hidden
 
     def _cells(self) -> Cells:

@@ -17,6 +17,7 @@ from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.npz import read_npz, require, write_npz
 from nbs_pin.base.shown import Shown, joints_told
+from nbs_pin.base.units import counted
 
 DATASET_FORMAT = "nbs_pin dataset 1"
 """Value of the `format` entry of a data file."""
@@ -88,7 +89,8 @@ class Dataset(Shown):
 
     def _facts(self) -> Iterable[str]:
         of = f" of {self.robot}" if self.robot else ""
-        return f"{len(self)} samples{of}", f"{self.trajectories} trajectories", joints_told(self.nv)
+        many = counted(self.trajectories, "trajectory", "trajectories")
+        return f"{counted(len(self), 'sample')}{of}", many, joints_told(self.nv)
 
     @property
     def nv(self) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from nbs_pin.base.doors import option
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.fit_report import FitReport
 from nbs_pin.identification.log_doubts import torque_ratio
@@ -29,7 +30,7 @@ def doubts(
 
 def doubts_of_report(report: FitReport) -> tuple[str, ...]:
     """The same of what the report says by itself."""
-    found = (_untrained(report), _held_out(report.train_nmse, report.test_nmse))
+    found = (_untrained(report), _held_out(report.train_nmse, report.test_nmse), _beside_urdf(report))
     return tuple(text for text in found if text)
 
 
@@ -58,6 +59,19 @@ def _held_out(train_nmse: float, test_nmse: float | None) -> str:
     return (
         f"{test_nmse:.2g} of the torque's variance is unexplained on held-out data, and {train_nmse:.2g} on those that "
         "were fitted: the motions are too few, or held-out ones of another kind; record longer and more various ones"
+    )
+
+
+def _beside_urdf(report: FitReport) -> str:
+    """A network that knows less than the arm's URDF."""
+    found = report.train_nmse if report.test_nmse is None else report.test_nmse
+    known = None if report.stopped == "interrupted" else report.details.get("urdf_nmse")
+    if known is None or not known < found or not found > _NOTICED:
+        return ""
+    return (
+        f"the arm's own URDF with friction and rotors leaves {known:.2g} of the torque's variance there, and what was "
+        f"learned {found:.2g}; {option('model', 'residual')} or {option('model', 'identified')} begins with "
+        "it or its geometry"
     )
 
 

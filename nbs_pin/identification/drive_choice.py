@@ -250,7 +250,7 @@ def terms_of_rest(
     candidates = Candidates.of(wanted, data, needed)
     rows = np.concatenate([candidates.factors.transpose(2, 1, 0), left.T[..., None]], axis=-1)
     triangles, samples = triangles_of(rows, parts)
-    noise = left.std(axis=0)
+    noise = np.maximum(left.std(axis=0), _EXACT * np.maximum(data.tau.std(axis=0), 1e-300))
     used = climb(candidates, triangles, samples, noise, 0, np.ones((len(candidates.names), data.nv)))
     terms, _ = candidates.chosen(used)
     return terms, terms.solved(terms.factors(data, needed), left)

@@ -17,7 +17,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import Shown, joints_told
 from nbs_pin.base.torch_threads import one_thread
-from nbs_pin.base.units import units
+from nbs_pin.base.units import percent, units
 from nbs_pin.identification.drive_terms import DriveTerms
 from nbs_pin.identification.excitation import torque_limits
 from nbs_pin.identification.excitation_problem import Bounds, Problem
@@ -231,8 +231,8 @@ def _bounds(robot: Robot, share: float, acceleration: PerJoint | None, effort: J
             )
         if not joint.friction < share * effort[i]:
             raise ArgumentError(
-                f"the Coulomb friction {joint.friction:g} {moving} of joint '{joint.name}' takes all of {share:.0%} of "
-                f"its effort limit {effort[i]:.4g} {moving}; correct one, or give a larger share."
+                f"the Coulomb friction {joint.friction:g} {moving} of joint '{joint.name}' takes all of "
+                f"{percent(share)} of its effort limit {effort[i]:.4g} {moving}; correct one, or give a larger share."
             )
     velocity = share * robot.velocity_limit
     return Bounds(middle, half, velocity, share * most, share * effort)
@@ -257,7 +257,7 @@ def _why(failure: Failure, robot: Robot, share: float, bounds: Bounds, clearance
         joint = robot.joints[failure.joint]
         (unit,) = units("torque", [joint.prismatic])
         return (
-            f"joint '{joint.name}' cannot hold the arm with {share:.0%} of its effort, "
+            f"joint '{joint.name}' cannot hold the arm with {percent(share)} of its effort, "
             f"{bounds.torque[failure.joint]:.4g} {unit}, together with the others in any posture that was tried; give "
             "a larger share, or correct effort limits or masses."
         )

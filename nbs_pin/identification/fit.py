@@ -11,6 +11,7 @@ import numpy as np
 from nbs_pin.base.arguments import SEED, checked, either, flag, maybe, number, text
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.registry import entry
+from nbs_pin.base.units import percent
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.compatibility import arm_fault, other_data_fault
@@ -181,5 +182,7 @@ def _useless(model: DynamicsProvider, data: Dataset, friction: JointFriction | N
     if np.isnan(nmse) and data.tau.any():
         return ("everything: the torque is constant, so its dependence on the motion is unknown",)
     if nmse > _USELESS and data.tau.any():
-        return (f"everything: {nmse:.0%} of the torque's variance is unexplained; it may be noise or of another arm",)
+        return (
+            f"everything: {percent(nmse)} of the torque's variance is unexplained; it may be noise or of another arm",
+        )
     return ()

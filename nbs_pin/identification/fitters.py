@@ -17,10 +17,10 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.registry import NETWORKS, make_network
 from nbs_pin.dynamics.residual import ResidualDynamics, ResidualNetwork
 from nbs_pin.identification.chain_fit import fit_chain
-from nbs_pin.identification.coupling import Coupling, in_motors
+from nbs_pin.identification.coupling import Coupling, in_motors, matrix_of
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted, terms_of_rest
-from nbs_pin.identification.fit_report import FitReport
+from nbs_pin.identification.fit_report import FitReport, torque_nmse
 from nbs_pin.identification.identify import identify
 from nbs_pin.identification.network_equations import deviation_of
 from nbs_pin.identification.network_fit import NetworkFit, fit_network
@@ -118,9 +118,24 @@ def fit_family(task: FitTask) -> Fitted:
         progress=task.progress,
         **settings,
     )
-    return _of_network(
+    fitted = _of_network(
         task, found, lambda report: LagrangianDynamics(found.network, task.robot, found.friction, report)
     )
+    beside = _left_by_urdf(task, wanted)
+    return fitted if beside is None else replace(fitted, details={**fitted.details, "urdf_nmse": beside})
+
+
+def _left_by_urdf(task: FitTask, wanted: Wanted) -> float | None:
+    """Torque nMSE of the arm's own URDF with friction and rotors found in the data, which a network is to beat."""
+    data, robot = task.data, task.robot
+    if robot is None or not robot.has_bodies or not data.tau.any():
+        return None
+    nominal = _nominal(robot, data, wanted, task.coupled)
+    left = replace(data, tau=data.tau - nominal.reference_torque(data.q, data.v, data.v, data.a))
+    beside = replace(wanted, rotor_inertia=False)
+    terms, numbers = terms_of_rest(beside, in_motors(data, task.coupled), in_motors(left, task.coupled).tau)
+    judged = data if task.held_out is None else task.held_out
+    return torque_nmse(nominal, judged, terms.friction(numbers, matrix_of(task.coupled)))
 
 
 def fit_rigid_tree(task: FitTask) -> Fitted:

@@ -9,6 +9,7 @@ import numpy as np
 from nbs_pin.base.arguments import checked, flag, maybe, number
 from nbs_pin.base.doors import in_words
 from nbs_pin.base.exceptions import ArgumentError
+from nbs_pin.base.units import percent
 from nbs_pin.dynamics.coupled import CoupledDynamics
 from nbs_pin.dynamics.identified import IdentifiedDynamics
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
@@ -149,7 +150,7 @@ def sign_fault(data: Dataset, robot: Robot) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{share:.2%}" if share < 0.1 else f"{share:.0%}"
+    return percent(share, 2 if share < 0.1 else 0)
 
 
 def _check_arm(data: Dataset, robot: Robot) -> None:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.doors import where_printed
+from nbs_pin.base.units import percent
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset, trajectory_slices
@@ -114,7 +115,7 @@ def next_try(found: Remainder, joints: Sequence[str], asked: Mapping[str, bool |
         )
     name, concerned = EFFECTS[effect], found.explained[effect] * nmse > 0.5 * (found.explained[effect] * nmse).max()
     which = " and ".join(joint for joint, has in zip(joints, concerned, strict=True) if has)
-    share = f"{gain[effect]:.0%} of what is left ({total:.2g} of the torque's variance)"
+    share = f"{percent(gain[effect])} of what is left ({total:.2g} of the torque's variance)"
     if name not in _TRIES:
         delay = float(np.median(found.delay[concerned]))
         when = "later" if delay > 0.0 else "earlier"
