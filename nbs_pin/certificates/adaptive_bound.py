@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from nbs_pin.base.arguments import DURATION, a, checked, maybe, number
+from nbs_pin.base.arguments import DURATION, a, checked, count, maybe, number
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.claims import Claim, Group, Known, Label, known, refuse, weakest
 from nbs_pin.base.known_code import foreign_code
-from nbs_pin.base.records import Run
+from nbs_pin.base.records import RUN, Run
 from nbs_pin.base.rounding import up
 from nbs_pin.base.shown import Cells, Shown
 from nbs_pin.base.units import measured, several, units
@@ -120,6 +120,7 @@ class TransientBound(Shown):
         """Unit of the error of each joint: rad, or m for a prismatic joint."""
         return units("position", self.law.robot.prismatic)
 
+    @checked(run=RUN, start=count(0))
     def check(self, run: Run, start: int = 0) -> TransientCheck:
         """The errors of a run of the law, simulated or logged, beside their bounds, and the assumptions that failed.
 

@@ -20,6 +20,7 @@ RESULTS = (
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
     "FaultReport", "Mode", "Sample", "ExcitingMotion", "ExternalTorque", "ObservedTorques", "TransientBound",
+    "TransientCheck",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
