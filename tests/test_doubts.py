@@ -165,3 +165,18 @@ def test_a_network_that_knows_less_than_the_urdf_is_told():
         warnings.simplefilter("always")
         nbs.fit(exact, "cholesky", robot=robot, held_out=0.0, iterations=1)  # a comparison, of whose result all know
     assert not any("own URDF" in str(warning.message) for warning in caught)
+
+
+def test_where_a_network_is_too_large_for_its_data_a_smaller_one_is_tried():
+    robot = nbs.load_robot("three_link")
+    train, test = (nbs.collect(robot, "excited", 200, seed) for seed in (0, 1))
+    given = {"held_out": test, "iterations": 4}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        large, small, chosen = (
+            nbs.fit(train, "cholesky", **given, **own) for own in ({"widths": (32, 32)}, {"widths": (8,)}, {})
+        )
+    assert large.report.test_nmse > 5.0 * large.report.train_nmse
+    best = min(large, small, key=lambda model: min(model.report.held_out))
+    assert chosen.report.held_out == best.report.held_out
+    assert chosen.network.widths == best.network.widths

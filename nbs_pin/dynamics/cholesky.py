@@ -32,6 +32,7 @@ class CholeskyNetwork(LagrangianNetwork):
     """
 
     fit_widths = (32, 32)
+    few_widths = (8,)
 
     def __init__(
         self,

@@ -31,6 +31,8 @@ class LagrangianNetwork(nn.Module, ABC):
     """Number of joints n."""
     fit_widths: tuple[int, ...] = (24, 24)
     """Default hidden layer sizes of `fit`, small enough for Levenberg–Marquardt."""
+    few_widths: tuple[int, ...] = ()
+    """Those that `fit` tries too where held-out data are predicted far worse than fitted ones; none if empty."""
     quadratic: bool = True
     """Whether T̂ is exactly ½ vᵀM̂(q)v, so that Ṁ − 2C is skew and the stability theory holds."""
 

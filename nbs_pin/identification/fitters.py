@@ -1,6 +1,6 @@
 """The fitters of each kind of model; `registry.py` names them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -107,17 +107,25 @@ def fit_family(task: FitTask) -> Fitted:
     options: dict[str, Any] = {name: settings.pop(name) for name in ("widths", "epsilon") if name in settings}
     torque, rate = (deviation_of(x) for x in (task.data.tau, task.data.a))
     scales = {"inertia": (torque / rate).tolist(), "energy": float(torque.mean())} if task.data.tau.any() else {}
-    options = {"widths": NETWORKS[task.model].load().fit_widths} | scales | options
-    found = fit_network(
-        lambda seed: make_network(task.model, task.data.prismatic.tolist(), seed, **options),
-        task.data,
-        task.held_out,
-        seed=task.seed,
-        wanted=wanted,
-        coupled=task.coupled,
-        progress=task.progress,
-        **settings,
-    )
+    family = NETWORKS[task.model].load()
+
+    def fitted_with(widths: Sequence[int]) -> NetworkFit:
+        return fit_network(
+            lambda seed: make_network(
+                task.model, task.data.prismatic.tolist(), seed, **({"widths": widths} | scales | options)
+            ),
+            task.data,
+            task.held_out,
+            seed=task.seed,
+            wanted=wanted,
+            coupled=task.coupled,
+            progress=task.progress,
+            **settings,
+        )
+
+    found = fitted_with(family.fit_widths)
+    if "widths" not in options and family.few_widths and found.is_too_large:
+        found = min(found, fitted_with(family.few_widths), key=lambda each: min(each.held_out))
     fitted = _of_network(
         task, found, lambda report: LagrangianDynamics(found.network, task.robot, found.friction, report)
     )

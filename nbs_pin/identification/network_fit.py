@@ -34,6 +34,7 @@ _STARTS, _STUCK = 3, 0.05  # most starts; nMSE after the coarse part above which
 _PATIENCE, _SLOW = 0.2, 0.03  # share of the iterations, and the least relative decrease in them
 _BATCH, _BATCHES, _RATE, _LBFGS_SHARE = 256, 16, 3e-3, 0.75  # largest batch, fewest batches, learning rate, share
 _AS_GOOD = 1.01  # ratio of costs up to which fewer or more terms of friction are as good
+_TOO_LARGE, _NOTICED = 5.0, 0.02  # of the misfit of held-out data: ratio to that of fitted ones, and what counts
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e8
 
 
@@ -54,6 +55,13 @@ class NetworkFit:
     stopped: str
     """"converged", "iterations", "held out" (no improvement there), "interrupted" or "no better than the start": no
     iterate predicts the held-out data, or the training data without these, better than the untrained network."""
+
+    @property
+    def is_too_large(self) -> bool:
+        """Whether held-out data are predicted so much worse than fitted ones that a smaller network may do better."""
+        if not self.held_out or self.stopped == "interrupted":
+            return False
+        return min(self.held_out) > max(_TOO_LARGE * min(self.history), _NOTICED)
 
 
 @dataclass(eq=False)
