@@ -14,6 +14,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.dynamics.chain import Chain
 from nbs_pin.dynamics.coupled_network import CoupledNetwork
 from nbs_pin.dynamics.registry import NETWORKS, make_network
+from nbs_pin.identification import network_fit
 from nbs_pin.identification.fit_report import torque_nmse
 from nbs_pin.identification.network_equations import Equation, Equations
 from tests.commands import summary
@@ -157,3 +158,25 @@ def test_the_shell_takes_a_coupling_for_any_model(tmp_path, capsys):
     assert said["details"]["torques_of_motors"] is True
     assert max(said["rms_test_torque_error_Nm"]) < 0.3
     assert "motor of joint2 also turns 1 times with joint1" in " ".join(capsys.readouterr().out.split())
+
+
+def test_ctrl_c_ends_the_fits_to_both_kinds_of_torque(monkeypatch):
+    seen, record = [], network_fit._Search.record
+
+    def interrupted(*given):
+        seen.append(given)
+        if len(seen) == 4:
+            raise KeyboardInterrupt
+        return record(*given)
+
+    monkeypatch.setattr(network_fit._Search, "record", interrupted)
+    model = nbs.fit(small()[0], "cholesky", coupling=BOTH, held_out=0.0, widths=(4,), iterations=10)
+    assert model.report.stopped == "interrupted"
+    assert len(seen) == 4
+
+
+@pytest.mark.parametrize("model", ["identified", "cholesky", "chain"])
+@pytest.mark.parametrize("transition", ["abc", None, 0.0, -1.0])
+def test_a_transition_that_is_no_speed_is_refused(model, transition):
+    with pytest.raises(ArgumentError, match="transition"):
+        nbs.fit(small()[0], model, robot=TWO, transition=transition)

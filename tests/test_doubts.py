@@ -179,4 +179,4 @@ def test_where_a_network_is_too_large_for_its_data_a_smaller_one_is_tried():
     assert large.report.test_nmse > 5.0 * large.report.train_nmse
     best = min(large, small, key=lambda model: min(model.report.held_out))
     assert chosen.report.held_out == best.report.held_out
-    assert chosen.network.widths == best.network.widths
+    assert chosen.network.widths == best.network.widths == (8,)

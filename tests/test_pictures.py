@@ -35,7 +35,7 @@ def certified():
 
 def test_the_heading_of_a_run_leaves_the_legend_and_the_names_of_joints_free(tmp_path, monkeypatch):
     told = {"controller": "NeuralBackstepping", "settings": {"seed": 0, "arm": {"armature": "0.1,0.2,0.3"}}}
-    run = sinusoid_run(3, robot=LONG, names=(JOINT, "b", "c"), info=told | {"plant_changes_s": [1.0]})
+    run = sinusoid_run(3, robot=LONG, names=(JOINT, "b", "c"), info=told | {"plant_changes": [1.0]})
     run.disturbance[:] = 0.3
     external = SimpleNamespace(torque=0.1 + 0.0 * run.q)
     figure = drawn(lambda: plot_tracking.__wrapped__(run, tmp_path / "a.png", external=external), monkeypatch)

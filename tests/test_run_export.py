@@ -245,7 +245,7 @@ def test_columns_say_what_they_have_and_in_which_unit(runs, tmp_path):
     assert header.endswith('external_rail [N],"external_swing, or β [N·m]"')
 
 
-def test_ten_seconds_of_panda_are_two_megabytes(arms, tmp_path):
+def test_how_much_ten_seconds_of_panda_take(arms, tmp_path):
     run = simulated(arms["panda"], duration=10.0, q0=None)
     sizes = {
         names: nbs.export_run(run, tmp_path / "run.mcap", signals=names).stat().st_size / 1e6

@@ -98,7 +98,7 @@ class TransientBound(Shown):
         if not (turning.size and turning.max() > np.pi):
             return ()
         turns = f"a bound of {turning.max() / (2.0 * np.pi):.2g} turns says nothing"
-        return (f"{turns}; give a smaller load or disturbance, or a larger bandwidth",)
+        return (f"{turns}; give a smaller load, start or disturbance, or a larger bandwidth",)
 
     @property
     def _growth(self) -> float:

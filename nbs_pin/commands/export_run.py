@@ -7,9 +7,8 @@ from nbs_pin.base.records import Run
 from nbs_pin.cli.export_run import ExportRun
 from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.certify import WATCHED
-from nbs_pin.commands.inputs import run_file
+from nbs_pin.commands.inputs import arm_that_ran, run_file
 from nbs_pin.reports.run_export import export_run
-from nbs_pin.robots.robot import load_robot
 
 
 def run(options: ExportRun, console: Console, notes: Console) -> None:
@@ -25,9 +24,7 @@ def run(options: ExportRun, console: Console, notes: Console) -> None:
     if options.out and file.exists() and not options.force:
         raise OptionError(f"'{file}' exists; give another --out, or --force to replace it.")
     with notes.status(f"writing {file}"):
-        if options.robot is None:
-            options.arm.refuse_without_arm("the run names its arm; give it with --robot")
-        robot = None if options.robot is None else load_robot(options.robot, **options.arm.given())
+        robot = arm_that_ran(options)
         signals = None if options.signals is None else options.signals.split(",")
         watched = None if options.monitored is None else options.monitored / WATCHED
         export_run(Run.load(source), file, robot, start=options.start, signals=signals, monitored=watched)

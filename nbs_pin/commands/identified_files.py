@@ -11,14 +11,13 @@ from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.units import units_of
 from nbs_pin.dynamics.coupled import CoupledDynamics
 from nbs_pin.dynamics.identified import IdentifiedDynamics
-from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES
+from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, PARAMETER_UNITS
 from nbs_pin.robots.robot import load_robot
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
 
 FILES = ("parameters.csv", "model.urdf", "model.xml")
 """The files; URDF and MJCF cannot hold coupled drives."""
 _HEAD = ("joint", "parameter", "unit", "value", "standard deviation", "urdf")
-_OF_BODY = ("kg", *["kg·m"] * 3, *["kg·m²"] * 6)
 _OF_DRIVE = {"viscous": "damping", "asymmetry": "damping", "rotor": "inertia", "load": ""}
 """Quantities of the terms of drives (`JointUnits`), empty for none; all others are torques."""
 
@@ -38,8 +37,8 @@ def _rows(model: IdentifiedDynamics) -> Iterator[tuple[Any, ...]]:
     """Rows of the table: ten for every body, then one for every number of the drives."""
     robot, details = model.robot, model.report.details
     for i, joint in enumerate(robot.joint_names):
-        stated = robot.model.inertias[i + 1].toDynamicParameters() if robot.has_bodies else [""] * len(_OF_BODY)
-        columns = (PARAMETER_NAMES, _OF_BODY, model.parameters[i], details["parameter_deviations"][i], stated)
+        stated = robot.model.inertias[i + 1].toDynamicParameters() if robot.has_bodies else [""] * len(PARAMETER_UNITS)
+        columns = (PARAMETER_NAMES, PARAMETER_UNITS, model.parameters[i], details["parameter_deviations"][i], stated)
         for row in zip(*columns, strict=True):
             yield joint, *row
     rotors = model.motor_inertia if isinstance(model, CoupledDynamics) else model.rotor_inertia

@@ -9,6 +9,8 @@ import numpy as np
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.shown import joints_told
 from nbs_pin.certificates.admissible import Admissible
+from nbs_pin.cli.export_run import ExportRun
+from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.track import Track
 from nbs_pin.cli.train import Train
 from nbs_pin.cli.values import SAVED, OptionError, plain_numbers
@@ -40,6 +42,14 @@ def arm_of(options: Track | Train) -> Robot:
 def run_file(given: Path) -> Path:
     """The file of a run, or that in a folder of results."""
     return given / "run.npz" if given.is_dir() else given
+
+
+def arm_that_ran(options: Replay | ExportRun) -> Robot | None:
+    """The arm that --robot names, None for that of the run; raises OptionError for options of an arm without it."""
+    if options.robot is None:
+        options.arm.refuse_without_arm("the run names its arm; give it with --robot")
+        return None
+    return load_robot(options.robot, **options.arm.given())
 
 
 def law_of(name: str, robot: Robot, **settings: Any) -> Controller:

@@ -55,7 +55,7 @@ def run(options: Log, console: Console, notes: Console) -> None:
 def _verdict(options: Log, data: Dataset, found: LogDoubts | None) -> str:
     name = options.data[0].name if len(options.data) == 1 else f"{len(options.data)} logs"
     doubts = 0 if found is None else len(found.doubts)
-    judged = "" if found is None else "; no doubts" if not doubts else f"; {doubts} doubt{'s' * (doubts > 1)}"
+    judged = "" if found is None else "; no doubts" if not doubts else f"; {counted(doubts, 'doubt')}"
     many = counted(data.trajectories, "trajectory", "trajectories")
     return f"{name}: {_seconds(data):.4g} s of motion of {joints_told(data.nv)} in {many}{judged}"
 

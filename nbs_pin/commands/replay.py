@@ -8,10 +8,9 @@ from nbs_pin.base.exports import KINDS
 from nbs_pin.base.records import Run
 from nbs_pin.cli.replay import Replay
 from nbs_pin.cli.values import OptionError
-from nbs_pin.commands.inputs import run_file
+from nbs_pin.commands.inputs import arm_that_ran, run_file
 from nbs_pin.reports.replay import replay
 from nbs_pin.reports.run_import import import_run
-from nbs_pin.robots.robot import load_robot
 
 
 def run(options: Replay, console: Console, notes: Console) -> None:
@@ -23,9 +22,7 @@ def run(options: Replay, console: Console, notes: Console) -> None:
     if options.out and page.exists() and not options.force:
         raise OptionError(f"'{page}' exists; give another --out, or --force to replace it.")
     with notes.status(f"drawing {page}"):
-        if options.robot is None:
-            options.arm.refuse_without_arm("the run names its arm; give it with --robot")
-        robot = None if options.robot is None else load_robot(options.robot, **options.arm.given())
+        robot = arm_that_ran(options)
         exported = source.suffix.lower().removeprefix(".") in KINDS
         played = import_run(source, robot) if exported else Run.load(source)
         replay(played, page, robot, start=options.start)

@@ -13,14 +13,13 @@ from nbs_pin.controllers.matrix_logistic import logistic_and_cut
 from nbs_pin.controllers.unknowns import KINDS, LOAD_AT, NO_MASS, Unknowns, into_tree, model_body
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.identified import IdentifiedDynamics
-from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, inertial_parameters, pseudo_inertia
+from nbs_pin.dynamics.pseudo_inertia import PARAMETER_NAMES, PARAMETER_UNITS, inertial_parameters, pseudo_inertia
 from nbs_pin.kernels.layout import NumberCode, Packed
 from nbs_pin.kernels.symmetric4 import FARTHEST
 from nbs_pin.kernels.tree_layout import ARMATURE, BASE, BODY
 from nbs_pin.robots.robot import Robot
 
-_KINDS = ("kg", *["kg·m"] * 3, *["kg·m²"] * 6)
-_PARAMETERS = tuple(zip(PARAMETER_NAMES, _KINDS, strict=True))
+_PARAMETERS = tuple(zip(PARAMETER_NAMES, PARAMETER_UNITS, strict=True))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -24,7 +24,6 @@ from nbs_pin.dynamics.rigid_tree import RigidTree
 
 _INSTANTS = 2000
 _SILENT = 1e-6  # of the largest feedback, below which that of a joint is rounding
-
 _WEIGHTS = np.where(UPPER[0] == UPPER[1], 1.0, np.sqrt(2.0))  # so that triangles have the norm of their matrices
 
 

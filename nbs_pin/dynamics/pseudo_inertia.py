@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 PARAMETER_NAMES = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-"""Mass [kg], first moment [kg·m] and inertia about the joint's origin [kg·m²], in Pinocchio's order."""
+"""Mass, first moment and inertia about the joint's origin, in Pinocchio's order."""
+PARAMETER_UNITS = ("kg", *["kg·m"] * 3, *["kg·m²"] * 6)
+"""Their units."""
 
 
 def _basis() -> np.ndarray:

@@ -92,7 +92,8 @@ class Coupling(NamedTuple):
         off = self.matrix - np.eye(len(self.matrix))
         turns = [f"the motor of {joints[k]} also turns {x:.3g} times with {joints[j]}" for k, j, x in _entries(off)]
         where = "the motors" if self.at_motors else "the joints"
-        return f"{' and '.join(turns)}, and the torques of the log are those of {where}"
+        told = " and ".join(turns) or "no motor turns several joints"
+        return f"{told}, and the torques of the log are those of {where}"
 
 
 Given: TypeAlias = "Coupling | np.ndarray | Sequence[Sequence[float]] | bool | None"
@@ -143,7 +144,8 @@ def find_coupling(geometry: Geometry, data: Dataset, wanted: Wanted) -> Coupling
     """The coupling of neighbouring joints that explains the torques much better than none; None if there is none.
 
     One entry of N after the other is added, as long as each lowers Σ_k log σ_k by `_BETTER`, with the torques taken as
-    those of the joints and of the motors. det N = 1 for such matrices, so that this compares likelihoods.
+    those of the joints and of the motors. det N = 1 for such matrices, so that this compares likelihoods. Believed is
+    the last matrix that explains the torques well: of two entries that share a joint the first alone leaves much.
     """
     some, n = data.thinned(_SOME), data.nv
     if n < 2 or not data.tau.any() or data.about.get("doubts"):
@@ -153,6 +155,7 @@ def find_coupling(geometry: Geometry, data: Dataset, wanted: Wanted) -> Coupling
     suspect = deviation > np.sqrt(_LEFT) * np.maximum(some.tau.std(axis=0), 1e-300)
     if not suspect.any():
         return None
+    believed: Coupling | None = None
     best, least = none, float(np.log(deviation).sum())
     sides: tuple[bool, ...] = (False, True)
     while True:
@@ -165,13 +168,14 @@ def find_coupling(geometry: Geometry, data: Dataset, wanted: Wanted) -> Coupling
                     tried, value = _fitted(geometry, some, wanted, best, least, (k, j), first, at_motors)
                     if value < lower:
                         found, lower = tried, value
-        if lower > least - _BETTER or not _explained(geometry, some, wanted, found):
-            return None if best is none else best
+        if lower > least - _BETTER:
+            return believed
         best, least, sides = found, lower, (found.at_motors,)
+        believed = best if _explained(geometry, some, wanted, best) else believed
 
 
 def settled(
-    data: Dataset, robot: Robot, given: "Given", wanted: Wanted, stacklevel: int = 3
+    data: Dataset, robot: Robot, given: "Given", wanted: Wanted, stacklevel: int = 4
 ) -> tuple[Dataset, "Coupling | None"]:
     """The data with the torques of the joints, and the coupling of the drives, None without.
 
@@ -188,7 +192,7 @@ def settled(
 
 
 def possible(
-    data: Dataset, others: Dataset | None, robot: Robot | None, given: Given, wanted: Wanted, stacklevel: int = 3
+    data: Dataset, others: Dataset | None, robot: Robot | None, given: Given, wanted: Wanted, stacklevel: int
 ) -> list[tuple[Dataset, Dataset | None, Coupling | None]]:
     """What `settled` tells, with `others`, held-out data whose torques are of the same kind.
 
@@ -279,4 +283,4 @@ def _deviations(geometry: Geometry, data: Dataset, wanted: Wanted, coupling: Cou
 
 
 def _entries(off: Float[np.ndarray, "n n"]) -> list[tuple[int, int, float]]:
-    return [(int(k), int(j), float(off[k, j])) for k, j in np.argwhere(np.abs(off) > 1e-12)]
+    return [(int(k), int(j), float(off[k, j])) for k, j in np.argwhere(np.abs(off) > 1e-12) if k != j]

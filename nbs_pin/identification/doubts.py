@@ -4,17 +4,13 @@ from collections.abc import Mapping, Sequence
 
 from nbs_pin.base.doors import option
 from nbs_pin.identification.datasets import Dataset
-from nbs_pin.identification.fit_report import FitReport
+from nbs_pin.identification.fit_report import NOTICED, FitReport, is_far_worse
 from nbs_pin.identification.log_doubts import torque_ratio
 from nbs_pin.identification.remainder import Remainder, next_try
 from nbs_pin.robots.robot import Robot
 
-_NOTICED = 0.02
-"""Unexplained share of the torque's variance that is worth a word."""
 _SIMULATED = 1e-6
 """Share that a URDF leaves of torques that were simulated with it, as in a comparison of networks, or less."""
-_WORSE = 5.0
-"""Ratio of the unexplained share on held-out data to that on fitted ones that is worth a word."""
 
 
 def doubts(
@@ -49,14 +45,14 @@ def _unit(data: Dataset, robot: Robot) -> str:
 
 def _missing(left: Remainder | None, asked: Mapping[str, bool | None], joints: Sequence[str]) -> str:
     """Drives that were not to be learned and would explain much of what is left."""
-    if left is None or left.unexplained < _NOTICED or asked.get(left.cause, True) is not False:
+    if left is None or left.unexplained < NOTICED or asked.get(left.cause, True) is not False:
         return ""
     return next_try(left, joints, asked)
 
 
 def _held_out(train_nmse: float, test_nmse: float | None) -> str:
     """Held-out data that are predicted far worse than the fitted ones."""
-    if test_nmse is None or not test_nmse > max(_WORSE * train_nmse, _NOTICED):
+    if test_nmse is None or not is_far_worse(test_nmse, train_nmse):
         return ""
     return (
         f"{test_nmse:.2g} of the torque's variance is unexplained on held-out data, and {train_nmse:.2g} on those that "
@@ -68,11 +64,12 @@ def _beside_urdf(report: FitReport) -> str:
     """A network that knows less than the arm's URDF."""
     found = report.train_nmse if report.test_nmse is None else report.test_nmse
     known = None if report.stopped == "interrupted" else report.details.get("urdf_nmse")
-    if known is None or not _SIMULATED < known < found or not found > _NOTICED:
+    if known is None or not _SIMULATED < known < found or not found > NOTICED:
         return ""
+    where = "fitted" if report.test_nmse is None else "held-out"
     return (
-        f"the arm's own URDF with friction and rotors leaves {known:.2g} of the torque's variance there, and what was "
-        f"learned {found:.2g}; {option('model', 'residual')} or {option('model', 'identified')} begins with "
+        f"the arm's own URDF with friction and rotors leaves {known:.2g} of the torque's variance on {where} data, and "
+        f"what was learned {found:.2g}; {option('model', 'residual')} or {option('model', 'identified')} begins with "
         "it or its geometry"
     )
 
@@ -80,7 +77,7 @@ def _beside_urdf(report: FitReport) -> str:
 def _untrained(report: FitReport) -> str:
     """A network that was not improved though much is left to learn."""
     left = report.train_nmse if report.test_nmse is None else report.test_nmse
-    if report.stopped != "no better than the start" or not left > _NOTICED:
+    if report.stopped != "no better than the start" or not left > NOTICED:
         return ""
     return (
         "the network learned nothing that holds on held-out data, and the model is the untrained one with friction; "

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from nbs_pin.base.arguments import SEED, checked, either, flag, maybe, number, text
+from nbs_pin.base.checks import positive
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.registry import entry
 from nbs_pin.base.units import percent
@@ -96,12 +97,14 @@ def fit(
     start = time.perf_counter()
     train, test = split_data(data, held_out, seed)
     rotors = rotors_wanted(rotor_inertia, robot)
-    wanted = Wanted(friction, offset, rotors, settings.get("transition", 0.01))
+    transition = settings.get("transition", 0.01)
+    positive("transition", transition, "rad/s")
+    wanted = Wanted(friction, offset, rotors, transition)
     task = FitTask(model, train, test, seed, robot, None, (friction, offset, rotors), progress, settings)
     task, fitted = _fitted(fitter, task, coupling, wanted)
     report = _reported(task, fitted, time.perf_counter() - start)
     for doubt in doubts_of_report(report):
-        warnings.warn(f"{doubt}.", stacklevel=2)
+        warnings.warn(f"{doubt}.", stacklevel=3)
     return fitted.assemble(report)
 
 
@@ -112,7 +115,7 @@ def _reported(task: FitTask, fitted: Fitted, seconds: float) -> FitReport:
     left = remainder(bare, judged, fitted.friction) if train.tau.any() else None
     joints = tuple(f"joint {i + 1}" for i in range(train.nv)) if robot is None else robot.joint_names
     for doubt in doubts(train, robot, left, asked, joints):
-        warnings.warn(f"{doubt}.", stacklevel=3)
+        warnings.warn(f"{doubt}.", stacklevel=4)
     return FitReport(
         model=task.model,
         seed=task.seed,
@@ -144,7 +147,11 @@ def _fitted(fitter: Callable[[FitTask], Fitted], task: FitTask, given: Given, wa
     for data, held_out, coupled in possible(task.data, task.held_out, task.robot, given, wanted, stacklevel=5):
         own = replace(task, data=data, held_out=held_out, coupled=coupled)
         done.append((own, fitter(own)))
-    return done[0] if len(done) == 1 else min(done, key=lambda pair: _misfit(*pair))
+        if done[-1][1].stopped == "interrupted":
+            break
+    chosen, fitted = done[0] if len(done) == 1 else min(done, key=lambda pair: _misfit(*pair))
+    last = done[-1][1].stopped
+    return chosen, replace(fitted, stopped=last) if last == "interrupted" else fitted
 
 
 def _misfit(task: FitTask, fitted: Fitted) -> float:

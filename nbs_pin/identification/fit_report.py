@@ -10,6 +10,10 @@ from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.identification.datasets import Dataset
 
+NOTICED = 0.02
+"""Unexplained share of the torque's variance that is worth a word."""
+_WORSE = 5.0
+"""Ratio of the unexplained share on held-out data to that on fitted ones from which on it is far worse."""
 _VARIES = 1e-12
 
 
@@ -50,6 +54,11 @@ class FitReport:
     """The one thing to try next, empty if little is left."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """Further results of this kind of model, JSON-serialisable."""
+
+
+def is_far_worse(held_out: float, fitted: float) -> bool:
+    """Whether so much more of the torque's variance is unexplained on held-out data that too much was learned."""
+    return held_out > max(_WORSE * fitted, NOTICED)
 
 
 def torque_errors(model: DynamicsProvider, data: Dataset, friction: JointFriction | None = None) -> np.ndarray:

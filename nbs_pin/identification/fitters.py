@@ -125,7 +125,9 @@ def fit_family(task: FitTask) -> Fitted:
 
     found = fitted_with(family.fit_widths)
     if "widths" not in options and family.few_widths and found.is_too_large:
-        found = min(found, fitted_with(family.few_widths), key=lambda each: min(each.held_out))
+        small = fitted_with(family.few_widths)
+        found = min(found, small, key=lambda each: min(each.held_out))
+        found = replace(found, stopped=small.stopped) if small.stopped == "interrupted" else found
     fitted = _of_network(
         task, found, lambda report: LagrangianDynamics(found.network, task.robot, found.friction, report)
     )

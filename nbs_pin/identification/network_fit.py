@@ -19,6 +19,7 @@ from nbs_pin.identification.coupling import Coupling, in_motors, matrix_of
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted, terms_of_rest
 from nbs_pin.identification.drive_terms import DriveTerms
+from nbs_pin.identification.fit_report import is_far_worse
 from nbs_pin.identification.network_equations import Equation, Equations, Loss, Theta
 
 FitOptimiser: TypeAlias = Literal["lm", "adam", "lbfgs"]
@@ -34,7 +35,6 @@ _STARTS, _STUCK = 3, 0.05  # most starts; nMSE after the coarse part above which
 _PATIENCE, _SLOW = 0.2, 0.03  # share of the iterations, and the least relative decrease in them
 _BATCH, _BATCHES, _RATE, _LBFGS_SHARE = 256, 16, 3e-3, 0.75  # largest batch, fewest batches, learning rate, share
 _AS_GOOD = 1.01  # ratio of costs up to which fewer or more terms of friction are as good
-_TOO_LARGE, _NOTICED = 5.0, 0.02  # of the misfit of held-out data: ratio to that of fitted ones, and what counts
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e8
 
 
@@ -61,7 +61,7 @@ class NetworkFit:
         """Whether held-out data are predicted so much worse than fitted ones that a smaller network may do better."""
         if not self.held_out or self.stopped == "interrupted":
             return False
-        return min(self.held_out) > max(_TOO_LARGE * min(self.history), _NOTICED)
+        return is_far_worse(min(self.held_out), min(self.history))
 
 
 @dataclass(eq=False)

@@ -27,8 +27,8 @@ _NEEDED, _FURTHER = (MEASURED, "/reference", FACTS), ("/command", "/disturbance"
 def import_run(path: str | Path, robot: Robot | None = None) -> Run:
     """The run in a file that `export_run` wrote with states and reference.
 
-    What it has is as it was, bit for bit. A .mcap file has no `a_ref`, which is differentiated; a .csv file names no
-    arm, no limits and no `info`.
+    What it has is as it was, bit for bit. A .mcap file has no `a_ref`, which is differentiated. A .csv file names no
+    arm, no limits and no `info`, nor the joints that turn without limit: without `robot` their whole turns are errors.
 
     Args:
         path: The .mcap or .csv file.
@@ -37,8 +37,6 @@ def import_run(path: str | Path, robot: Robot | None = None) -> Run:
     Raises:
         FileFormatError: If it is damaged or no such file.
         MissingExtra: If the extra `logs` is not installed, which .mcap needs.
-
-    A .csv file does not say which joints turn without limit: without `robot` whole turns count as errors.
 
     Example:
         >>> import tempfile
