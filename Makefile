@@ -30,7 +30,7 @@ help:
 setup: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs,franka,logs,verify,xacro]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[cluster,dev,docs,franka,logs,parquet,verify,xacro]'
 	touch $(READY)
 
 demo: $(READY)

@@ -25,7 +25,7 @@ FLOORS = [
     {"simulation", "storage"},
     {"accuracy", "identification", "training"},
     {"certificates", "cli", "verification"},
-    {"reports", "runtime"},
+    {"campaigns", "reports", "runtime"},
     {"benchmarks", "reproduction"},
     {"commands"},
 ]
@@ -53,6 +53,7 @@ HOMES = {
     "jsonschema": {"verification.document"},
     "threadpoolctl": {"identification.chain_fit", "identification.coupling", "identification.explain"},
     "xacro": {"robots.xacro_source"},
+    "distributed": {"campaigns.runner"},
     "rosbags": {"identification.log_bags", "reports.run_bags"},
     "numba": {"kernels", "benchmarks.bench"},
     "tyro": {"cli"},
