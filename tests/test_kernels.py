@@ -38,7 +38,7 @@ from nbs_pin.kernels.tree_layout import PER_JOINT, TREE_JOINTS, Link, pack_tree,
 from nbs_pin.kernels.trees import tree_acceleration, tree_torque
 from nbs_pin.simulation.costs import squared_error
 from nbs_pin.simulation.integrators import INTEGRATORS
-from nbs_pin.simulation.rollout import _scene, motions, running_cost
+from nbs_pin.simulation.rollout import motions, running_cost, scene_of
 from tests.laws import COMPILED
 from tests.test_adjoints import adjoint_of, random_damping, random_law, random_potential, scratch, states
 from tests.test_training import arm, assert_engines_agree, law_for, problem
@@ -184,7 +184,7 @@ def run_and_adjoint(name: str, arm_name: str, integrator: str, substeps: int, co
     robot = arm(arm_name)
     steps, n, law = 2, robot.nv, law_for(robot, name)
     batch, packed = problem(robot, steps, 1, integrator=integrator, substeps=substeps), law.packed_law()
-    scene = _scene(law, batch.loop)
+    scene = scene_of(law, batch.loop)
     scene = scene if code is None else scene._replace(integrator=code)
     shapes = ((steps + 1, n), (steps + 1, n), (steps, n), (steps + 1, 2, n))
     motion, bars = Rollout(*(np.zeros(s) for s in shapes)), Rollout(*(np.ones(s) for s in shapes))

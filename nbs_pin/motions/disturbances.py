@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 
 from nbs_pin.base.arguments import PERIOD, SEED, check_fields, number
 from nbs_pin.base.arrays import Vectors
@@ -39,7 +40,11 @@ class ConstantTorque:
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """τ_d [N·m] at time t [s] and state (q, v)."""
-        return _on_joints(self.torque, q)
+        return _on_joints(self._at(_instant(t)), q)
+
+    def _at(self, t: Any) -> Any:
+        """τ_d [N·m] at a time t [s], or a row for each of t of shape (rows, 1)."""
+        return self.torque
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +67,11 @@ class SinusoidalTorque:
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """τ_d [N·m] at time t [s] and state (q, v)."""
-        return _on_joints(self.amplitude * np.sin(self.frequency * _instant(t) + self.phase), q)
+        return _on_joints(self._at(_instant(t)), q)
+
+    def _at(self, t: Any) -> Any:
+        """τ_d [N·m] at a time t [s], or a row for each of t of shape (rows, 1)."""
+        return self.amplitude * np.sin(self.frequency * t + self.phase)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +94,11 @@ class SquareWave:
 
     def __call__(self, t: float, q: Vectors, v: Vectors) -> Vectors:
         """τ_d [N·m] at time t [s] and state (q, v)."""
-        sign = np.where(np.sin(self.frequency * _instant(t) + self.phase) >= 0.0, 1.0, -1.0)
-        return _on_joints(self.amplitude * sign, q)
+        return _on_joints(self._at(_instant(t)), q)
+
+    def _at(self, t: Any) -> Any:
+        """τ_d [N·m] at a time t [s], or a row for each of t of shape (rows, 1)."""
+        return self.amplitude * np.where(np.sin(self.frequency * t + self.phase) >= 0.0, 1.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +135,23 @@ class TorqueNoise:
             return std * rng.standard_normal(std.shape)
         first, end, count = self.share
         return std * rng.standard_normal((count, *std.shape[1:]))[first:end]
+
+
+def torques_over(
+    disturbance: Disturbance | None, times: Float[np.ndarray, " rows"], nv: int
+) -> Float[np.ndarray, "rows n"] | None:
+    """τ_d [N·m] at each of the times [s]; None for one of another class, which may depend on the state."""
+    if disturbance is None:
+        return np.zeros((len(times), nv))
+    if type(disturbance) not in (ConstantTorque, SinusoidalTorque, SquareWave, TorqueNoise):
+        return None  # a subclass may do something else
+    if isinstance(disturbance, ConstantTorque | SinusoidalTorque | SquareWave):
+        first, rows = _on_joints(disturbance._at(float(times[0])), np.zeros(nv)), disturbance._at(times[:, None])
+        return np.zeros((len(times), len(first))) + rows
+    if isinstance(disturbance, TorqueNoise):
+        rest = np.zeros(nv)
+        return np.array([disturbance(t, rest, rest) for t in times.tolist()])
+    return None
 
 
 def _on_joints(torque: Any, q: Any) -> np.ndarray:

@@ -96,7 +96,7 @@ class Batch:
 
 def engine_for(controller: Controller, loop: Loop) -> Engine:
     """The fastest engine for this loop: "kernels" if law, model and plant have them, else "torch"."""
-    return "torch" if _scene(controller, loop) is None or not _on_cpu(controller) else "kernels"
+    return "torch" if scene_of(controller, loop) is None or not _on_cpu(controller) else "kernels"
 
 
 def motions(
@@ -126,7 +126,7 @@ def motions(
         )
     if engine == "torch":
         return _by_torch(controller, batch, torque)
-    scene = _scene(controller, batch.loop)
+    scene = scene_of(controller, batch.loop)
     if scene is None or not _on_cpu(controller):
         raise ArgumentError(
             f"{type(controller).__name__} on {batch.loop.plant!r} has no kernels; take engine='torch', it runs any law."
@@ -185,7 +185,7 @@ def _constant_torque(tau_d: Any, nv: int) -> np.ndarray:
     return torque
 
 
-def _scene(controller: Controller, loop: Loop) -> Scene | None:
+def scene_of(controller: Controller, loop: Loop) -> Scene | None:
     """Constants of the loop for the kernels, or None if one of its parts has no kernel."""
     plant = loop.plant
     if type(plant) is not DynamicsPlant or not controller.packable:
