@@ -170,6 +170,8 @@ class DisturbanceText:
     kind: DisturbanceKind | Literal["none"]
     sizes: tuple[float, ...] = ()
     frequency: float = 0.0
+    named: str = "--disturbance"
+    """What a message calls it."""
 
     def build(self, nv: int, period: float, seed: int) -> Callable[..., Any] | None:
         """The torque on `nv` joints, noise held for `period` [s]; raises OptionError if the number of sizes differs."""
@@ -177,7 +179,7 @@ class DisturbanceText:
 
         if len(self.sizes) not in (0, 1, nv):
             raise OptionError(
-                f"--disturbance '{self.text}' has {len(self.sizes)} torques for {counted(nv, 'joint')}; give one or "
+                f"{self.named} '{self.text}' has {len(self.sizes)} torques for {counted(nv, 'joint')}; give one or "
                 "one per joint."
             )
         size = self.sizes[0] if len(self.sizes) == 1 else list(self.sizes)
@@ -199,10 +201,10 @@ def disturbance_text() -> PrimitiveConstructorSpec[str]:
     return _spec("TORQUE", lambda words: parse_disturbance(words[0]).text, str)
 
 
-def parse_disturbance(text: str) -> DisturbanceText:
+def parse_disturbance(text: str, named: str = "--disturbance") -> DisturbanceText:
     """Parse `none`, `constant:5`, `constant:5,5,3`, `square:5@8`, `sine:5@8` or `noise:0.5`; raises OptionError."""
     if text == "none":
-        return DisturbanceText(text, "none")
+        return DisturbanceText(text, "none", named=named)
     parts = re.fullmatch(r"(?:(constant|noise):([^@]+)|(square|sine):([^@]+)@(.+))", text)
     if parts:
         kind, listed, frequency = parts[1] or parts[3], parts[2] or parts[4], plain_number(parts[5] or "0")
@@ -212,9 +214,9 @@ def parse_disturbance(text: str) -> DisturbanceText:
             size is not None and abs(size) <= _LARGEST and (size >= 0.0 or kind != "noise") for size in sizes
         )
         if usable:
-            return DisturbanceText(text, kind, tuple(sizes), frequency)  # type: ignore[arg-type]
+            return DisturbanceText(text, kind, tuple(sizes), frequency, named)  # type: ignore[arg-type]
     raise OptionError(
-        f"--disturbance is '{text}'; give none, constant:5, square:5@8, sine:5@8 or noise:0.5 "
+        f"{named} is '{text}'; give none, constant:5, square:5@8, sine:5@8 or noise:0.5 "
         "(N·m, or N where it slides, one for all joints or one per joint, separated by commas; "
         "@ frequency above 0 rad/s)."
     )

@@ -17,14 +17,12 @@ from nbs_pin.cli.payloads import TimedLoad
 from nbs_pin.commands.inputs import law_of
 from nbs_pin.commands.loads import kept, loaded
 from nbs_pin.controllers.controller import Controller
-from nbs_pin.controllers.gains import sample_configurations
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.motions.disturbances import Disturbance
 from nbs_pin.motions.references import DesiredMotion, Sinusoid, check_reference
 from nbs_pin.robots.robot import Robot
-from nbs_pin.simulation.dynamics_plant import DynamicsPlant
-from nbs_pin.simulation.loop import LONGEST_PLANT_STEP
 from nbs_pin.simulation.plant import Plant
+from nbs_pin.simulation.plant_steps import stable_step
 from nbs_pin.simulation.registry import build_plant
 from nbs_pin.simulation.simulate import recorded_numbers, stream
 
@@ -105,7 +103,7 @@ def track(
             duration,
             period,
             q0=start,
-            plant_step=_plant_step(plant, robot, period) if plant_step is None else plant_step,
+            plant_step=stable_step(plant, robot, period) if plant_step is None else plant_step,
             effort_limit=robot.effort_limit,
             lookahead=lookahead,
             disturbance=disturbance,
@@ -151,18 +149,3 @@ def _check_size(numbers: int, duration: float, period: float) -> None:
             f"{duration:g} s at a period of {period:g} s would record {size / 1e9:.3g} GB, at most "
             f"{LARGEST / 1e9:.3g} GB are kept; give a shorter duration or a longer period."
         )
-
-
-def _plant_step(plant: Plant, robot: Robot, period: float) -> float | None:
-    """A step short enough for RK4 to follow the plant's joint friction [s], or None for the usual one.
-
-    Loads that appear make the arm heavier, and with that friction slower to follow.
-    """
-    plant = plant.at(0.0)
-    if not isinstance(plant, DynamicsPlant) or plant.friction is None:
-        return None
-    # Friction is a damper of this slope near rest; RK4 is stable up to 2.78 of its fastest time constant.
-    slope = plant.friction.viscous + plant.friction.coulomb / plant.friction.transition
-    mass = plant.dynamics.mass_matrix(sample_configurations(robot, 200))
-    fastest = float(np.linalg.eigvals(np.linalg.solve(mass, np.diag(slope))).real.max())
-    return period / int(np.ceil(period / min(LONGEST_PLANT_STEP, 2.0 / max(fastest, 1.0)) - 1e-9))

@@ -38,10 +38,11 @@ def check_loop(
         samples=_SAMPLES,
         joint_friction="keep" if friction == "keep" else "drop",
     )
-    _check_start(start[0].reshape(-1, robot.nv), robot)
+    check_start(start[0].reshape(-1, robot.nv), robot)
 
 
-def _check_start(q: np.ndarray, robot: Robot) -> None:
+def check_start(q: np.ndarray, robot: Robot) -> None:
+    """Raise ArgumentError unless the starts (starts, n) are within the position limits."""
     outside = (q < robot.lower - _ROUNDING) | (q > robot.upper + _ROUNDING)
     if not outside.any():
         return
