@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo demos test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms monitor-campaign adaptive-campaign certificate-campaign adaptive-bound-campaign export-check faults hostile-samples bench-history clean
+.PHONY: help setup demo demos test check docs docs-check pictures mutants fuzz fuzz-calls fuzz-files fuzz-descriptions random-arms campaign-kills monitor-campaign adaptive-campaign certificate-campaign adaptive-bound-campaign export-check faults hostile-samples bench-history clean
 help:
 	@echo "make demo           track three arms; pictures and replays land in out/"
 	@echo "make demos          every demo in demos/, at its full length; some minutes"
@@ -17,6 +17,7 @@ help:
 	@echo "make fuzz-files     10,000 damaged files at every reader; about five minutes"
 	@echo "make fuzz-descriptions  20,000 broken URDF and xacro files and 5,000 in MJCF; about ten minutes"
 	@echo "make random-arms    50 random arms with rotors and friction, untuned; about five minutes"
+	@echo "make campaign-kills a campaign killed at 20 random moments, and its table; about two minutes"
 	@echo "make monitor-campaign  false alarms of 200 honest runs, and whether faults are named; about 3 minutes"
 	@echo "make adaptive-campaign  what the adaptive law keeps of its promises on four arms; about half an hour"
 	@echo "make certificate-campaign  2,000 random certificates against MuJoCo; about two hours"
@@ -75,6 +76,9 @@ fuzz-descriptions: $(READY)
 
 random-arms: $(READY)
 	$(BIN)/python tools/random_arms.py
+
+campaign-kills: $(READY)
+	$(BIN)/python tools/campaign_kills.py
 
 monitor-campaign: $(READY)
 	$(BIN)/python tools/monitor_campaign.py

@@ -14,6 +14,8 @@ from .base.exceptions import (
     TooLarge as TooLarge,
 )
 from .base.records import Reference as Reference, Run as Run
+from .campaigns.campaign import Campaign as Campaign
+from .campaigns.table import CampaignTable as CampaignTable, run_campaign as run_campaign
 from .certificates.adaptive_bound import TransientBound as TransientBound, transient_bound as transient_bound
 from .certificates.admissible import Admissible as Admissible
 from .certificates.attack import Attack as Attack, attack as attack

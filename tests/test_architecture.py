@@ -25,7 +25,8 @@ FLOORS = [
     {"simulation", "storage"},
     {"accuracy", "identification", "training"},
     {"certificates", "cli", "verification"},
-    {"campaigns", "reports", "runtime"},
+    {"campaigns"},
+    {"reports", "runtime"},
     {"benchmarks", "reproduction"},
     {"commands"},
 ]
@@ -54,6 +55,7 @@ HOMES = {
     "threadpoolctl": {"identification.chain_fit", "identification.coupling", "identification.explain"},
     "xacro": {"robots.xacro_source"},
     "distributed": {"campaigns.runner"},
+    "pyarrow": {"campaigns.table"},
     "rosbags": {"identification.log_bags", "reports.run_bags"},
     "numba": {"kernels", "benchmarks.bench"},
     "tyro": {"cli"},

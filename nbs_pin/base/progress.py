@@ -22,9 +22,11 @@ def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = Tru
     A function as `label` is called whenever the bar is drawn.
     """
     if not (show and _is_terminal()):
+        begun = time.perf_counter()
         for done, item in enumerate(items):
             if show:
-                _now[:] = [f"{_text(label)}, {done} of {len(items)}"]
+                left = (time.perf_counter() - begun) * (len(items) - done) / done if done else 0.0
+                _now[:] = [f"{_text(label)}, {done} of {len(items)}{f', about {left:.0f} s left' if done else ''}"]
             yield item
         return
     from rich.console import Console

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
-from math import prod
+from math import isfinite, prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,7 +113,7 @@ class Campaign(Shown):
     def trials(self) -> tuple[Trial, ...]:
         """All trials, sample by sample."""
         usual = {name: variable.usual for name, variable in VARIABLES.items()} | dict(self.fixed)
-        found = []
+        found: list[Trial] = []
         for sample in range(self.samples):
             drawn = {name: _draw(self.seed, sample, name, source) for name, source in self.random.items()}
             for combined in product(*self.grid.values()):
@@ -132,7 +132,7 @@ class Campaign(Shown):
         """All that it states, as JSON can store it."""
         spans = {name: x._asdict() if isinstance(x, Span) else list(x) for name, x in self.random.items()}
         grid = {name: list(values) for name, values in self.grid.items()}
-        tables = {"fixed": dict(self.fixed), "grid": grid, "random": spans, "arm": dict(self.arm)}
+        tables = {"fixed": dict(self.fixed), "grid": grid, "random": spans, "arm": _stored(self.arm)}
         return {**tables, "samples": self.samples, "seed": self.seed}
 
     def _facts(self) -> Iterable[str]:
@@ -177,6 +177,15 @@ def _plain(where: str, table: Mapping[str, Any]) -> dict[str, Any]:
         if not is_plain(value):
             raise ArgumentError(f"{where}.{name} is {told(value)}; give numbers, texts, lists and tables.")
     return dict(table)
+
+
+def _stored(x: Any) -> Any:
+    """The arguments of an arm with words for numbers that are not finite, which JSON does not have."""
+    if isinstance(x, Mapping):
+        return {key: _stored(value) for key, value in x.items()}
+    if isinstance(x, list | tuple):
+        return [_stored(value) for value in x]
+    return str(x) if isinstance(x, float) and not isfinite(x) else x
 
 
 def _beside(folder: Path, name: str, value: Any) -> Any:

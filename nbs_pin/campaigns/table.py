@@ -1,8 +1,9 @@
 """A campaign done: its trials with their figures, as a table and in files."""
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from nbs_pin.base.versions import versions
 from nbs_pin.campaigns.campaign import Campaign, Trial
 from nbs_pin.campaigns.runner import run_jobs
 from nbs_pin.campaigns.trials import Figures, figures_of, is_fused
+from nbs_pin.campaigns.variables import VARIABLES, Span
 
 _KIND = ("robot", "law", "bandwidth", "period", "disturbance", "friction", "unknown_viscous", "unknown_coulomb",
          "plant", "integrator", "plant_step")  # fmt: skip
@@ -97,10 +99,36 @@ class CampaignTable(Shown):
     @checked(path=writable)
     def write_parquet(self, path: str | Path) -> Path:
         """Write the table as Parquet, for pandas, polars, duckdb and dask; raises MissingExtra without pyarrow."""
-        table, write = _parquet()
+        table, write = check_parquet()
         with whole_file(path) as file:
             write(table({name: self.column(name) for name in self.columns}), file, compression="zstd")
         return Path(path)
+
+    @checked(most=count(1))
+    def groups(self, most: int = 24) -> dict[str, tuple[Row, ...]]:
+        """The rows by the values of what varies in steps, in words: by as many variables as make at most `most`."""
+        stepped = {**self.campaign.grid, **{k: x for k, x in self.campaign.random.items() if not isinstance(x, Span)}}
+        while prod(len(values) for values in stepped.values()) > most:
+            stepped.popitem()
+        found: dict[str, list[Row]] = {}
+        for row in self.rows:
+            found.setdefault(in_words({name: row.trial.values[name] for name in stepped}), []).append(row)
+        return {words: tuple(rows) for words, rows in found.items()}
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """What summary.json keeps: counts, medians and the worst trial, of all and of each group."""
+        worst, varied = self.worst(1), (*self.campaign.grid, *self.campaign.random)
+        groups = {words: figures_of_rows(rows) for words, rows in self.groups().items()}
+        found = {"trials": len(self.rows), **figures_of_rows(self.rows), "groups": groups if len(groups) > 1 else {}}
+        if worst:
+            trial, figures, _ = worst[0]
+            assert figures is not None
+            about = {name: trial.values[name] for name in varied}
+            told = in_words(about) if about else ""
+            found["worst"] = {"trial": trial.number, "settings": about, "told": told, "joint": figures.worst_joint}
+            found["unit"] = figures.unit
+        return found
 
     def _facts(self) -> Iterable[str]:
         yield counted(len(self.rows), "trial")
@@ -109,8 +137,8 @@ class CampaignTable(Shown):
         for row in self.worst(1):
             assert row.figures is not None
             errors = [error for error in self.column("rms_error_rad") if error is not None]
-            yield f"median RMS error {measured(float(np.median(errors)), 'rad')}"
-            yield f"worst {measured(row.figures.rms_error_rad, 'rad')} in trial {row.trial.number}"
+            yield f"median RMS error {measured(float(np.median(errors)), row.figures.unit)}"
+            yield f"worst {measured(row.figures.rms_error_rad, row.figures.unit)} in trial {row.trial.number}"
 
     def _cells(self) -> Cells:
         names = [*self.campaign.grid, *self.campaign.random]
@@ -126,8 +154,30 @@ class CampaignTable(Shown):
         return Cells(("trial", *names, "RMS error [rad]"), rows)
 
 
-def _parquet() -> tuple[Any, Any]:
-    """What makes a table of columns, and what writes it."""
+def in_words(values: Mapping[str, Any]) -> str:
+    """Values of variables, as in "nbs, payload 2 kg"; "all" without any."""
+    told = []
+    for name, value in values.items():
+        number = f"{name.replace('_', ' ')} {value:.4g} {VARIABLES[name].unit}" if VARIABLES[name].is_number else value
+        told.append("usual " + name if value is None else str(number).strip())
+    return ", ".join(told) or "all"
+
+
+def figures_of_rows(rows: Sequence[Row]) -> dict[str, Any]:
+    """Counts and errors of some rows, as JSON can store them."""
+    done = [row.figures for row in rows if row.figures is not None]
+    errors = np.array([figures.rms_error_rad for figures in done])
+    return {
+        "failed": sum(row.figures is None for row in rows),
+        "converged": sum(figures.converged_s is not None for figures in done),
+        "saturated": sum(figures.saturated_share > 0.0 for figures in done),
+        "median_rms_error_rad": float(np.median(errors)) if done else None,
+        "worst_rms_error_rad": float(errors.max()) if done else None,
+    }
+
+
+def check_parquet() -> tuple[Any, Any]:
+    """What makes a table of columns, and what writes it; raises MissingExtra without pyarrow."""
     try:
         import pyarrow
         from pyarrow import parquet
@@ -185,7 +235,7 @@ def run_campaign(
         workers=workers,
         processes=workers > 1 and cluster is None and not _shared_by_threads(trials),
         cluster=cluster,
-        label="campaign",
+        label="trials",
         progress=progress,
     )
     rows = []

@@ -62,6 +62,8 @@ class Figures(NamedTuple):
     """Largest error of a joint at the end."""
     worst_joint: str
     """The joint of the largest RMS error."""
+    unit: str
+    """Unit of its errors, "rad" or "m"."""
     converged_s: float | None
     """Time from which ‖z1‖² stays below 0.01; None if there is none."""
     peak_torque_Nm: float
@@ -82,6 +84,7 @@ def figures_of(trial: Trial) -> dict[str, Any]:
     run, robot = run_of(trial)
     z1 = metrics.error(run)
     rms, size = metrics.rms_error(run), np.abs(z1)
+    worst = int(rms.argmax())
     with np.errstate(invalid="ignore"):
         share = metrics.joint_peak_torque(run) / run.effort_limit
     beyond = np.maximum(robot.lower - run.q, run.q - robot.upper)
@@ -92,7 +95,8 @@ def figures_of(trial: Trial) -> dict[str, Any]:
                 late_rms_error_rad=float(metrics.rms_error(run, 0.7 * float(run.t[-1])).max()),
                 peak_error_rad=float(size.max()),
                 final_error_rad=float(size[-1].max()),
-                worst_joint=run.joint_names[int(rms.argmax())],
+                worst_joint=run.joint_names[worst],
+                unit=run.units[worst].position,
                 converged_s=float(metrics.convergence_time(run)),
                 peak_torque_Nm=float(metrics.peak_torque(run)),
                 peak_effort_share=float(share.max()) if np.isfinite(run.effort_limit).any() else None,

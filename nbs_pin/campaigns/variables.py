@@ -9,7 +9,7 @@ from nbs_pin.base.arguments import BANDWIDTH, DURATION, PERIOD, SEED, Check, cho
 from nbs_pin.base.checks import told
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.registry import entry
-from nbs_pin.cli.values import SAVED, parse_disturbance
+from nbs_pin.cli.values import SAVED, OptionError, parse_disturbance
 from nbs_pin.controllers.registry import LAWS
 from nbs_pin.simulation.registry import INTEGRATOR_NAMES, PLANTS
 
@@ -50,8 +50,10 @@ def _law(name: str, value: Any) -> str:
 
 
 def _disturbance(name: str, value: Any) -> str:
-    parse_disturbance(text(name, value), name)
-    return str(value)
+    try:
+        return parse_disturbance(text(name, value), name).text
+    except OptionError as error:
+        raise ArgumentError(str(error)) from error
 
 
 def _measure(*, usual: float | None, unit: str, check: Check) -> Variable:

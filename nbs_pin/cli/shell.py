@@ -22,6 +22,7 @@ from nbs_pin.base.doors import at_the_shell
 from nbs_pin.base.exceptions import CertificateRefused, NbsPinError
 from nbs_pin.base.picture_kinds import svg_too
 from nbs_pin.cli.bench import Bench
+from nbs_pin.cli.campaign import Campaign
 from nbs_pin.cli.certify import Certify
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.compare import Compare
@@ -46,6 +47,7 @@ from nbs_pin.cli.verify import Verify
 
 COMMANDS: dict[str, type] = {
     "track": Track,
+    "campaign": Campaign,
     "train": Train,
     "excite": Excite,
     "collect": Collect,

@@ -358,8 +358,25 @@ def _percent(share: float | None) -> str:
     return "not finite" if share is None else f"{100.0 * share:.2g} %"
 
 
+def _campaign(figures: Mapping[str, Any]) -> Verdict:
+    """Median and worst error over the trials, and how many failed."""
+    count, failed = figures["trials"], figures["failed"]
+    lost = f"; {failed} failed" if failed else ""
+    if failed == count:
+        return Verdict(BAD, f"all of {counted(count, 'trial')} failed")
+    unit, worst = figures["unit"], figures["worst"]
+    median, most = (measured(_number(figures[f"{key}_rms_error_rad"]), unit) for key in ("median", "worst"))
+    said = f"median RMS error {median} over {counted(count - failed, 'trial')}, at most {most}{lost}"
+    about = f" ({worst['told']})" if worst["told"] else ""
+    more = f"the worst is trial {worst['trial']}{about}, at {worst['joint']}"
+    cut = figures["saturated"]
+    kept = f"{figures['converged']} converged" + (f", torques were cut off in {cut}" if cut else "")
+    return Verdict(WARNING if failed else NOTE, said, (more, kept))
+
+
 _JUDGES: dict[str, Callable[[Mapping[str, Any]], Verdict]] = {
     "laws": _laws,
+    "groups": _campaign,
     "rms_error_late_rad": _tracking,
     "certificate": _certificate,
     "transient": _transient,

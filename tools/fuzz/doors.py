@@ -20,7 +20,7 @@ RESULTS = (
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
     "FaultReport", "Mode", "Sample", "ExcitingMotion", "ExternalTorque", "ObservedTorques", "TransientBound",
-    "TransientCheck",
+    "TransientCheck", "CampaignTable",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -122,12 +122,19 @@ class Stock:
     def _tool_motion(self) -> Any:
         return nbs.tool_motion(self.robot, self.tool_path, "tip", posture=BENT)
 
+    def _campaign(self) -> Any:
+        return nbs.Campaign({"robot": "two_link", "duration": 0.02}, grid={"law": ["nbs", "pid"]})
+
     def path(self, name: str, write: Callable[[Path], Any]) -> Path:
         """A file, written at its first use."""
         file = self.folder / name
         if not file.exists():
             write(file)
         return file
+
+
+def _write_campaign(file: Path) -> None:
+    file.write_text('robot = "two_link"\nduration = 0.02\n[grid]\nlaw = ["nbs", "pid"]\n', encoding="utf-8")
 
 
 def _write_tool_path(file: Path) -> None:
@@ -183,6 +190,13 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "Admissible.told": {"units": ["N·m", "N·m"]},
         "Admissible": {"box": np.ones(2), "radius": None},
         "Dataset": {**{name: getattr(s.data, name) for name in _COLUMNS}, "robot": "arm", "about": {}},
+        "Campaign": {"fixed": {"robot": "two_link"}, "samples": 2, "random": {"payload": {"from": 0, "to": 1}}},
+        "Campaign.load": {"path": s.path("campaign.toml", _write_campaign)},
+        "CampaignTable.column": {"name": "law"},
+        "CampaignTable.worst": {"most": 1},
+        "CampaignTable.write_csv": {"path": s.folder / "table.csv"},
+        "CampaignTable.write_parquet": {"path": s.folder / "table.parquet"},
+        "run_campaign": {"campaign": s.campaign, "folder": s.folder / "campaign", "workers": 1, "cluster": None},
         "ChangingPlant": {"first": s.plant, "changes": [(0.005, nbs.MujocoPlant(s.robot))]},
         "Damping": {"floor": np.eye(2), "gain": 0.2, "scale": np.ones(2), "ceiling": 1.0, "widths": (4,)},
         "Potential": {"stiffness": np.eye(2), "scale": np.ones(2), "widths": (4,)},
@@ -310,6 +324,7 @@ def _subjects(s: Stock) -> dict[str, Any]:
         nbs.Watch(s.certificate), s.exciting, s.tool_path, s.tool_motion, nbs.Margins(0.1),
         nbs.tool_errors(s.run, s.robot, "tip"), nbs.ChangingPlant(s.plant, [(0.005, nbs.MujocoPlant(s.robot))]),
         nbs.tool_errors(s.run, s.robot, "tip"), s.observer, s.observer.observe(s.run),
+        s.campaign, nbs.run_campaign(s.campaign, s.folder / "campaign"),
     ]  # fmt: skip
     return {type(x).__name__: x for x in found} | {
         "CompiledController": s.law.compile(),
