@@ -169,7 +169,7 @@ def test_what_no_test_can_type_names_what_exists():
         )
         if words[0] == "nbs-pin":  # with an arm that is not there
             assert cli.parse(words[1:]) is not None
-            assert any(word.startswith(("libfranka:", "ur:")) for word in words), (page, words)
+            assert any(word.startswith(("libfranka:", "ur:", "tcp:")) for word in words), (page, words)
         if words[0] == "make" and "-C" not in words:  # of what another command wrote
             assert set(words[1:]) <= targets, (page, words)
         if words[0] == "pip":

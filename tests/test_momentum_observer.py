@@ -356,3 +356,14 @@ def test_pages_have_it_as_a_signal_with_the_friction_that_was_simulated(kept):
     assert np.allclose(numbers, nbs.MomentumObserver.for_robot(robot, friction=friction).observe(run).torque, atol=1e-5)
     # MuJoCo's own Coulomb friction is not the smooth one that is known here
     assert np.abs(numbers[-1] - [3.0, -1.0]).max() < (0.2 if kept else 1e-3)
+
+
+def test_samples_of_several_states_may_be_read_only():
+    observer = nbs.MomentumObserver(nbs.PinocchioDynamics(TWO))
+    q, v = states(TWO, 3)
+    memory = observer.initial(q, v)
+    known, _ = observer.step(memory, q, v, 0.0 * v, 0.001)
+    for x in (q, v):
+        x.setflags(write=False)
+    again, _ = observer.step(memory, q, v, 0.0 * v, 0.001)
+    np.testing.assert_array_equal(again.torque, known.torque)

@@ -4,7 +4,8 @@
     python tools/campaign_kills.py --kills 5 --seed 3
 
 The process group of `nbs-pin campaign` gets SIGKILL up to a second after its first new result. After every kill the
-file of results has whole lines only, but for the last, and none that it had before is lost. The exit code is 1 otherwise.
+file of results has whole lines only, but for the last, and none that it had before is lost. Otherwise the exit code
+is 1.
 """
 
 import argparse

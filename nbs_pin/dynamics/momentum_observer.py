@@ -297,7 +297,7 @@ class MomentumObserver(Shown):
 
     def _terms(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """p = M(q) v and β = C(q, v)ᵀv − G(q) − friction(v), both of the shape of q."""
-        rows = [np.ascontiguousarray(x.reshape(-1, self.nv)) for x in (q, v)]
+        rows = [np.array(x, order="C").reshape(-1, self.nv) for x in (q, v)]  # copies, since x may be read-only
         momentum, known = self._of_tree(*rows) if self._tree else self._of_model(*rows)
         momentum, known = momentum.reshape(q.shape), known.reshape(q.shape)
         return momentum, known if self.friction is None else known - np.asarray(self.friction.torque(v))
