@@ -24,7 +24,7 @@ class Campaign(Reported):
     """The campaign (docs/howto/many-runs.md)."""
     workers: Annotated[int | None, integer("--workers", least=1, most=1024), default("one per core")] = None
     """How many trials run at once on this machine."""
-    cluster: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    cluster: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS"), default("this machine")] = None
     """Scheduler of dask.distributed whose workers run the trials, such as tcp://10.0.0.1:8786."""
     parquet: bool = False
     """Also write table.parquet."""

@@ -107,7 +107,8 @@ def rollout(course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout) 
     for k in range(len(course.leads)):
         _ask(k, course, scene, law, work, run)
         _clip(run.command[k], course.tau_d[k], scene, tau)
-        run.q[k + 1], run.v[k + 1] = run.q[k], run.v[k]
+        for i in range(len(tau)):  # an assignment to a row would first ask whether the two overlap
+            run.q[k + 1, i], run.v[k + 1, i] = run.q[k, i], run.v[k, i]
         for _ in range(scene.substeps):
             _step(State(run.q[k + 1], run.v[k + 1]), tau, scene, work)
 
@@ -270,7 +271,8 @@ def _run_stages(state: State, tau: Vec, scene: Scene, work: Vec) -> tuple[Stages
     net, work = take(work, n)
     factors, work = take(work, STAGES * n * n)
     stages = Stages(q, v, a, net, factors.reshape(STAGES, n, n))
-    q[:n], v[:n] = state.q, state.v
+    for i in range(n):
+        q[i], v[i] = state.q[i], state.v[i]
     _accelerate(0, stages, tau, scene, work)
     for s in range(1, _tableau(scene.integrator, 0)[0]):
         c, before, now = _tableau(scene.integrator, s)[2], (s - 1) * n, s * n
