@@ -59,7 +59,7 @@ def anchors(page: Path) -> set[str]:
 
 def made_by(run: str) -> list[str]:
     """The commands behind a picture, in order, as a page has them."""
-    folders = {"collect": "out/motions", "learn": "out/learned", "arm": "my_arm.urdf"}
+    folders = {"collect": "out/motions", "learn": "out/learned", "arm": "my_arm.urdf", "loads": "demos/loads.toml"}
     before = [line for name in re.findall(r"{(\w+)}", RUNS[run]) if name in RUNS for line in made_by(name)]
     return [*before, f"nbs-pin {RUNS[run].format(**folders)}"]
 

@@ -38,6 +38,7 @@ from fuzz.guarded import guarded, peak
 import nbs_pin as nbs
 from nbs_pin.base.archives import read_archive, write_archive
 from nbs_pin.base.exceptions import NbsPinError
+from nbs_pin.campaigns import journal as journals
 from nbs_pin.motions.by_name import motion_of
 from nbs_pin.reports.replay import replay
 from nbs_pin.robots.meshes import read_mesh
@@ -134,6 +135,12 @@ def samples(folder: Path) -> None:
     (folder / "log.csv.gz").write_bytes(gzip.compress((folder / "log.csv").read_bytes()))
     scipy.io.savemat(folder / "log.mat", {"log": {"t": t, "q": q, "tau": a, "v": v}, "about": "a log"})
     np.savetxt(folder / "motion.csv", table[:, :3], delimiter=",", header="t,q1,q2", comments="")
+    (folder / "campaign.toml").write_text(CAMPAIGN)
+    with journals.Journal.opened(folder, {"seed": 1}) as journal:
+        for k in range(9):
+            journal.add(
+                journals.Outcome(str(k), {"error": 0.1 * k} if k % 3 else None, "it diverged." * (k % 3 == 0), 0.1 * k)
+            )
     nbs.save(nbs.NeuralBackstepping.for_robot(robot, seed=1), folder / "law.nbs")
     nbs.save(nbs.PID.for_robot(robot), folder / "pid.nbs")
     corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
@@ -154,6 +161,17 @@ def samples(folder: Path) -> None:
     (folder / "mesh.dae").write_text(DAE.format(*flat))
 
 
+CAMPAIGN = """robot = "two_link"
+duration = 0.2
+samples = 3
+[grid]
+law = [ "nbs" , "pid" ]
+payload = [ 0.0 , 1.0 ]
+[random]
+bandwidth = { from = 4.0 , to = 8.0 }
+[arm]
+lock = {}
+"""
 DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset>
 <up_axis>Z_UP</up_axis></asset><library_geometries><geometry id="g"><mesh><source id="p"><float_array id="pa"
 count="12">{0}</float_array><technique_common><accessor source="#pa" count="4" stride="3"><param name="X" type="float"/>
@@ -192,6 +210,16 @@ def _data(read: Callable[[Path], Any]) -> Callable[[Path], Iterator[Any]]:
     return read_all
 
 
+def _campaign(path: Path) -> Iterator[Any]:
+    for trial in nbs.Campaign.load(path).trials[:20]:
+        yield [x for x in trial.values.values() if isinstance(x, int | float)]
+
+
+def _journal(path: Path) -> Iterator[Any]:
+    with journals.Journal.opened(path.parent, {"seed": 1}) as journal:
+        yield [outcome.seconds for outcome in journal.outcomes.values()]
+
+
 def _mesh(path: Path) -> Iterator[Any]:
     yield from (part.vertices for part in read_mesh(path, np.ones(3)))
 
@@ -207,6 +235,8 @@ READERS: dict[str, Callable[[Path], Iterator[Any]]] = {
     "log.mat": _data(nbs.load_log),
     "motion.npz": _reference,
     "motion.csv": _reference,
+    "campaign.toml": _campaign,
+    "results.jsonl": _journal,
     "law.nbs": _controller,
     "pid.nbs": _controller,
     "mesh.stl": _mesh,
@@ -228,7 +258,7 @@ def mutated(path: Path, draw: random.Random) -> bytes:
         content = inside(path, draw)
     else:
         for _ in range(draw.choice((1, 1, 2, 3))):
-            text = path.suffix in (".csv", ".obj", ".dae") or path.name == "mesh.stl"
+            text = path.suffix in (".csv", ".obj", ".dae", ".toml") or path.name == "mesh.stl"
             content = draw.choice((_numbers, _numbers, _bytes) if text else (_bytes,))(content, draw)
     return content
 

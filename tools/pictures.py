@@ -28,6 +28,7 @@ RUNS = {
     "compare": "compare {learn}/model.nbs",
     "adapt": "track panda --controller nbs,adaptive --payload 2@5 --duration 20",
     "adapt-one": "track panda --controller adaptive --payload 2@5-14 --duration 20",
+    "campaign": "campaign {loads}",
     "my-track": "track {arm} --start-error 0.3 --duration 4",
     "my-certify": "certify {arm} --disturbance 2",
 }
@@ -39,6 +40,7 @@ CHARTS = {
     "tracking": ("track", "tracking"),
     "adapt-comparison": ("adapt", "comparison"),
     "adapt-estimates": ("adapt-one", "estimates"),
+    "campaign": ("campaign", "errors"),
     "tutorial-tracking": ("my-track", "tracking"),
     "tutorial-certificate": ("my-certify", "certificate"),
 }
@@ -52,10 +54,10 @@ def run(folder: Path) -> dict[str, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     arm = folder / "my_arm.urdf"
     arm.write_text(next(text for _, title, text in blocks(ROOT / "docs" / "tutorial.md") if title == arm.name))
-    folders = {name: folder / name for name in RUNS}
+    folders, loads = {name: folder / name for name in RUNS}, ROOT / "demos" / "loads.toml"
     for name, line in RUNS.items():
         if not (folders[name] / "summary.json").exists():
-            code = cli.main([*line.format(arm=arm, **folders).split(), "--out", str(folders[name])])
+            code = cli.main([*line.format(arm=arm, loads=loads, **folders).split(), "--out", str(folders[name])])
             if code:
                 raise SystemExit(f"nbs-pin {line} ended with {code}")
     return folders

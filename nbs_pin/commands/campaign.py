@@ -51,7 +51,7 @@ def run(options: Campaign, console: Console, notes: Console) -> None:
         wall = time.perf_counter() - start
         runs = _names(done, plan.keep_runs)
         with notes.status(f"writing the table and {counted(len(runs), 'run')} into {folder}"):
-            _write(done, runs, results, parquet=options.parquet)
+            _write(done, runs, results, options.file.stem, parquet=options.parquet)
     verdict = verdict_of(done.figures)
     reasons = dict.fromkeys(row.failure for row in done.failures)
     lines = [*verdict.more, *(f"failed: {reason}" for reason in list(reasons)[:3]), f"ran in {wall:.1f} s"]
@@ -64,7 +64,7 @@ def _names(done: CampaignTable, most: int) -> dict[str, Any]:
     return {RUN if k == 0 else f"run-{row.trial.number}.npz": row.trial for k, row in enumerate(done.worst(most))}
 
 
-def _write(done: CampaignTable, runs: dict[str, Any], results: Results, *, parquet: bool) -> None:
+def _write(done: CampaignTable, runs: dict[str, Any], results: Results, title: str, *, parquet: bool) -> None:
     """Write the table and the runs, which are simulated again, and draw the picture."""
     figures = done.figures
     before = summary_in(results.folder).get("runs")
@@ -79,7 +79,6 @@ def _write(done: CampaignTable, runs: dict[str, Any], results: Results, *, parqu
             recorded.info.update(results.facts)
             recorded.save(draft / name)
     if done.worst(1):
-        title = results.folder.name.removeprefix("campaign-")
         with drawing(results.folder / PICTURE) as path:
             plot_campaign(done, path, Heading(title, _settings(done), verdict_of(figures)))
 
