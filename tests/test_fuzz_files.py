@@ -15,12 +15,12 @@ TOOL = [sys.executable, str(ROOT / "tools" / "fuzz_files.py")]
 @pytest.mark.parametrize("seed", [0, 1])
 def test_damaged_files_are_told_or_read(seed):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [*TOOL, "--count", "120", "--seed", str(seed), "--workers", "1"]
+    command = [*TOOL, "--count", "144", "--seed", str(seed), "--workers", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=300)
     assert done.returncode == 0, done.stdout
-    assert "120 files, 0 faults" in done.stdout
-    rows = [line.split() for line in done.stdout.splitlines()[1:13]]
-    assert len(rows) == 12
+    assert "144 files, 0 faults" in done.stdout
+    rows = [line.split() for line in done.stdout.splitlines()[1:15]]
+    assert len(rows) == 14
     assert all(int(row[1]) > 0 for row in rows)  # some of every kind are refused
     assert sum(int(row[2]) for row in rows) > 5  # and some are read
 
