@@ -156,8 +156,8 @@ def _arm(source: str, options: str, effort_share: float) -> Robot:
 def _motion(
     arm: tuple[str, str], reference: str, frequency: float, period: float, duration: float | None
 ) -> tuple[DesiredMotion, float]:
-    """The motion, which does not depend on the effort that is left, and its duration [s]."""
-    motion, length = motion_of(reference, _arm(*arm, 1.0), frequency=frequency, period=period)
+    """The motion, which does not depend on the effort that is left, and its duration [s], all of a tool's path."""
+    motion, length = motion_of(reference, _arm(*arm, 1.0), frequency=frequency, period=period, duration=duration)
     return motion, duration or length
 
 
