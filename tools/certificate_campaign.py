@@ -4,11 +4,11 @@
     python tools/certificate_campaign.py --count 100 --seed 7
 
 Each set-up is an arm of the catalogue with its limits and friction, an NBS, sliding-mode or Slotine–Li law with random
-gains and weights, a reference, a start, a disturbance box and a period. Its certificate is made as a user would, and
-MuJoCo runs it under constants, square waves and jumps within the box. A number labelled PROVED that a run exceeds is
-printed with the set-up that breaks it, and the exit code is 1. A set-up is calm if no run leaves the bounds of its
-certificate or saturates; the share of these that keep PROVED is printed, since a label that is always EMPIRICAL says
-nothing.
+gains and weights, a reference, a start, a disturbance box, a period and, for a quarter of them, an unknown payload.
+Its certificate is made as a user would, and MuJoCo runs it under constants, square waves and jumps within the box. A
+number labelled PROVED that a run exceeds is printed with the set-up that breaks it, and the exit code is 1. A set-up is
+calm if no run leaves the bounds of its certificate or saturates; the share of these that keep PROVED is printed, since
+a label that is always EMPIRICAL says nothing.
 """
 
 import argparse
@@ -31,6 +31,8 @@ ARMS = ("two_link", "two_link", "three_link", "three_link", "ur3", "ur5", "ur10"
 PERIODS = (0.00025, 0.0005, 0.001, 0.002, 0.005, 0.01)
 DURATION, RUNS = 1.5, 6
 """Length of a run [s], and runs of each set-up."""
+LOADED = 0.25
+"""Share of the set-ups with an unknown payload; every second run carries all of it, the others none."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +94,13 @@ def setup(seed: int) -> tuple[str, nbs.Robot, Any, dict[str, Any], np.ndarray, f
     if apart:
         size = float(10.0 ** rng.uniform(-3.0, -0.3))
         given |= {"q0": begin.q[0] + size * rng.uniform(-1.0, 1.0, robot.nv), "v0": begin.v[0]}
+    loaded = bool(rng.uniform() < LOADED)
+    if loaded:
+        given["uncertainty"] = nbs.Uncertainty(payload=nbs.Payload(float(10.0 ** rng.uniform(-2.0, 0.3))))
     told = (
         f"{name} {kind} ω={bandwidth:.3g} designed for {1e3 * designed:g} ms, weights × {times:.3g}, {1e3 * period:g}"
         f" ms, {share:.2g} of the effort, sinusoid {frequency:.2g} rad/s{', apart' * apart}{', fed' * bool(friction)}"
+        f"{', ' + str(given['uncertainty']) if loaded else ''}"
     )
     return told, robot, law, given, box, period
 
@@ -129,8 +135,10 @@ def runs(
     steps = round(DURATION / period)
     waves = random_disturbances(nbs.Admissible.of(box, robot.nv), steps, period, RUNS, np.random.default_rng(seed))
     start = {key: given[key] for key in ("q0", "v0") if key in given}
-    for wave in waves:
-        plant = nbs.MujocoPlant(robot, joint_friction="keep")
+    load = given["uncertainty"].payload if "uncertainty" in given else None
+    for k, wave in enumerate(waves):
+        arm = robot if load is None or k % 2 else load.on(robot)
+        plant = nbs.MujocoPlant(arm, joint_friction="keep")
         try:
             yield nbs.simulate(
                 plant, law, given["reference"], steps * period, period, disturbance=_Held(wave, period), **start

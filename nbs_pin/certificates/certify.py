@@ -10,40 +10,28 @@ from nbs_pin.accuracy.mismatch import Mismatch
 from nbs_pin.base.arguments import DURATION, PERIOD, a, checked, maybe, number
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint, floats, is_usual, told
-from nbs_pin.base.claims import Claim, Group, Label, weakest
+from nbs_pin.base.claims import Claim, Group, Label
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
 from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.bodies import bounds_for_all
 from nbs_pin.certificates.body_error import BodyError
 from nbs_pin.certificates.certificate import Certificate, Start
-from nbs_pin.certificates.claims import Assumption, Condition
 from nbs_pin.certificates.comparison_system import ComparisonSystem, decay, level, reach
+from nbs_pin.certificates.conditions import with_conditions
 from nbs_pin.certificates.constants import Constants, constants_of
 from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.error_bounds import errors, radians
 from nbs_pin.certificates.friction_error import FrictionError, FrictionGap, friction_error
 from nbs_pin.certificates.held_torque import Readings, held_torque, unknown_before
-from nbs_pin.certificates.margins import (
-    effort_margin,
-    hold_margin,
-    position_margin,
-    sampled_control,
-    smoothness,
-    start_margin,
-    unsaturated,
-    velocity_margin,
-)
-from nbs_pin.certificates.model_error import ModelError, coverage, model_error
-from nbs_pin.certificates.model_structure import EXACT, is_exact, torque_difference
+from nbs_pin.certificates.model_error import ModelError, model_error
+from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.certificates.structure import lyapunov_law
 from nbs_pin.certificates.uncertainty import Uncertainty
 from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
-from nbs_pin.dynamics.analytic import AnalyticDynamics
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.references import MOTION, DesiredMotion, at_times
 from nbs_pin.robots.robot import ARM, Robot
 
@@ -130,7 +118,7 @@ def certify(
     if bodies is not None and reference is not None and motion is not None:
         found = bounds_for_all(law, bodies, constants, comparison, rest, reference, motion, start)
         certificate = _for_all(found, law, admissible, constants, rest, arm, start)
-        return _with_conditions(certificate, reference, motion, period)
+        return with_conditions(certificate, reference, motion, period, bodies.payload)
     least = level(comparison)
     if not math.isfinite(least.storage):
         raise CertificateRefused(_why_not(comparison, mismatch is not None, bool(rest.lines)))
@@ -141,7 +129,7 @@ def certify(
     if period is not None:
         steps = None if encoders is None else encoders.resolution(certificate)
         certificate = _held(certificate, reference, motion, Readings.of(period, lookahead, delay, steps))
-    return _with_conditions(certificate, reference, motion, period)
+    return with_conditions(certificate, reference, motion, period)
 
 
 def _held(
@@ -291,19 +279,6 @@ def _friction_error(
     return friction_error(gap, constants, speed, "at most the velocity limit")
 
 
-def _exactness(certificate: Certificate) -> tuple[Condition, ...]:
-    """Whether a model that should be exact is that of the URDF, edits of its numbers included."""
-    law, robot = certificate.controller, certificate.robot
-    if robot is None or certificate.mismatch is not None or certificate.bodies is not None:
-        return ()
-    if type(law.dynamics) not in (PinocchioDynamics, AnalyticDynamics):
-        return ()
-    name = f"{EXACT:g} > difference of the model's torques from the URDF's, over these"
-    because = "at generic states: both are linear in the parameters of the bodies"
-    difference = torque_difference(law.dynamics, robot)
-    return (Condition(name, EXACT, difference, "", Label.PROVED, because, checks=Assumption.MODEL),)
-
-
 def _comparison(
     constants: Constants, admissible: Admissible, error: ModelError, friction: FrictionError
 ) -> ComparisonSystem:
@@ -333,68 +308,3 @@ def _why_not(k: ComparisonSystem, has_mismatch: bool, has_friction: bool) -> str
         f"no bound follows from ρ = {k.rho:.3g}, ω = {k.omega:.3g} and κ = {k.kappa:.3g} 1/s: D must dominate M, "
         "which an inertial rate ω > 0 ensures for every arm; take the damping 'inertial', as that of nbs is."
     )
-
-
-def _with_conditions(
-    certificate: Certificate, reference: DesiredMotion | None, motion: SampledMotion | None, period: float | None
-) -> Certificate:
-    """The certificate with the conditions of its assumptions."""
-    law, robot, start = certificate.controller, certificate.robot, certificate.start
-    joints, reached, potential = certificate.joint_errors, certificate.storage, certificate.potential
-    if start is not None and certificate.overshoot is not None:
-        joints = np.maximum(joints, certificate.overshoot[1])
-        reached, potential = max(reached, start.storage), max(potential, start.storage)
-    margins, found = sampled_control(law, period, reached, potential)
-    is_held = certificate.held is not None and certificate.held.is_proved
-    if certificate.held is not None and (is_held or not certificate.held.readings.is_plain):
-        found = (certificate.held.condition,)
-    known = certificate.constants.label
-    conditions = [
-        Condition("Theorem 1: min(ρ, ω + κ) > 0", certificate.rate, 0.0, "1/s", known, "docs/certificates.md §2"),
-        *certificate.model_error.conditions,
-        *_dissipation(certificate),
-        *certificate.friction.conditions,
-        *_exactness(certificate),
-        *found,
-        *_no_wrap(robot, joints),
-    ]
-    if motion is not None:
-        conditions += smoothness(motion)
-    if motion is not None and period is not None and not is_held:
-        metric = certificate.constants.metric
-        bodies = 0.0 if certificate.bodies is None else certificate.bodies.torque
-        conditions += hold_margin(law, metric, motion, period, certificate.admissible.energy(metric) + bodies**2)
-    if motion is not None and reference is not None and certificate.mismatch is not None:
-        errors = np.zeros(law.nv) if start is None else np.abs(law.dynamics.difference(start.q, start.begin.q))
-        speeds = np.zeros(law.nv) if start is None else np.abs(start.v - start.begin.v)
-        box, length = certificate.admissible.largest(law.nv), float(motion.t[-1])
-        conditions += coverage(certificate.mismatch, reference, length, box, errors, speeds)
-    if motion is not None and robot is not None:
-        frictions = (law.friction, certificate.friction.gap.arm)
-        conditions += effort_margin(robot, law.dynamics, certificate.admissible, motion, frictions)
-        if certificate.held is not None:
-            conditions += unsaturated(robot, law.dynamics, motion, certificate.held.room)
-        conditions += velocity_margin(robot, motion, 0.0 if start is None else start.v)
-        conditions += position_margin(robot, joints, motion)
-    if start is not None and robot is not None:
-        conditions += start_margin(robot, law, (start.q, start.v), start.begin)
-    return replace(certificate, margins=margins, conditions=tuple(conditions))
-
-
-def _dissipation(certificate: Certificate) -> tuple[Condition, ...]:
-    """The condition of Theorem 4, with what model error and friction add, if there are any."""
-    bodies = () if certificate.bodies is None else certificate.bodies.lines
-    lines = (*certificate.model_error.lines, *certificate.friction.lines, *bodies)
-    if not lines:
-        return ()
-    k, label = certificate.comparison, weakest(*(line.label for line in lines))
-    sides = 1.0 - k.beta, 0.25 * k.cross**2
-    return (Condition("Theorem 4: 1 − β > α²/4", *sides, "", label, "docs/certificates.md §5, §8"),)
-
-
-def _no_wrap(robot: Robot | None, joints: JointArray) -> tuple[Condition, ...]:
-    if robot is None or not robot.continuous.any():
-        return ()
-    largest = float(joints[robot.continuous].max())
-    name, because = "π > |z1_i| of every continuous joint", "its error jumps at ±π (docs/theory.md §1)"
-    return (Condition(name, math.pi, largest, "rad", Label.PROVED, because, checks=Assumption.WRAP),)

@@ -109,7 +109,7 @@ def effort_margin(
     needed = np.abs(all_torques).max(axis=(0, 1))
     bound = admissible.largest(robot.nv)
     because = f"reference over {motion.t[-1]:g} s; necessary, not sufficient: feedback comes on top"
-    return (_least_room(robot, "effort", needed + bound, "torque of reference and disturbance", because),)
+    return (least_room(robot, "effort", needed + bound, "torque of reference and disturbance", because),)
 
 
 def unsaturated(
@@ -124,7 +124,7 @@ def unsaturated(
         return ()
     torque = inverse_dynamics(dynamics, *motion.rows)
     because = f"reference over {motion.t[-1]:g} s, and every state of the bounds: docs/certificates.md §15"
-    found = _least_room(robot, "effort", np.abs(torque).max(axis=0) + room, "largest torque of the law", because)
+    found = least_room(robot, "effort", np.abs(torque).max(axis=0) + room, "largest torque of the law", because)
     return (replace(found, role=Role.SUFFICIENT if found.holds else Role.COMPARISON),)
 
 
@@ -135,7 +135,7 @@ def start_margin(
     if not np.isfinite(robot.effort_limit).any():
         return ()
     torque, here = np.abs(controller.torque(*start, *begin)), "the law evaluated there"
-    return (_least_room(robot, "effort", torque, "torque at the start", here),)
+    return (least_room(robot, "effort", torque, "torque at the start", here),)
 
 
 def hold_margin(
@@ -161,10 +161,10 @@ def velocity_margin(robot: Robot, motion: SampledMotion, start: JointArray | flo
         return ()
     because = f"reference over {motion.t[-1]:g} s; necessary, not sufficient: the error adds a speed"
     needed = np.maximum(motion.speed, np.abs(start))
-    return (_least_room(robot, "velocity", needed, "speed of reference and start", because),)
+    return (least_room(robot, "velocity", needed, "speed of reference and start", because),)
 
 
-def _least_room(robot: Robot, kind: str, needed: JointArray, what: str, because: str) -> Condition:
+def least_room(robot: Robot, kind: str, needed: JointArray, what: str, because: str) -> Condition:
     """The necessary condition limit > needed of the joint whose limit is exceeded most, relative to it."""
     limit = robot.effort_limit if kind == "effort" else robot.velocity_limit
     share = needed / limit

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from nbs_pin.base.arguments import a, check_fields, checked, maybe, number, text
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
-from nbs_pin.robots.places import place_of
+from nbs_pin.robots.places import place_of, tool_frame
 from nbs_pin.robots.robot import ARM, Robot
 
 
@@ -36,6 +36,10 @@ class Payload:
         check_fields(
             self, mass=number(above=0.0, unit="kg"), radius=number(least=0.0, most=1e50, unit="m"), link=maybe(text)
         )
+
+    def on(self, robot: Robot) -> Robot:
+        """The arm with all of the mass at the origin of the link, in place of a load that it carries there."""
+        return robot.with_payload(tool_frame(robot) if self.link is None else self.link, self.mass)
 
 
 @dataclass(frozen=True)
