@@ -259,7 +259,7 @@ def test_weights_far_from_zero_are_in_the_rule_of_sampled_control(ceiling):
     chatters = [
         "control period",
         "bound of |z1_i| of joint1 > largest in simulation",
-        "effort limit of joint1 > largest torque of the law in simulation",
+        "effort limit of joint1 > largest torque in simulation",
     ]
     assert [name.split(":")[0] for name in found.void] == (chatters if ceiling is None else [])
 

@@ -93,7 +93,7 @@ class TriedMotions:
         found = Condition(name, *sides, unit, Label.PROVED, because, Role.NECESSARY, Assumption.TIME)
         if robot is None or not np.isfinite(robot.effort_limit).any():
             return (found,)
-        cut = least_room(robot, "effort", self.torque, "largest torque of the law in simulation", because)
+        cut = least_room(robot, "effort", self.torque, "largest torque in simulation", because)
         return found, cut
 
 
