@@ -1,1 +1,1 @@
-"""Run times of laws, plants and training, and a comparison of tuned laws."""
+"""Run times of laws, plants and training, a comparison of tuned laws, and the challenge for laws of anyone."""

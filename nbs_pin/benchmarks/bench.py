@@ -307,8 +307,12 @@ def rows_of(summary: Any) -> dict[str, dict[str, float]]:
 
 def summary(rows: list[Row]) -> dict[str, Any]:
     """The bench as JSON stores it: machine, versions, and every row."""
-    machine = {"processor": _processor(), "system": platform.platform()}
-    return {"machine": machine, "versions": versions(), "rows": [asdict(row) for row in rows]}
+    return {"machine": machine(), "versions": versions(), "rows": [asdict(row) for row in rows]}
+
+
+def machine() -> dict[str, str]:
+    """Processor and operating system."""
+    return {"processor": _processor(), "system": platform.platform()}
 
 
 def _states(robot: Robot, count: int = 64) -> list[tuple[np.ndarray, ...]]:

@@ -24,6 +24,7 @@ from nbs_pin.base.picture_kinds import svg_too
 from nbs_pin.cli.bench import Bench
 from nbs_pin.cli.campaign import Campaign
 from nbs_pin.cli.certify import Certify
+from nbs_pin.cli.challenge import Challenge
 from nbs_pin.cli.collect import Collect
 from nbs_pin.cli.compare import Compare
 from nbs_pin.cli.excite import Excite
@@ -63,6 +64,7 @@ COMMANDS: dict[str, type] = {
     "reproduce": Reproduce,
     "run": Run,
     "faults": Faults,
+    "challenge": Challenge,
     "bench": Bench,
     "robots": Robots,
 }

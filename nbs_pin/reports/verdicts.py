@@ -8,6 +8,7 @@ import numpy as np
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.units import counted, measured, percent, several
+from nbs_pin.reports.challenge_told import challenge_told
 from nbs_pin.simulation.run_figures import LIGHT, load_of
 
 GOOD, WARNING, BAD, NOTE = "good", "warning", "bad", "note"
@@ -349,6 +350,11 @@ def _exciting(figures: Mapping[str, Any]) -> Verdict:
     return Verdict(GOOD if condition < _ILL else WARNING, said, tuple(more))
 
 
+def _challenged(figures: Mapping[str, Any]) -> Verdict:
+    is_kept, said, more = challenge_told(figures["standings"])
+    return Verdict(GOOD if is_kept else BAD, said, more)
+
+
 def _benched(figures: Mapping[str, Any]) -> Verdict:
     told = ", ".join(f"{time:.3g} µs of {what}" for what, time in figures["control_step_p50_us"].items())
     return Verdict(NOTE, f"one control step takes, in the median, {told}" if told else "no control step was timed")
@@ -375,6 +381,7 @@ def _campaign(figures: Mapping[str, Any]) -> Verdict:
 
 
 _JUDGES: dict[str, Callable[[Mapping[str, Any]], Verdict]] = {
+    "standings": _challenged,
     "laws": _laws,
     "groups": _campaign,
     "rms_error_late_rad": _tracking,
