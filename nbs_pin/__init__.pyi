@@ -27,6 +27,7 @@ from .certificates.monitor import Monitored as Monitored, monitor as monitor
 from .certificates.online_monitor import Watch as Watch
 from .certificates.propose import Proposal as Proposal, propose as propose
 from .certificates.reference_margins import certified_margins as certified_margins
+from .certificates.transient_attack import TransientAttack as TransientAttack, transient_attack as transient_attack
 from .certificates.transient_check import TransientCheck as TransientCheck
 from .certificates.uncertainty import Payload as Payload, Uncertainty as Uncertainty
 from .controllers.adaptive_law import AdaptiveLaw as AdaptiveLaw

@@ -2,6 +2,7 @@
 
     python tools/adaptive_bound_campaign.py                # 1,000 runs on two cores, about twenty minutes
     python tools/adaptive_bound_campaign.py --count 100 --seed 7
+    python tools/adaptive_bound_campaign.py --search 1000  # transient_attack, so many runs for every arm and kind
 
 Each run is an arm with an `AdaptiveLaw` that knows nothing of its load, of random mass and place within the box that
 the bound is for: no load, a point or five points, often the heaviest at the edge. It starts on the reference or beside
@@ -10,6 +11,9 @@ admissible disturbance. Every other arm has effort limits that it never reaches.
 counted and left out, since the bound assumes that none is. V and every |z1_i| at each instant are compared with the
 bounds; the exit code is 1 if one is exceeded, and such a run is repeated with a quarter of the period, as the bound is
 proved in continuous time. Ctrl-C reports what is done.
+
+With --search, `transient_attack` searches instead: on every arm over the loads of a box from the reference, from starts
+beside it, and under a disturbance, on random motions and postures.
 """
 
 import argparse
@@ -24,6 +28,8 @@ import numpy as np
 import nbs_pin as nbs
 from nbs_pin.base.progress import tracked
 from nbs_pin.certificates.torque_waves import random_disturbances
+from nbs_pin.certificates.transient_search import loaded_storage
+from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.motions.references import at_times
 
 ARMS = ("two_link", "panda", "ur5", "xarm7")
@@ -120,8 +126,8 @@ def outcome(seed: int, period: float = PERIOD) -> Outcome:
     size = 0.0 if rng.uniform() < 0.5 else float(10.0 ** rng.uniform(-4.0, -1.0))
     q0 = np.clip(begin.q[0] + size * rng.uniform(-1.0, 1.0, robot.nv), robot.lower, robot.upper)
     v0 = begin.v[0] + size * rng.uniform(-1.0, 1.0, robot.nv)
-    truth = nbs.PinocchioDynamics(loaded)
-    start = float(storage(inner, truth, q0, v0, begin.q[0], begin.v[0])[0])
+    truth = pack_model(loaded.model)
+    start = float(loaded_storage(inner, truth, q0[None], v0[None], begin.q[:1], begin.v[:1])[0])
     box, given = np.zeros(robot.nv), {}
     if rng.uniform() < DISTURBED:
         limits = robot.effort_limit / (AMPLE if ample else 1.0)
@@ -134,8 +140,9 @@ def outcome(seed: int, period: float = PERIOD) -> Outcome:
     bound = nbs.transient_bound(law, mass, radius, start, disturbance=box, friction=none, duration=duration)
     run = nbs.simulate(nbs.MujocoPlant(loaded), law.compile(), motion, duration, period, q0=q0, v0=v0, **given)
     cut = bool((run.tau != run.tau_command).any())
-    values, z1 = storage(inner, truth, run.q, run.v, run.q_ref, run.v_ref)
-    largest, errors = max(float(np.max(values)), _LEAST), np.maximum(np.abs(z1).max(axis=0), _LEAST)
+    values = loaded_storage(inner, truth, run.q, run.v, run.q_ref, run.v_ref)
+    largest = max(float(np.max(values)), _LEAST)
+    errors = np.maximum(np.abs(nbs.metrics.error(run)).max(axis=0), _LEAST)
     told = (
         f"{name} ω={inner.inertial_rate:g}, load {load['mass']:.3g} of {mass:.3g} kg within {radius:g} m, start "
         f"{start:.3g} J, disturbance {box.max():.3g} N·m{', ample' * ample}"
@@ -146,10 +153,30 @@ def outcome(seed: int, period: float = PERIOD) -> Outcome:
     return Outcome(seed, told, name, cut, *((math.nan, math.nan) if cut else ratios), heavy)
 
 
-def storage(law: Any, truth: Any, q: Any, v: Any, q_ref: Any, v_ref: Any) -> tuple[Any, Any]:
-    """V with the inertia of the loaded arm [J], and z1 [rad]."""
-    e = law.errors(q, v, q_ref, v_ref, 0.0 * v_ref)
-    return e.value + 0.5 * np.einsum("...i,...ij,...j", e.z2, truth.mass_matrix(q), e.z2), e.z1
+def searched(name: str, runs: int, seed: int) -> bool:
+    """`transient_attack` of an arm without and with starts and disturbances; whether every bound is kept."""
+    rng, kept = np.random.default_rng(seed), True
+    law = law_of(name, False, 8.0, seed)
+    robot, radius = law.robot, min(law.load_radius or 0.0, law.load_across or 0.0)
+    heavy = robot.with_payload(law.unknowns.bodies[0].name.removeprefix("load at "), LOADS[name])
+    motions = [nbs.Sinusoid.for_robot(robot), *(motion_in(rng, heavy, 4.0) for _ in range(6))]
+    box = NEAR * np.where(np.isfinite(robot.effort_limit), robot.effort_limit, 20.0)
+    none = nbs.JointFriction(np.zeros(robot.nv), np.zeros(robot.nv))
+    start = 0.2 * nbs.transient_bound(law, LOADS[name], radius, friction=none).divergence
+    for kind, given in (
+        ("from the reference", {}),
+        ("from a start", {"start": start}),
+        ("disturbed", {"disturbance": box, "duration": 1.0}),
+    ):
+        bound = nbs.transient_bound(law, LOADS[name], radius, friction=none, **given)
+        found = nbs.transient_attack(bound, reference=motions, runs=runs, seed=seed, progress=True)
+        kept &= found.is_kept
+        print(
+            f"  {name}, {kind} ({found.runs}, {found.cut} cut): bound ÷ found {found.ratio:.2f} in the tightest joint, "
+            f"√V {math.sqrt(bound.storage_within / found.storage):.2f}; {found.verdict}",
+            flush=True,
+        )
+    return kept
 
 
 def main() -> int:
@@ -158,7 +185,10 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--search", type=int, default=0, help="runs of a search for every arm and kind")
     options = parser.parse_args()
+    if options.search:
+        return int(not all([searched(name, options.search, options.seed) for name in ARMS]))
     seeds, found = range(options.seed, options.seed + options.count), []
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(n_jobs=options.workers, return_as="generator_unordered")

@@ -11,14 +11,15 @@ from nbs_pin.base.arguments import DURATION, a, checked, count, maybe, number
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.checks import PerJoint
 from nbs_pin.base.claims import Claim, Group, Known, Label, known, refuse, weakest
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.known_code import foreign_code
 from nbs_pin.base.records import RUN, Run
 from nbs_pin.base.rounding import up
 from nbs_pin.base.shown import Cells, Shown
 from nbs_pin.base.units import measured, several, units
-from nbs_pin.certificates.adaptive_storage import Beginning
+from nbs_pin.certificates.adaptive_storage import Beginning, loaded_start
 from nbs_pin.certificates.admissible import Admissible
-from nbs_pin.certificates.certificate import Certificate
+from nbs_pin.certificates.certificate import Certificate, Start
 from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.error_bounds import radians
 from nbs_pin.certificates.fixed_beside import FixedLaw, fixed_law, frame_of
@@ -26,6 +27,7 @@ from nbs_pin.certificates.transient_check import Assumed, TransientCheck
 from nbs_pin.certificates.uncertainty import Payload
 from nbs_pin.certificates.worst_load import Divergence, WorstLoad, of_number
 from nbs_pin.controllers.adaptive_law import AdaptiveLaw
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
 from nbs_pin.motions.references import MOTION, DesiredMotion
 
@@ -53,6 +55,8 @@ class TransientBound(Shown):
     """V(0) [J]."""
     admissible: Admissible
     """The disturbance."""
+    friction: JointFriction
+    """Joint friction of the arm."""
     worst: WorstLoad
     """The load that is farthest from the first estimate."""
     divergence: float
@@ -206,6 +210,8 @@ def transient_bound(
     friction: JointFriction | None = None,
     reference: DesiredMotion | None = None,
     duration: float | None = None,
+    q0: Any = None,
+    v0: Any = None,
 ) -> TransientBound:
     """Bound the error of an adaptive law for every unknown load of a box, from before it has learned anything.
 
@@ -228,6 +234,8 @@ def transient_bound(
         friction: Joint friction of the arm. None takes the URDF's.
         duration: How long a disturbed loop is bounded, and the length of the reference that is used [s]. None takes the
             reference's own `duration`, or 10 s without one.
+        q0: A start [rad] in place of `start`, which is then V(0) there with any load of the box. Needs the reference.
+        v0: Its velocity [rad/s]; None is at rest.
 
     Raises:
         CertificateRefused: For a law that adapts no load, loads beyond its own, or a law without a bound.
@@ -241,11 +249,16 @@ def transient_bound(
         PROVED: V ≤ 0.0179 J
     """
     _check_box(law, load_mass, load_radius)
+    assert isinstance(law.law, LyapunovLaw)  # as no other law adapts a load
+    begin = Start.of(law.law, reference, q0, v0)
+    if begin is not None and start:
+        raise ArgumentError("start and q0 both state the beginning; give one of them.")
     admissible = Admissible.of(disturbance, law.nv)
     nothing = np.zeros(law.nv)  # a box of 0, so that the law's own certificate is one of friction alone
     base = certify(law.law, nothing if admissible.is_zero else admissible, friction=friction)
     length = getattr(reference, "duration", _LENGTH) if duration is None else duration
     payload = Payload(load_mass, load_radius, law.frame)
+    start = start if begin is None else loaded_start(law, frame_of(law), payload, begin)
     found = _bounded(law, payload, base, start, length)
     if reference is None:
         return found
@@ -320,6 +333,7 @@ def _bounded(law: AdaptiveLaw, payload: Payload, base: Certificate, start: float
         load_radius=payload.radius,
         start=start,
         admissible=base.admissible,
+        friction=base.friction.gap.arm,
         worst=worst,
         divergence=divergence,
         duration=math.inf if is_free else length,

@@ -6,12 +6,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from nbs_pin.base.rounding import up
+from nbs_pin.certificates.certificate import Start
 from nbs_pin.certificates.comparison_system import ComparisonSystem, decay, level
+from nbs_pin.certificates.uncertainty import Payload
 from nbs_pin.controllers.adaptive_law import AdaptiveLaw
+from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.kernels.symmetric4 import FARTHEST
 
 _MOST = FARTHEST + math.log1p(math.exp(-FARTHEST))  # d of one eigenvalue, for estimates that are cut
 _SHARES = np.linspace(0.0, 1.0, 41)[1:-1].tolist()
+
+
+def loaded_start(law: AdaptiveLaw, frame: str, payload: Payload, start: Start) -> float:
+    """V(0) at most, with every load of the box [J].
+
+    A load adds ½Σ m_k‖u + w × x_k‖² ≤ ½m̄(‖u‖ + r‖w‖)², with u and w the velocities of its frame at z2.
+    """
+    assert isinstance(law.law, LyapunovLaw)  # as no other law adapts a load
+    e = law.law.errors(start.q, start.v, start.begin.q, start.begin.v, start.begin.a)
+    u, w = np.split(law.robot.jacobian(start.q, frame) @ e.z2, 2)
+    speed = float(np.linalg.norm(u)) + payload.radius * float(np.linalg.norm(w))
+    return up(up(start.storage) + 0.5 * payload.mass * up(speed) ** 2)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,9 @@ from jaxtyping import Float
 from nbs_pin.accuracy.mismatch import Mismatch
 from nbs_pin.base.arguments import a, checked, number, numbers_or_one
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.checks import floats, is_usual, told
 from nbs_pin.base.claims import Claim, Group, Label, weakest
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Reference
 from nbs_pin.base.shown import Cells, Shown, joints_told
 from nbs_pin.base.units import measured, over_joints, several, units
@@ -25,6 +27,7 @@ from nbs_pin.certificates.friction_error import FrictionError
 from nbs_pin.certificates.held_torque import HeldTorque
 from nbs_pin.certificates.model_error import ModelError
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.motions.references import DesiredMotion, at_times
 from nbs_pin.robots.robot import Robot
 
 _PRINTED = "printed ‖z1‖"
@@ -43,6 +46,27 @@ class Start(NamedTuple):
     """The reference at t = 0."""
     storage: float
     """V(0) [J]."""
+
+    @classmethod
+    def of(cls, law: LyapunovLaw, reference: DesiredMotion | None, q0: Any, v0: Any) -> "Start | None":
+        """The start at q0 [rad] and v0 [rad/s], None is at rest; None without q0.
+
+        Raises ArgumentError if these do not fit each other or the law.
+        """
+        if reference is None and (q0 is not None or v0 is not None):
+            raise ArgumentError("q0 and v0 refer to a motion; give the reference too.")
+        if q0 is None and v0 is not None:
+            raise ArgumentError("v0 was given without q0; give both, or q0 alone for a start at rest.")
+        if q0 is None or reference is None:
+            return None
+        start = floats("q0", q0), np.zeros(law.nv) if v0 is None else floats("v0", v0)
+        for name, x in zip(("q0", "v0"), start, strict=True):
+            if x.shape != (law.nv,) or not is_usual(x):
+                raise ArgumentError(
+                    f"{name} is {told(x)}, expected {law.nv} finite numbers, one per joint; correct it."
+                )
+        begin = Reference(*(x[0] for x in at_times(reference, np.zeros(1), law.nv)))
+        return cls(*start, begin, float(law.storage(*start, begin.q, begin.v)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

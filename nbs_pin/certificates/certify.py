@@ -9,10 +9,9 @@ import numpy as np
 from nbs_pin.accuracy.mismatch import Mismatch
 from nbs_pin.base.arguments import DURATION, PERIOD, a, checked, maybe, number
 from nbs_pin.base.arrays import JointArray
-from nbs_pin.base.checks import PerJoint, floats, is_usual, told
+from nbs_pin.base.checks import PerJoint, floats
 from nbs_pin.base.claims import Claim, Group, Label
 from nbs_pin.base.exceptions import ArgumentError, CertificateRefused
-from nbs_pin.base.records import Reference
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.bodies import bounds_for_all
 from nbs_pin.certificates.body_error import BodyError
@@ -32,7 +31,7 @@ from nbs_pin.certificates.uncertainty import Uncertainty
 from nbs_pin.controllers.controller import CONTROLLER, Controller
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
 from nbs_pin.dynamics.friction import FRICTION, JointFriction
-from nbs_pin.motions.references import MOTION, DesiredMotion, at_times
+from nbs_pin.motions.references import MOTION, DesiredMotion
 from nbs_pin.robots.robot import ARM, Robot
 
 _NO_ERROR = ModelError(0.0, 0.0, 0.0, (), ())
@@ -182,18 +181,9 @@ def _check_arguments(
     """The start, None without one."""
     if robot is not None and robot.nv != law.nv:
         raise ArgumentError(f"the controller has {law.nv} joints and {robot.name} {robot.nv}; give its own arm.")
-    if reference is None and (mismatch is not None or q0 is not None or v0 is not None):
-        raise ArgumentError("q0, v0 and mismatch refer to a motion; give the reference too.")
-    if q0 is None and v0 is not None:
-        raise ArgumentError("v0 was given without q0; give both, or q0 alone for a start at rest.")
-    if q0 is None or reference is None:
-        return None
-    start = floats("q0", q0), np.zeros(law.nv) if v0 is None else floats("v0", v0)
-    for name, x in zip(("q0", "v0"), start, strict=True):
-        if x.shape != (law.nv,) or not is_usual(x):
-            raise ArgumentError(f"{name} is {told(x)}, expected {law.nv} finite numbers, one per joint; correct it.")
-    begin = Reference(*(x[0] for x in at_times(reference, np.zeros(1), law.nv)))
-    return Start(*start, begin, float(law.storage(*start, begin.q, begin.v)))
+    if reference is None and mismatch is not None:
+        raise ArgumentError("mismatch refers to a motion; give the reference too.")
+    return Start.of(law, reference, q0, v0)
 
 
 def _check_readings(period: float | None, bodies: Uncertainty | None, delay: float, encoders: Encoders | None) -> None:

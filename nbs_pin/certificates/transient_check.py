@@ -2,11 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nbs_pin.base.arguments import checked, writable
 from nbs_pin.base.arrays import JointArray
+from nbs_pin.base.csv_files import write_csv
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.records import Run
 from nbs_pin.base.shown import Shown
@@ -82,6 +85,13 @@ class TransientCheck(Shown):
     @property
     def _shares(self) -> Float[np.ndarray, "rows n"]:
         return np.asarray(self.joint_errors / self.joint_bounds)
+
+    @checked(path=writable)
+    def save(self, path: str | Path) -> Path:
+        """Write times and each joint's |z1| with its bound as a CSV file; returns its path."""
+        joints = [f"{kind}_{name}" for kind in ("error", "bound") for name in self.joint_names]
+        rows = np.column_stack([self.t, self.joint_errors, self.joint_bounds])
+        return write_csv(Path(path), ["t", *joints], rows.tolist())
 
     def _facts(self) -> Iterable[str]:
         return f"{len(self.t)} rows", self.verdict

@@ -106,11 +106,11 @@ def rollout(course: Course, scene: Scene, law: Packed, work: Vec, run: Rollout) 
     run.memory[0] = 0.0
     for k in range(len(course.leads)):
         _ask(k, course, scene, law, work, run)
-        _clip(run.command[k], course.tau_d[k], scene, tau)
+        acting(run.command[k], course.tau_d[k], scene, tau)
         for i in range(len(tau)):  # an assignment to a row would first ask whether the two overlap
             run.q[k + 1, i], run.v[k + 1, i] = run.q[k, i], run.v[k, i]
         for _ in range(scene.substeps):
-            _step(State(run.q[k + 1], run.v[k + 1]), tau, scene, work)
+            advance(State(run.q[k + 1], run.v[k + 1]), tau, scene, work)
 
 
 @kernel
@@ -137,11 +137,11 @@ def rollout_adjoint(
     for k in range(len(course.leads) - 1, -1, -1):
         after_bar, tau_bar = State(bars.q[k + 1], bars.v[k + 1]), tau_d_bar[k]
         tau_bar[:] = 0.0
-        _clip(run.command[k], course.tau_d[k], scene, tau)
+        acting(run.command[k], course.tau_d[k], scene, tau)
         states[0, 0], states[0, 1] = run.q[k], run.v[k]
         for s in range(1, scene.substeps):
             states[s] = states[s - 1]
-            _step(State(states[s, 0], states[s, 1]), tau, scene, work)
+            advance(State(states[s, 0], states[s, 1]), tau, scene, work)
         for s in range(scene.substeps - 1, -1, -1):
             _step_adjoint(State(states[s, 0], states[s, 1]), tau, scene, work, after_bar, tau_bar)
         for i in range(n):
@@ -153,14 +153,14 @@ def rollout_adjoint(
 
 
 @inlined
-def _clip(command: Vec, tau_d: Vec, scene: Scene, tau: Vec) -> None:
+def acting(command: Vec, tau_d: Vec, scene: Scene, tau: Vec) -> None:
     """The torque that acts → tau."""
     for i in range(len(tau)):
         tau[i] = min(max(command[i], -scene.limit[i]), scene.limit[i]) + tau_d[i]
 
 
 @inlined
-def _ahead(k: int, course: Course, run: Rollout, seen: State) -> Target:
+def looking_ahead(k: int, course: Course, run: Rollout, seen: State) -> Target:
     """The state that the law sees at instant k → seen; where it is to go."""
     aim, lead = course.aims[k], course.leads[k]
     for i in range(len(seen.q)):
@@ -180,7 +180,7 @@ def _ask(k: int, course: Course, scene: Scene, law: Packed, work: Vec, run: Roll
     """The torque that the law asks for at instant k, and what it remembers afterwards."""
     q, v, work = take2(work, len(scene.limit))
     seen, tau = State(q, v), run.command[k]
-    target = _ahead(k, course, run, seen)
+    target = looking_ahead(k, course, run, seen)
     if law.layout[LAW] == LawCode.PID:
         memory, after, aim = _remembered(k, run), _remembered(k + 1, run), State(target.q, target.v)
         pid_step(memory, seen, aim, scene.period, pid_of(law.weights), tau, after)
@@ -196,7 +196,7 @@ def _ask_adjoint(
     n, lead, tau_bar = len(scene.limit), course.leads[k], bars.command[k]
     q, v, q_bar, v_bar, work = take4(work, n)
     seen, seen_bar = State(q, v), State(q_bar, v_bar)
-    target = _ahead(k, course, run, seen)
+    target = looking_ahead(k, course, run, seen)
     q_bar[:], v_bar[:] = 0.0, 0.0
     if law.layout[LAW] == LawCode.PID:
         memory, aim = _remembered(k, run), State(target.q, target.v)
@@ -283,7 +283,7 @@ def _run_stages(state: State, tau: Vec, scene: Scene, work: Vec) -> tuple[Stages
 
 
 @kernel
-def _step(state: State, tau: Vec, scene: Scene, work: Vec) -> None:
+def advance(state: State, tau: Vec, scene: Scene, work: Vec) -> None:
     """One plant step in place."""
     n, h = len(tau), scene.step
     stages, work = _run_stages(state, tau, scene, work)

@@ -15,6 +15,8 @@ from nbs_pin.certificates.attack import Attack
 from nbs_pin.certificates.certificate import Certificate
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.monitor import Monitored
+from nbs_pin.certificates.transient_attack import TransientAttack
+from nbs_pin.certificates.transient_check import TransientCheck
 from nbs_pin.reports.plotting import (
     ACTUAL,
     ERROR,
@@ -105,11 +107,17 @@ def plot_certificate(
 
 
 def plot_transient(
-    bound: TransientBound, path: str | Path, *, settings: Sequence[str] = (), verdict: Verdict | None = None
+    bound: TransientBound,
+    path: str | Path,
+    *,
+    attack: TransientAttack | None = None,
+    settings: Sequence[str] = (),
+    verdict: Verdict | None = None,
 ) -> Path:
     """Plot the bounds of a law that adapts and write the picture (`plotting.picture`); returns its path.
 
-    A bar per joint up to its bound, and one inside up to the error of the law with a fixed model, if that is known.
+    A bar per joint up to its bound, one inside up to the error of the law with a fixed model, if that is known, and a
+    mark at the largest error that an attack found.
     """
     title = f"{bound.law.robot.name}, any load of 0 to {bound.load_mass:.3g} kg at {bound.frame}: {bound.label}"
     with picture(path, 6.4, 4.6, heading=Heading(title, settings, verdict)) as figure:
@@ -117,10 +125,27 @@ def plot_transient(
         axes.barh(at, bound.joint_errors, height=0.7, color=LIMIT, alpha=0.35, label="the law that adapts, at most")
         if bound.fixed is not None:
             axes.barh(at, bound.fixed.joint_errors, height=0.38, color=ERROR, label="with a fixed model, simulated")
+        if attack is not None:
+            axes.plot(attack.joint_errors, at, "|", color=INK, markersize=14, label="worst found")
         axes.set_yticks(at, [_plain(name) for name in bound.joint_names])
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.set(xlabel=f"error of each joint, |z1| [{several(bound.joint_units)}]")
+        figure.legend(loc="outside lower left", **_LEGEND)
+    return Path(path)
+
+
+def plot_transient_check(
+    seen: TransientCheck, path: str | Path, *, title: str = "", settings: Sequence[str] = ()
+) -> Path:
+    """Plot each |z1_i| of a run as a share of its bound and write the picture; returns its path."""
+    level = monitor_level(is_kept=seen.is_kept, broken=tuple(seen.failures))
+    with picture(path, 8.0, 4.6, heading=Heading(title, settings, Verdict(level, seen.verdict))) as figure:
+        axes = figure.add_subplot()
+        for name, share in zip(seen.joint_names, (seen.joint_errors / seen.joint_bounds).T, strict=True):
+            axes.plot(*thin(seen.t, 100.0 * share), label=_plain(name))
+        axes.axhline(100.0, color=LIMIT, linestyle=_DASHED, label="bound")
+        axes.set(xlabel="time [s]", ylabel="error, of its bound [%]", xlim=(seen.t[0], seen.t[-1]))
         figure.legend(loc="outside lower left", **_LEGEND)
     return Path(path)
 

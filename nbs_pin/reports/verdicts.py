@@ -249,7 +249,7 @@ def _transient(figures: Mapping[str, Any]) -> Verdict:
     said = (
         f"{found['label']}: no joint of {figures['arm']} strays more than {most(found['joint_errors_rad'])} from its "
         f"motion{under}, whatever it carries up to {found['load_mass_kg']:.3g} kg{within} at {found['frame']} "
-        f"({figures['law']}, from a start on the motion, {lasting}, in continuous time)"
+        f"({figures['law']}, from {_started(figures)}, {lasting}, in continuous time)"
     )
     more = ["held torques, noise and torques that are cut off are not in the bound; simulate"]
     if found["duration_s"] is not None:
@@ -261,9 +261,25 @@ def _transient(figures: Mapping[str, Any]) -> Verdict:
         bounds = found["fixed_joint_error_bounds_rad"]
         certified = f"it is certified to {most(bounds)}" if bounds else f"no certificate: {found['fixed_refused']}"
         more[-1] += f"; {certified}".rstrip(".")
+    attack, seen = figures.get("attack"), figures.get("monitor")
+    level = GOOD if found["label"] == "PROVED" else WARNING
+    if attack is not None:
+        ratio = "" if attack["bound_over_found"] is None else f"; certified ÷ found = {attack['bound_over_found']:.2f}"
+        left = f"; {counted(attack['runs_left_out'], 'run')} with a torque cut off left out"
+        more.append(f"{attack['verdict']}{ratio}{left if attack['runs_left_out'] else ''}")
+        level = BAD if attack["exceeds"] else level
+    if seen is not None:
+        more.append(f"the run: {seen['verdict']}")
+        level = max(level, monitor_level(is_kept=seen["is_kept"], broken=seen["broken"]), key=_SEVERITY.index)
     useless = figures.get("useless") or []
     more += [f"of no use: {text}" for text in useless]
-    return Verdict(GOOD if found["label"] == "PROVED" and not useless else WARNING, said, tuple(more))
+    return Verdict(WARNING if level == GOOD and useless else level, said, tuple(more))
+
+
+def _started(figures: Mapping[str, Any]) -> str:
+    """Where the motions of a bound begin."""
+    error = figures.get("start_error_rad")
+    return f"a start at rest with {measured(error, 'rad')} off every joint" if error else "a start on the motion"
 
 
 def _attacked(attack: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
