@@ -17,7 +17,8 @@ from nbs_pin.base.versions import versions
 from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.loads import gravity_error, payload, total
-from nbs_pin.commands import certify as certifying
+from nbs_pin.certificates.transient_search import TransientSearch
+from nbs_pin.commands import certify as certifying, certify_adaptive
 from nbs_pin.reproduction import certificate_poses, certificate_study
 from nbs_pin.robots.catalogue import find
 
@@ -297,7 +298,11 @@ def test_results_of_another_certificate_are_kept(certified, capsys):
         ("two_link --disturbance 5 --against panda", "the controller has 2 joints and panda 7"),
         ("two_link --disturbance 5 --monitor none.npz", "none.npz"),
         ("two_link --disturbance 5 --payload-radius 0.1", "--payload-radius is for a law that adapts"),
-        ("two_link --law adaptive --attack", "--attack is for a law with a fixed model, and two_link has one that"),
+        (
+            "two_link --law adaptive --against panda",
+            "--against panda is for a law with a fixed model, and two_link has",
+        ),
+        ("two_link --law adaptive --link moon", "no moving link 'moon'"),
         ("two_link --law adaptive --delay 0.001", "--delay 0.001 is for a law with a fixed model"),
     ],
 )
@@ -333,6 +338,72 @@ def test_a_law_that_adapts_is_bounded_beside_the_one_that_does_not(tmp_path, cap
     page = (tmp_path / "report.html").read_text()
     assert "fixed model, simulated" in page
     assert "at all times it is below" in page.lower()
+
+
+def test_the_bound_of_a_law_that_adapts_is_attacked_and_a_run_is_checked(tmp_path, capsys, monkeypatch):
+    robot = nbs.load_robot("two_link")
+    law = nbs.AdaptiveLaw.for_robot(robot)
+    plant = nbs.MujocoPlant(robot.with_payload("link1", 0.2))
+    motion = nbs.Sinusoid.for_robot(robot)
+    moved = nbs.AdaptiveLaw(law.law, law.adapts, frame="link1")
+    nbs.simulate(plant, moved, motion, 1.0, 0.001).save(tmp_path / "seen.npz")
+    honest = certify_adaptive.transient_attack
+    monkeypatch.setattr(certify_adaptive, "transient_attack", lambda *given, **named: honest(*given, **named, runs=30))
+    words = ("--law", "adaptive", "--unknown-payload", "0.3", "--payload-radius", "0.05", "--link", "link1")
+    words = (*words, "--start-error", "0.02", "--attack", "--monitor", str(tmp_path / "seen.npz"), "--report")
+    figures = figures_of(tmp_path / "a", "two_link", *words)
+    said = capsys.readouterr().out
+    begin = motion(np.zeros(1)).q[0] + [0.02, -0.02]
+    expected = nbs.transient_bound(moved, 0.3, 0.05, reference=motion, q0=begin)
+    assert figures["transient"]["joint_errors_rad"] == pytest.approx(expected.joint_errors)
+    assert figures["transient"]["frame"] == "link1"
+    found, seen = figures["attack"], figures["monitor"]
+    assert 20 < found["runs"] <= 30
+    assert not found["exceeds"]
+    ratios = expected.joint_errors / np.array(found["joint_errors_rad"])
+    assert found["bound_over_found"] == pytest.approx(ratios.min())
+    assert f"certified ÷ found = {ratios.min():.2f}" in said
+    row = next(line for line in said.splitlines() if line.split()[:1] == ["joint1"])
+    assert f"{ratios[0]:.2f}" in row
+    assert "from a start at rest with 0.02 rad" in said
+    assert seen["is_kept"]
+    assert f"The run: {seen['verdict']}"[4:] in said
+    for name in ("certificate.png", "monitor.png"):
+        assert (tmp_path / "a" / name).read_bytes().startswith(PNG)
+    with open(tmp_path / "a" / "monitor.csv") as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["t", "error_joint1", "error_joint2", "bound_joint1", "bound_joint2"]
+    assert len(rows) == 1002
+    worst = Run.load(tmp_path / "a" / "run.npz")
+    assert expected.check(worst).is_kept
+    page = (tmp_path / "a" / "report.html").read_text()
+    assert "the worst run found reaches" in page
+
+
+def test_ctrl_c_in_the_search_keeps_the_results(tmp_path, capsys, monkeypatch):
+    honest, rounds = TransientSearch.shares, []
+
+    def shares(self, vectors):
+        if rounds:
+            raise KeyboardInterrupt
+        rounds.append(1)
+        return honest(self, vectors)
+
+    monkeypatch.setattr(TransientSearch, "shares", shares)
+    words = ("--law", "adaptive", "--unknown-payload", "0.3", "--payload-radius", "0", "--attack")
+    assert run(tmp_path / "a", "two_link", *words) == 130
+    assert "interrupted" in capsys.readouterr().out.lower()
+    found = summary(tmp_path / "a")
+    assert found["interrupted"]
+    assert found["figures"]["attack"]["runs"] == 40
+    assert (tmp_path / "a" / "run.npz").exists()
+
+
+def test_a_saved_law_that_adapts_keeps_its_own_link(tmp_path, capsys):
+    law = nbs.AdaptiveLaw.for_robot(nbs.load_robot("two_link"))
+    nbs.save(law, tmp_path / "law.nbs")
+    assert run(tmp_path / "a", str(tmp_path / "law.nbs"), "--link", "link1") == 2
+    assert "--link is for a law built here" in capsys.readouterr().err
 
 
 def test_a_law_without_a_proof_is_refused(tmp_path, capsys):

@@ -137,8 +137,8 @@ def law_of(controller: Any) -> ModelLaw:
     """The controller, if it is a law with a model; raises ArgumentError otherwise."""
     if isinstance(controller, (AdaptiveLaw, CompiledAdaptiveLaw)):
         raise ArgumentError(
-            f"attack does not follow the estimates of a {type(controller).__name__}; transient_bound bounds its error, "
-            "or give the law that it is about."
+            f"attack does not follow the estimates of a {type(controller).__name__}; call transient_attack with its "
+            "transient_bound, or give the law that it is about."
         )
     if not isinstance(controller, ModelLaw):
         raise ArgumentError(

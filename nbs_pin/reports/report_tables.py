@@ -127,6 +127,8 @@ def transient_tables(figures: Mapping[str, Any]) -> str:
         "fixed model, certified": found["fixed_joint_error_bounds_rad"] or nothing,
         "fixed model, simulated": found["fixed_joint_errors_rad"] or nothing,
     }
+    if figures.get("attack"):
+        columns["the worst run found reaches"] = figures["attack"]["joint_errors_rad"]
     bounds = [
         [name, *("none" if value is None else measured(value, unit) for value in values)]
         for name, unit, *values in zip(found["joints"], found["units"], *columns.values(), strict=True)

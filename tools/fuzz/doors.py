@@ -20,7 +20,7 @@ RESULTS = (
     "ToolMotion", "ToolPath", "ToolErrors", "ArgumentError", "CertificateRefused", "FileFormatError", "MissingExtra",
     "NbsPinError", "NoSuchFile", "RobotError", "RobotNotFound", "SimulationDiverged", "TooLarge", "Driven", "Fault",
     "FaultReport", "Mode", "Sample", "ExcitingMotion", "ExternalTorque", "ObservedTorques", "TransientBound",
-    "TransientCheck", "CampaignTable",
+    "TransientCheck", "TransientAttack", "CampaignTable",
 )  # fmt: skip
 """What functions of the package return and nobody constructs; their methods are doors all the same."""
 INTERFACES = ["Controller", "MemorylessController", "DynamicsProvider", "LyapunovLaw", "ModelLaw", "Plant"]
@@ -299,7 +299,8 @@ def _own(s: Stock) -> dict[str, dict[str, Any]]:
         "simulate": {"disturbance": None, "q0": Q, "v0": Z, "workers": 1},
         "stream": {"disturbance": None, "q0": Q, "v0": Z, "block": 5},
         "squared_error": {"tau": V},
-        "transient_bound": {"law": s.adaptive, "load_mass": 0.5, "load_radius": 0.0, "start": 0.1},
+        "transient_attack": {"bound": s.transient, "duration": 0.02, "period": 0.001, "runs": 10},
+        "transient_bound": {"law": s.adaptive, "load_mass": 0.5, "load_radius": 0.0, "start": 0.0, "q0": Q, "v0": Z},
         "train": {**quick, "disturbance": None, "cost": nbs.squared_error},
         "verify": {"path": s.path("certificate.json", functools.partial(nbs.write_certificate, s.certificate))},
         "write_certificate": {"path": s.folder / "certificate-out.json"},
