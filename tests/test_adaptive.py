@@ -450,7 +450,7 @@ def test_damping_pays_for_the_mass_in_the_output_of_pd():
     kept = np.einsum("pi,pij,pj->p", s, damping, s)
     assert (taken >= kept * (1.0 - 1e-12)).all()
     assert taken[0] == pytest.approx(kept[0])
-    with pytest.raises(ArgumentError, match=r"output_rate is 1e\+03 1/s.* does not pay for it in every pose"):
+    with pytest.raises(ArgumentError, match=r"output_rate of 1e\+03 1/s is more than the damping k_d of this PD"):
         nbs.AdaptiveLaw(law, ["offsets"], output_rate=np.full(7, 1e3))
 
 
@@ -458,6 +458,17 @@ def test_the_cost_of_a_step_is_the_gain_unless_the_rates_are_others():
     law = law_for(nbs.load_robot("panda"), ["load", "friction", "rotors"], gain=0.3)
     assert law.step_cost() == pytest.approx(0.3)
     assert law_for(law.robot, law.adapts, rates=2.0 * law.rates).step_cost() == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("name", ["PD", "ComputedTorque"])
+def test_the_cost_of_a_step_is_refused_where_training_left_too_little_damping(name):
+    inner = OTHERS[name](nbs.load_robot("two_link"))
+    law = nbs.AdaptiveLaw(inner, ["offsets"])
+    assert law.step_cost() > 0.0
+    inner.gains.named("kd").change.data[:] = -3.0  # k_d is e^-6 of what it was, and output_rate follows from that
+    with pytest.raises(ArgumentError, match=f"is more than the damping k_d of this {name} pays for in every pose"):
+        law.step_cost()
+    assert nbs.AdaptiveLaw(inner, ["offsets"]).step_cost() > 0.0  # what the sentence says to do
 
 
 def test_estimates_count_in_the_size_of_a_run(monkeypatch):

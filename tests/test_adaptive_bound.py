@@ -19,6 +19,7 @@ from nbs_pin.certificates.adaptive_storage import Beginning
 from nbs_pin.certificates.error_bounds import radians
 from nbs_pin.certificates.fixed_beside import loaded_model
 from nbs_pin.certificates.worst_load import Divergence, of_number
+from nbs_pin.controllers.adapting_model import Duals
 from nbs_pin.controllers.matrix_logistic import logistic_and_cut
 from nbs_pin.controllers.unknowns import model_body
 from nbs_pin.dynamics.pinocchio_tree import pack_model
@@ -243,6 +244,39 @@ def test_the_fixed_law_is_simulated_with_the_bodies_of_its_model():
     found = loaded_model(law, "panda_hand_tcp", 1.5, centre).mass_matrix(q)
     assert np.abs(own - bare).max() > 0.05
     np.testing.assert_allclose(found, own + more - bare, rtol=0.0, atol=1e-7)
+
+
+def test_an_output_of_an_instant_whose_torque_was_cut_off_pays_for_the_hold_that_takes_it():
+    """After a torque that is cut off V_a falls at §2's rate at once, though the update takes an output of that time.
+
+    If the estimates waited for that output too, V would gain z2ᵀYπ̃ in this hold and d would pay for nothing.
+    """
+    robot = nbs.load_robot("two_link").with_effort_limit([90.0, 42.0])
+    law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), load_mass=1.0)
+    loaded, inner = nbs.PinocchioDynamics(robot.with_payload("tip", 0.8)), law.law
+    truth, compiled = Divergence(law.unknowns.bodies[0]).loaded(0.8, np.zeros(3)), law.compile()
+    off = {}
+    for period in (2e-4, 5e-5):
+        run = nbs.simulate(
+            nbs.DynamicsPlant(loaded), law, nbs.Hold([0.4, -0.3]), 0.2, period, q0=[0.1, 0.2], lookahead=0.0
+        )
+        duals, memory = [], law.initial_memory(run.q[0])
+        for q, v in zip(run.q, run.v, strict=True):
+            duals.append(memory.duals)
+            _, memory = compiled.step(memory, q, v, nbs.Hold([0.4, -0.3])(0.0), period)
+        given = Duals.of(np.array(duals), 1).bodies[:, 0]
+        apart = [bregman(truth, x, dual) for x, dual in zip(*logistic_and_cut(given), strict=True)]
+        e, mass = inner.errors(run.q, run.v, run.q_ref, run.v_ref, run.a_ref), loaded.mass_matrix(run.q)
+        kinetic = np.einsum("ki,kij,kj->k", e.z2, mass, e.z2)
+        taken = (e.gradient**2 * inner.rate_like(e.gradient)).sum(axis=-1) + inner.inertial_rate * kinetic
+        taken += (e.z2 * inner.damping_force(e.z2)).sum(axis=-1)
+        cut = (run.tau != run.tau_command).any(axis=-1)
+        (k,) = np.flatnonzero(~cut[2:-1] & cut[:-3])[:1] + 2
+        v_rate, d_rate = (np.diff(x)[k] / period for x in (e.value + 0.5 * kinetic, np.array(apart) / law.rates[0]))
+        off[period] = abs(v_rate + d_rate + taken[k]) / taken[k]
+        assert abs(d_rate) > 0.05 * taken[k]  # what waiting would leave unpaid
+    assert off[2e-4] < 0.02
+    assert off[5e-5] < 0.5 * off[2e-4]
 
 
 @pytest.mark.parametrize("seed", range(10))

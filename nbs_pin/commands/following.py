@@ -11,11 +11,13 @@ import numpy as np
 from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.npz import LARGEST
+from nbs_pin.base.plain import plain
 from nbs_pin.base.progress import waiting
 from nbs_pin.base.records import Reference, Run
 from nbs_pin.cli.payloads import TimedLoad
 from nbs_pin.commands.inputs import law_of
 from nbs_pin.commands.loads import kept, loaded
+from nbs_pin.controllers.adaptive_law import AdaptiveLaw
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.motions.disturbances import Disturbance
@@ -24,6 +26,7 @@ from nbs_pin.robots.robot import Robot
 from nbs_pin.simulation.plant import Plant
 from nbs_pin.simulation.plant_steps import stable_step
 from nbs_pin.simulation.registry import build_plant
+from nbs_pin.simulation.run_figures import figures
 from nbs_pin.simulation.simulate import recorded_numbers, stream
 
 _ROWS_OF_ARRAYS = 8  # arrays of a Run with one number per row and joint
@@ -39,6 +42,12 @@ class Tracked(NamedTuple):
     """Time to simulate [s]."""
     interrupted: bool
     """Whether Ctrl-C ended it, so that the run is a part of what was asked for."""
+    deviations: dict[str, float]
+    """How far each estimate of a law that adapts may be off in the end (`AdaptiveLaw.estimate`); empty for others."""
+
+    def figures(self, robot: Robot) -> dict[str, Any]:
+        """`run_figures.figures` of the run, with these deviations."""
+        return figures(self.run, robot) | ({"estimates_deviation": plain(self.deviations)} if self.deviations else {})
 
 
 def track(
@@ -116,7 +125,16 @@ def track(
     run = _joined(blocks)
     run.info.update(kept(loads))
     interrupted = len(run.t) <= round(duration / period)
-    return Tracked(run, before - begun, time.perf_counter() - before, interrupted)
+    return Tracked(run, before - begun, time.perf_counter() - before, interrupted, _deviations(controller, run))
+
+
+def _deviations(controller: Controller, run: Run) -> dict[str, float]:
+    """How far each estimate may be off after one run."""
+    if not isinstance(controller, AdaptiveLaw) or run.q.ndim != 2:
+        return {}
+    found = controller.estimate(run)
+    assert found.deviation is not None  # as it is of a run
+    return dict(zip(found.names, found.deviation.tolist(), strict=True))
 
 
 def not_simulated(robot: Robot, joint_friction: str) -> list[str]:

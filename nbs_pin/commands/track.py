@@ -23,7 +23,6 @@ from nbs_pin.reports.plotting import plot_tracking
 from nbs_pin.reports.replay import replay
 from nbs_pin.reports.verdicts import verdict_of
 from nbs_pin.robots.robot import Robot
-from nbs_pin.simulation.run_figures import figures
 
 _NOTICEABLE = 3.0  # compilation times above this are printed [s]; machine code from disk takes less
 
@@ -55,9 +54,10 @@ def run(options: Track, console: Console, notes: Console) -> None:
         return
     results = results.check((*FILES, PICTURE, LEARNED), options.force, whole={"interrupted": False})
     with results.made() as folder:
-        recorded, compile_time, wall_time, interrupted = track(robot, **given, progress=True)
+        tracked = track(robot, **given, progress=True)
+        recorded, compile_time, wall_time, interrupted, _ = tracked
         recorded.info.update(reference=options.reference, interrupted=interrupted, **results.facts)
-        found = figures(recorded, robot) | {"joint_stops": options.joint_stops}
+        found = tracked.figures(robot) | {"joint_stops": options.joint_stops}
         found["not_simulated"] = not_simulated(robot, options.joint_friction)
         with notes.status(f"writing run, picture and replay into {folder}"):
             times = {"compile_time_s": compile_time, "wall_time_s": wall_time}

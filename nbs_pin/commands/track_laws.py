@@ -19,7 +19,6 @@ from nbs_pin.reports.law_charts import plot_laws
 from nbs_pin.reports.plotting import Heading
 from nbs_pin.reports.verdicts import largest_late_errors, verdict_of
 from nbs_pin.robots.robot import Robot
-from nbs_pin.simulation.run_figures import figures
 
 FILES = (RUN, "tracking.png", "replay.html", SUMMARY)
 """What `nbs-pin track` writes with one law."""
@@ -58,7 +57,7 @@ def track_laws(
             if done[name].interrupted:
                 break
         interrupted = len(done) < len(laws) or any(tracked.interrupted for tracked in done.values())
-        found: dict[str, Any] = {"laws": {name: figures(tracked.run, robot) for name, tracked in done.items()}}
+        found: dict[str, Any] = {"laws": {name: tracked.figures(robot) for name, tracked in done.items()}}
         found["not_simulated"] = not_simulated(robot, options.joint_friction)
         verdict = verdict_of(found, interrupted=interrupted)
         with notes.status(f"writing runs and picture into {folder}"):

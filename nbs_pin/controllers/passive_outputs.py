@@ -102,7 +102,7 @@ def damping_of(law: ModelLaw, output: Output, mass: Float[np.ndarray, "poses n n
     """A matrix Δ with V̇ ≤ −sᵀΔs without a wrong torque, at poses with these mass matrices; of PD near the motion.
 
     Of PD and computed torque V̇ = −ż1ᵀAż1 − z1ᵀεK_pz1 with A = K_d − εM or K_d − λ, so Δ⁻¹ = A⁻¹ + εK_p⁻¹. Raises
-    ArgumentError for an ε with which A is not positive definite.
+    ArgumentError for an ε or λ with which A is not positive definite.
     """
     if isinstance(law, LyapunovLaw):
         return np.asarray(law.inertial_rate * mass + law.lyapunov().floor)
@@ -113,7 +113,8 @@ def damping_of(law: ModelLaw, output: Output, mass: Float[np.ndarray, "poses n n
         paid = np.diag(law.kd) - 0.5 * (output.rate[:, None] + output.rate) * mass
     if not np.linalg.eigvalsh(paid)[:, 0].min() > 0.0:
         raise ArgumentError(
-            f"AdaptiveLaw: output_rate is {output.rate.max():.3g} 1/s, expected less, as the damping k_d of"
-            f" {type(law).__name__} does not pay for it in every pose; give a smaller one, or leave it out."
+            f"AdaptiveLaw: the output_rate of {output.rate.max():.3g} 1/s is more than the damping k_d of this"
+            f" {type(law).__name__} pays for in every pose; make an AdaptiveLaw around it with a smaller output_rate,"
+            " or with none, which then follows from the k_d of now."
         )
     return np.linalg.inv(np.linalg.inv(paid) + np.diag(output.rate / law.kp))

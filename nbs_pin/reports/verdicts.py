@@ -9,7 +9,7 @@ import numpy as np
 from nbs_pin.base.doors import option
 from nbs_pin.base.units import counted, measured, percent, several
 from nbs_pin.reports.challenge_told import challenge_told
-from nbs_pin.simulation.run_figures import LIGHT, load_of
+from nbs_pin.simulation.run_figures import LIGHT, load_deviation, load_of
 
 GOOD, WARNING, BAD, NOTE = "good", "warning", "bad", "note"
 """How a verdict is coloured: kept, to be looked at, broken, and neither."""
@@ -144,7 +144,12 @@ def _load_learned(figures: Mapping[str, Any]) -> tuple[str, ...]:
     if abs(mass) < LIGHT:
         return (f"the law believes that {link} carries no load",)
     at = ", ".join(f"{1e3 * x:z.0f}" for x in centre)
-    return (f"the law believes in a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm",)
+    told = f"the law believes in a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm"
+    off = load_deviation(figures["estimates"], figures.get("estimates_deviation", {}))
+    if off is not None:
+        apart = ", ".join(f"{1e3 * x:.2g}" for x in off[1])
+        told += f"; the mass may be off by {off[0]:.2g} kg, the centre by ({apart}) mm"
+    return (told,)
 
 
 def _convergence(figures: Mapping[str, Any]) -> tuple[str, str]:

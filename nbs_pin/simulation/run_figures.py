@@ -57,6 +57,22 @@ def load_of(estimates: dict[str, Any]) -> tuple[str, Any, Any] | None:
     return link, mass, np.stack(firsts, axis=-1) / np.where(np.abs(mass) > NO_MASS, mass, np.inf)[..., None]
 
 
+def load_deviation(estimates: dict[str, Any], deviations: dict[str, Any]) -> tuple[float, Any] | None:
+    """How far mass [kg] and centre (3,) [m] of the load may be off, from the deviations of all estimates by name.
+
+    Of the centre c = h/m it is (σ_h + |c|σ_m)/m, which is the largest for any correlation. None where it is not known.
+    """
+    found = load_of(estimates)
+    if found is None:
+        return None
+    link, mass, centre = found
+    names = [f"{LOAD_AT}{link} {what}" for what in ("m [kg]", *(f"m{axis} [kg·m]" for axis in "xyz"))]
+    off = np.array([deviations.get(name) for name in names], dtype=float)
+    if not np.isfinite(off).all():
+        return None
+    return float(off[0]), (off[1:] + np.abs(centre) * off[0]) / abs(mass)
+
+
 def loads_of(run: Run) -> list[dict[str, Any]]:
     """The loads that appeared in the plant of a run, as the run notes them; none of those that cannot be read.
 
