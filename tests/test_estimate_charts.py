@@ -13,6 +13,7 @@ from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.controllers.unknowns import ADAPTS
 from nbs_pin.reports.estimate_panels import CARRIED, panels_of
 from nbs_pin.reports.replay import shown_run
+from nbs_pin.simulation.run_figures import load_deviation
 from tests.commands import contents, printed_by, summary
 
 GANTRY = str(Path(__file__).parent / "data" / "gantry.urdf")  # one joint slides, two turn
@@ -145,6 +146,24 @@ def test_a_load_at_a_link_that_the_arm_does_not_have_is_not_drawn(carried):
     np.testing.assert_allclose(np.subtract(balls[0]["point"], balls[1]["point"]), [0.0, 0.0, 0.1], atol=1e-12)
 
 
+def test_a_centre_may_be_off_by_what_mass_and_moment_may_be_off_together():
+    """(σ_h + |c|σ_m)/m is the largest deviation of h/m to first order, over all correlations of h and m."""
+    moment, mass, off = np.array([0.06, -0.04, 0.0]), 2.0, np.array([0.1, 0.02, 0.01, 0.03])
+    names = ["load at tip m [kg]", *(f"load at tip m{axis} [kg·m]" for axis in "xyz")]
+    estimates, deviations = dict(zip(names, [mass, *moment], strict=True)), dict(zip(names, off.tolist(), strict=True))
+    found = load_deviation(estimates, deviations)
+    assert found is not None
+    step = 1e-6
+    worst = [
+        max(abs((h + a * step * s) / (mass + b * step * off[0]) - h / mass) / step for a in (-1, 1) for b in (-1, 1))
+        for h, s in zip(moment, off[1:], strict=True)
+    ]
+    assert found[0] == 0.1
+    np.testing.assert_allclose(found[1], worst, rtol=1e-4)
+    assert load_deviation(estimates, {}) is None
+    assert load_deviation({}, deviations) is None
+
+
 def test_track_tells_the_load_and_another_law_takes_the_picture_away(tmp_path):
     folder, line = tmp_path / "out", ("track", "two_link", "--duration", "5", "--payload", "0.3@1")
     printed = printed_by(*line, "--controller", "adaptive", "--out", folder)
@@ -152,8 +171,12 @@ def test_track_tells_the_load_and_another_law_takes_the_picture_away(tmp_path):
     assert str(folder / "estimates.png") in printed.replace("\n", "")
     files = {"run.npz", "tracking.png", "estimates.png", "replay.html", "summary.json"}
     assert contents(folder).keys() == files
-    learned = summary(folder)["figures"]["estimates"]
+    learned, off = (summary(folder)["figures"][key] for key in ("estimates", "estimates_deviation"))
     assert learned["load at tip m [kg]"] == pytest.approx(0.3, abs=0.03)
+    found = nbs.AdaptiveLaw.for_robot(nbs.load_robot("two_link")).estimate(nbs.Run.load(folder / "run.npz"))
+    assert list(off) == found.names
+    np.testing.assert_allclose(list(off.values()), found.deviation, rtol=1e-9)
+    assert f"the mass may be off by {found.deviation[0]:.2g} kg" in printed.replace("\n", " ")
     assert cli.main([*line, "--controller", "nbs", "--out", str(folder)]) == 2
     assert contents(folder).keys() == files
     printed = printed_by(*line, "--controller", "nbs", "--out", folder, "--force")

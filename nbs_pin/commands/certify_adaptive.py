@@ -146,27 +146,29 @@ def _bound(options: Certify, law: AdaptiveLaw, motion: DesiredMotion, duration: 
 
 
 def _tables(bound: TransientBound, found: TransientAttack | None) -> list[Table]:
-    """The bounds of the joints beside the law with a fixed model, the worst found, and what they rest on."""
+    """The bounds of the joints beside the law with a fixed model, and the worst found; what they rest on."""
     fixed = bound.fixed
     columns = {"bound": bound.joint_errors, "at all\ntimes": bound.joint_errors_always}
     if fixed is not None:
         known, none = fixed.certificate, np.full_like(fixed.joint_errors, np.inf)
         columns["fixed law,\ncertified"] = none if known is None else known.joint_errors
         columns["fixed law,\nsimulated"] = fixed.joint_errors
-    shown = table("errors", *columns, *(() if found is None else ("worst\nfound", "bound ÷\nfound")))
-    worst = np.zeros_like(bound.joint_errors) if found is None else found.joint_errors
-    rows = zip(bound.joint_names, bound.joint_units, worst, bound.joint_errors, *columns.values(), strict=True)
-    for name, unit, error, most, *row in rows:
-        cells: list[str | Text] = [f"{x:.3g} {unit}" if math.isfinite(x) else "none" for x in row]
-        if found is not None:
-            ratio = f"{most / error:.2f}" if error > 0.0 else ""
-            cells += [f"{error:.3g} {unit}", Text(ratio, style="bold red" if error > most else "")]
-        shown.add_row(name, *cells)
-    if found is not None:
-        share, blank = bound.storage_within / found.storage, [""] * (len(columns) - 1)
-        of_storage = Text(f"{share:.2f}", style="bold red" if share < 1.0 else "")
-        shown.add_row("V", f"{bound.storage_within:.3g} J", *blank, f"{found.storage:.3g} J", of_storage)
-    return [shown, claims_table("what they rest on", [line.plain() for line in bound.lines])]
+    shown = table("errors", *columns)
+    for name, unit, *row in zip(bound.joint_names, bound.joint_units, *columns.values(), strict=True):
+        shown.add_row(name, *(f"{x:.3g} {unit}" if math.isfinite(x) else "none" for x in row))
+    searched = () if found is None else (_searched(found),)
+    return [shown, *searched, claims_table("what they rest on", [line.plain() for line in bound.lines])]
+
+
+def _searched(found: TransientAttack) -> Table:
+    """The worst found beside the bounds, of the joints and of V."""
+    bound, shown = found.bound, table("the worst found", "bound", "worst found", "bound ÷ found")
+    limits = [*bound.joint_errors.tolist(), bound.storage_within]
+    worst = [*found.joint_errors.tolist(), found.storage]
+    for name, unit, most, x in zip((*bound.joint_names, "V"), (*bound.joint_units, "J"), limits, worst, strict=True):
+        ratio = Text(f"{most / x:.2f}" if x > 0.0 else "", style="bold red" if x > most else "")
+        shown.add_row(name, f"{most:.3g} {unit}", f"{x:.3g} {unit}", ratio)
+    return shown
 
 
 def refuse_radius(options: Certify) -> None:
