@@ -11,6 +11,8 @@ from hypothesis import given, settings, strategies as st
 import nbs_pin as nbs
 from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.certificates import transient_attack as attacking
+from nbs_pin.certificates.adaptive_storage import loaded_start
+from nbs_pin.certificates.certificate import Start
 from nbs_pin.certificates.fixed_beside import loaded_model
 from nbs_pin.certificates.transient_search import Load, Reached, TransientSearch, loaded_storage
 from nbs_pin.dynamics.pinocchio_tree import pack_model
@@ -201,25 +203,34 @@ def test_sliding_joints_are_searched_in_metres():
     assert "error at most" in found._repr_html_()
 
 
-def test_a_start_is_bounded_with_every_load_of_the_box():
-    law = bound_for("panda").law
-    robot, motion = law.robot, nbs.Sinusoid.for_robot(law.robot)
-    begin = motion(0.0)
-    q0, v0 = begin.q + 0.05 * (-1.0) ** np.arange(7), np.zeros(7)
-    bound = nbs.transient_bound(law, 2.0, 0.08, reference=motion, duration=0.1, q0=q0)
-    rng, frame, values = np.random.default_rng(3), bound.frame, []
-    e = law.law.errors(q0, v0, begin.q, begin.v, begin.a)
-    for _ in range(40):
-        x = rng.normal(size=3)
-        x *= 0.08 / np.linalg.norm(x)
-        mass = nbs.PinocchioDynamics(robot.with_payload(frame, 2.0, com=x.tolist())).mass_matrix(q0)
-        values.append(float(e.value + 0.5 * e.z2 @ mass @ e.z2))
-    assert max(values) <= bound.start
-    assert bound.start <= 1.1 * max(values)
-    point = nbs.transient_bound(law, 2.0, reference=motion, duration=0.1, q0=q0)
-    mass = nbs.PinocchioDynamics(robot.with_payload(frame, 2.0)).mass_matrix(q0)
-    assert point.start == pytest.approx(float(e.value + 0.5 * e.z2 @ mass @ e.z2), rel=1e-6)
+@pytest.mark.parametrize("name", LOADS)
+def test_a_start_is_bounded_with_every_load_of_the_box(name):
+    """Above V(0) with point loads at the edge of the box; equal to it for a box without radius."""
+    law = bound_for(name).law
+    inner, robot, n, mass = law.law, law.robot, law.nv, LOADS[name]
+    motion = nbs.Sinusoid.for_robot(robot)
+    q0, rng = motion(0.0).q + 0.05 * (-1.0) ** np.arange(n), np.random.default_rng(3)
+    start, frame = Start.of(inner, motion, q0, None), bound_for(name).frame
+
+    def storage(centre):
+        loaded = nbs.PinocchioDynamics(robot.with_payload(frame, mass, com=centre.tolist())).mass_matrix(q0)
+        e = inner.errors(q0, np.zeros(n), start.begin.q, start.begin.v, start.begin.a)
+        return float(e.value + 0.5 * e.z2 @ loaded @ e.z2)
+
+    edge = rng.normal(size=(30, 3))
+    values = [storage(0.08 * x / np.linalg.norm(x)) for x in edge]
+    bound = loaded_start(law, frame, nbs.Payload(mass, 0.08), start)
+    assert max(values) <= bound <= 1.1 * max(values)
+    assert loaded_start(law, frame, nbs.Payload(mass), start) == pytest.approx(storage(np.zeros(3)), rel=1e-6)
+
+
+def test_a_start_is_given_in_one_way():
+    law = bound_for().law
+    motion, q0 = nbs.Sinusoid.for_robot(law.robot), [0.1, 0.2]
+    found = nbs.transient_bound(law, 0.5, reference=motion, duration=0.1, q0=q0)
+    start = Start.of(law.law, motion, q0, None)
+    assert found.start == loaded_start(law, found.frame, nbs.Payload(0.5), start)
     with pytest.raises(ArgumentError, match="start and q0 both state the beginning"):
-        nbs.transient_bound(law, 2.0, start=0.1, reference=motion, q0=q0)
+        nbs.transient_bound(law, 0.5, start=0.1, reference=motion, q0=q0)
     with pytest.raises(ArgumentError, match="q0 and v0 refer to a motion"):
-        nbs.transient_bound(law, 2.0, q0=q0)
+        nbs.transient_bound(law, 0.5, q0=q0)

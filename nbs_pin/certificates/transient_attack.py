@@ -164,28 +164,7 @@ def transient_attack(
     period = bound.law.period if period is None else period
     followed = motions_of(bound.law.law.dynamics, reference, seed)
     search = TransientSearch(bound, followed, _steps(bound, followed[0], duration, period), period)
-    size = max(5, min(runs // 2, round(math.sqrt(1.6 * runs))))
-    rounds = runs // size
-    begin = np.random.default_rng(seed).uniform(size=(size, search.size))
-    begin[: len(followed)] = [search.expected(k, x) for k, x in enumerate(begin[: len(followed)])]
-    ticks, history = tracked(range(rounds), search.told, progress), []
-
-    def objective(x: Float[np.ndarray, "size runs"]) -> Float[np.ndarray, " runs"]:
-        next(ticks)
-        shares = search.shares(x.T)
-        history.append(search.worst)
-        return -shares
-
-    interrupted = False
-    try:
-        differential_evolution(
-            objective, [(0.0, 1.0)] * search.size, strategy="currenttobest1bin", maxiter=rounds - 1, init=begin,
-            polish=False, tol=0.0, vectorized=True, updating="deferred", rng=np.random.default_rng((seed, 1)),
-        )  # fmt: skip
-    except KeyboardInterrupt:
-        if search.best is None:
-            raise
-        interrupted = True
+    history, interrupted = _searched(search, runs, seed, progress)
     if search.best is None:
         raise ArgumentError(
             f"in each of {counted(search.runs, 'run')} a torque was cut off, where the bound does not hold; "
@@ -196,6 +175,32 @@ def transient_attack(
         bound, search.storage, search.joint_errors, search.run(search.best), search.best.load, search.runs, search.cut,
         np.array(history), finer, interrupted,
     )  # fmt: skip
+
+
+def _searched(search: TransientSearch, runs: int, seed: int, progress: bool) -> tuple[list[float], bool]:
+    """The largest share after every round of at most so many runs, and whether Ctrl-C ended them."""
+    size, known = max(5, min(runs // 2, round(math.sqrt(1.6 * runs)))), len(search.motions)
+    rounds = runs // size
+    begin = np.random.default_rng(seed).uniform(size=(size, search.size))
+    begin[:known] = [search.expected(k, x) for k, x in enumerate(begin[:known])]
+    ticks, history = tracked(range(rounds), search.told, progress), list[float]()
+
+    def objective(x: Float[np.ndarray, "size runs"]) -> Float[np.ndarray, " runs"]:
+        next(ticks)
+        shares = search.shares(x.T)
+        history.append(search.worst)
+        return -shares
+
+    try:
+        differential_evolution(
+            objective, [(0.0, 1.0)] * search.size, strategy="currenttobest1bin", maxiter=rounds - 1, init=begin,
+            polish=False, tol=0.0, vectorized=True, updating="deferred", rng=np.random.default_rng((seed, 1)),
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        if search.best is None:
+            raise
+        return history, True
+    return history, False
 
 
 def _steps(bound: TransientBound, motion: DesiredMotion, duration: float | None, period: float) -> int:
