@@ -31,12 +31,14 @@ def test_rows_carry_their_percentiles_in_order(monkeypatch):
         figures = row.figures
         assert 0.0 < figures["p50_us"] <= figures["p99_us"] <= figures["p99.9_us"] <= figures["max_us"]
         assert figures["over_two_rnea"] == pytest.approx(figures["p50_us"] / figures["two_rnea_us"])
-    kinds = {"control step", "plant step", "simulate", "model torque", "joints", "training epoch"}
+    kinds = {"control step", "guarded step", "plant step", "simulate", "model torque", "joints", "training epoch"}
     kinds |= {"step in C", "joints in C"} if can_compile() else set()
     assert {row.what for row in rows} == kinds
     for row in rows:
         if row.what == "step in C":
             assert row.figures["python_over_c"] == pytest.approx(row.figures["python_us"] / row.figures["p50_us"])
+        if row.what == "guarded step":
+            assert row.figures["guard_us"] == pytest.approx(row.figures["p50_us"] - row.figures["law_us"])
     assert {row.how for row in rows if row.what == "model torque"} == {"pinocchio", "chain", "cholesky"}
     assert len({row.key for row in rows}) == len(rows)
     json.dumps(bench.summary(rows), allow_nan=False)

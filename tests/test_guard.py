@@ -389,7 +389,7 @@ class Unguarded(nbs.Guarded):
     def step(self, sample, aim, *, overrun=False, stop=False):
         if not np.isfinite(sample.q).all() or not sample.fresh:
             return self.tau
-        return self._command(sample, aim)
+        return self._command(self._taken(sample, aim, False)[1], aim)
 
 
 def fails(at, arm="two_link"):
@@ -427,3 +427,47 @@ def test_rows_that_need_no_guard_can_fail_too(monkeypatch):
         lambda robot, *a, torque_rate=None, **k: slow(robot, *a, torque_rate=torque_rate and 0.02 * torque_rate, **k),
     )
     assert fails(row("F18", "1000 N·m/s against none"))
+
+
+def test_samples_of_any_kind_are_used_alike_and_kept_as_they_were():
+    robot = nbs.load_robot("two_link")
+    motion, law = nbs.Sinusoid.for_robot(robot), nbs.NeuralBackstepping.for_robot(robot)
+    kinds = {
+        "arrays": np.array,
+        "lists": np.ndarray.tolist,
+        "strided": lambda x: np.repeat(x, 2)[::2],
+        "read-only": lambda x: np.frombuffer(x.tobytes()),
+    }
+    sent, shown = {}, {}
+    for kind, made in kinds.items():
+        guarded, start = nbs.Guarded(law, robot), motion(0.0)
+        guarded.begin(start.q, motion(guarded.lead))
+        for k in range(30):
+            now, aim = motion(k * H), motion(k * H + guarded.lead)
+            vectors = [made(np.array(x)) for x in (now.q, now.v, *aim)]
+            sent[kind, k] = guarded.step(nbs.Sample(k * H, *vectors[:2]), nbs.Reference(*vectors[2:]))
+            shown[kind, k] = guarded.seen
+            if kind == "arrays":  # what a driver does with its arrays afterwards is not seen in the report
+                for x in vectors:
+                    x[:] = np.nan
+        assert guarded.mode is nbs.Mode.OK
+    for kind, k in sent:
+        np.testing.assert_array_equal(sent[kind, k], sent["arrays", k])
+        sample, aim, tau = shown[kind, k]
+        for found, expected in zip(
+            (sample.q, sample.v, *aim, tau), (*motion(k * H)[:2], *motion(k * H + 0.5 * H), sent[kind, k]), strict=True
+        ):
+            np.testing.assert_array_equal(found, expected)
+        assert (sample.t, sample.fresh, sample.external, sample.fault) == (k * H, True, None, "")
+
+
+@pytest.mark.parametrize("a_ref", [np.zeros(3), [0.0, np.nan], "none", np.zeros((2, 2))])
+def test_a_reference_without_accelerations_of_every_joint_holds_the_torque(a_ref):
+    robot = nbs.load_robot("two_link")
+    guarded, aim = nbs.Guarded(nbs.NeuralBackstepping.for_robot(robot), robot), nbs.Hold([0.3, 0.2])(0.0)
+    guarded.begin(aim.q, aim)
+    tau = guarded.step(nbs.Sample(0.0, aim.q, aim.v), aim)
+    held = guarded.step(nbs.Sample(H, aim.q, aim.v), aim._replace(a=a_ref))
+    assert held.tolist() == tau.tolist()
+    assert guarded.mode is nbs.Mode.DEGRADED
+    assert guarded.counters.held == 1

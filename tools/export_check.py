@@ -30,7 +30,7 @@ RANGES = {"q": 7.0, "v": 10.0, "q_ref": 7.0, "v_ref": 10.0, "a_ref": 100.0, "las
 SANITIZED = "ASan and UBSan"
 FLAGS = {
     "-O0": ["-O0"],
-    "-O3": ["-O3", "-march=native", "-fno-math-errno"],
+    "-O3": ["-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast"],
     SANITIZED: ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"],
 }
 AARCH64_GCC, M7_GCC = "aarch64-linux-gnu-gcc", "arm-none-eabi-gcc"

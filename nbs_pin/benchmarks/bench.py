@@ -31,6 +31,7 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.motions.disturbances import SquareWave, TorqueNoise
 from nbs_pin.motions.references import DesiredMotion, Sinusoid, paper_reference
 from nbs_pin.robots.robot import Robot, load_robot
+from nbs_pin.runtime.guarded import Guarded, Sample
 from nbs_pin.simulation import metrics
 from nbs_pin.simulation.costs import squared_error
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
@@ -84,6 +85,7 @@ def bench(
         for law in LAWS:
             yield control_row(robot, law, calls, against_torch=law == "nbs")
         yield from exported_rows(robot, calls)
+        yield guarded_row(robot, calls)
         yield from plant_rows(robot)
         yield simulation_row(robot)
     for arm in MODELS:
@@ -143,6 +145,21 @@ def exported_rows(
             figures = {"joints": float(robot.nv), "p50_us": p50, "p99_us": p99, "python_us": python,
                        "python_over_c": python / p50, "bytes": float(size)}  # fmt: skip
             yield Row(what, robot.name, how, figures)
+
+
+def guarded_row(robot: Robot, calls: int) -> Row:
+    """A step of the compiled law behind the guard, in Python, along the default motion, and what the law takes [µs]."""
+    guarded, motion, steps = Guarded(build_law("nbs", robot, period=PERIOD), robot), Sinusoid.for_robot(robot), 1000
+    at_rest, aims = motion(0.0), [motion(PERIOD * k + guarded.lead) for k in range(steps)]
+    here = [motion(PERIOD * k) for k in range(steps)]
+    arguments = [(Sample(PERIOD * k, here[k].q, here[k].v), aims[k]) for k in range(steps)]
+    times = []
+    for _ in range(max(1, calls // steps)):
+        guarded.begin(at_rest.q, aims[0])
+        times.append(_times(guarded.step, arguments, steps, warm=0))
+    law = float(np.median(_step_times(guarded.law, _states(robot), calls)))
+    p50, p99 = np.percentile(times, [50.0, 99.0]).tolist()
+    return Row("guarded step", robot.name, "nbs", {"p50_us": p50, "p99_us": p99, "law_us": law, "guard_us": p50 - law})
 
 
 def _without_networks(robot: Robot) -> NeuralBackstepping:
@@ -333,10 +350,10 @@ def _step_times(controller: Controller, states: list[tuple[np.ndarray, ...]], ca
     return _times(step, [(q, v, Reference(*r)) for q, v, *r in states], calls)
 
 
-def _times(function: Callable[..., Any], arguments: list[Any], calls: int) -> np.ndarray:
-    """Wall times of single calls [µs], the arguments taken in turn."""
+def _times(function: Callable[..., Any], arguments: list[Any], calls: int, warm: int = 200) -> np.ndarray:
+    """Wall times of single calls [µs], the arguments taken in turn, after some that are not counted."""
     times = np.empty(calls)
-    for k in range(min(calls, 200)):
+    for k in range(min(calls, warm)):
         function(*arguments[k % len(arguments)])
     collecting = gc.isenabled()
     gc.disable()

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from nbs_pin.controllers.controller import Controller
 
 COMPILER = "gcc"
-FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno")
+FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast")
 """Those of the package's Makefile."""
 _TIMED = """
 #define _POSIX_C_SOURCE 200809L

@@ -35,6 +35,7 @@ _COLUMNS = {
         "python\n÷ it": "python_over_c",
         "code, data\n[B]": "bytes",
     },
+    "guarded step": {"p50\n[µs]": "p50_us", "p99\n[µs]": "p99_us", "law\n[µs]": "law_us", "guard\n[µs]": "guard_us"},
     "plant step": {"p50\n[µs]": "p50_us"},
     "simulate": {"steps\nper s": "steps_per_s", "recorded\n[MB]": "recorded_MB"},
     "model torque": {"p50\n[µs]": "p50_us", "÷ pinocchio": "over_pinocchio"},

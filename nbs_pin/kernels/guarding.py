@@ -8,7 +8,7 @@ laid end to end, in the order of the names below.
 import math
 from collections import namedtuple
 
-from numba import boolean, float64, int64, void
+from numba import boolean, float64, int64
 
 from nbs_pin.kernels.jit import compile_for, exact_kernel, inlined
 from nbs_pin.kernels.records import Vec
@@ -31,6 +31,8 @@ EFFORT, STEP, REACH, SPEED, ERROR, PUSH, DAMPING, RESOLUTION, WRAPS, LOWER, UPPE
 (Q, V, Q_REF, V_REF, TAU, GRAVITY, STALE, MOVED, ALONG, SQUARE, SIDE, ROOM, PEAK, READ, AWAY,
  ROWS) = range(16)  # fmt: skip
 """Vectors of the state, and how many. While braking, Q and V are what is believed, and READ was read last."""
+SEEN_Q, SEEN_V, AIM_Q, AIM_V, AIM_A, OUTSIDE, AHEAD_Q, AHEAD_V, KEPT = range(9)
+"""Vectors of a record, and how many: what was given, and where the arm is when the reference is."""
 
 Part = namedtuple("Part", "x rows")
 """Numbers and vectors, of the configuration or the state."""
@@ -46,7 +48,8 @@ _VEC = float64[::1]
 def compile_guarding() -> None:
     """Compile the entry points for float64, so that no first call waits for the compiler."""
     compile_for(admit, int64(_VEC, _VEC, float64, boolean, boolean, *[_VEC] * 5))
-    compile_for(release, void(*[_VEC] * 4, int64))
+    compile_for(take, int64(_VEC, _VEC, float64, boolean, boolean, *[_VEC] * 7))
+    compile_for(release, int64(*[_VEC] * 4, int64))
 
 
 @inlined
@@ -270,6 +273,44 @@ def admit(
 
 
 @inlined
+def _write(x: Vec, record: Vec, which: int, n: int) -> None:
+    """A vector of a record; not numbers where x is none of n."""
+    for i in range(n):
+        record[which * n + i] = x[i] if len(x) == n else math.nan
+
+
+@exact_kernel
+def take(
+    config: Vec,
+    state: Vec,
+    t: float,
+    fresh: bool,
+    overrun: bool,
+    q: Vec,
+    v: Vec,
+    q_ref: Vec,
+    v_ref: Vec,
+    a_ref: Vec,
+    external: Vec,
+    record: Vec,
+) -> int:
+    """`admit`, with a copy of all that is given, and of q and v moved on by LEAD with a_ref, → record (KEPT n,)."""
+    n = (len(config) - NUMBERS) // VECTORS
+    lead = config[LEAD]
+    _write(q, record, SEEN_Q, n)
+    _write(v, record, SEEN_V, n)
+    _write(q_ref, record, AIM_Q, n)
+    _write(v_ref, record, AIM_V, n)
+    _write(a_ref, record, AIM_A, n)
+    _write(external, record, OUTSIDE, n)
+    for i in range(n):
+        speed, change = record[SEEN_V * n + i], lead * record[AIM_A * n + i]
+        record[AHEAD_Q * n + i] = record[SEEN_Q * n + i] + lead * (speed + 0.5 * change)
+        record[AHEAD_V * n + i] = speed + change
+    return admit(config, state, t, fresh, overrun, q, v, q_ref, v_ref, external)
+
+
+@inlined
 def _swings(command: Vec, s: Part, c: Part) -> None:
     """Count joints whose torque goes from one limit to the other; the count fades in a tenth of a second."""
     found = 0.0
@@ -296,8 +337,8 @@ def _wanted(i: int, command: Vec, s: Part, c: Part) -> float:
 
 
 @exact_kernel
-def release(config: Vec, state: Vec, command: Vec, gravity: Vec, fault: int) -> None:
-    """The torque that may be sent → the vector TAU of the state.
+def release(config: Vec, state: Vec, command: Vec, gravity: Vec, fault: int) -> int:
+    """The torque that may be sent → the vector TAU of the state; returns the mode after it.
 
     Args:
         config: as in `admit`.
@@ -337,3 +378,4 @@ def release(config: Vec, state: Vec, command: Vec, gravity: Vec, fault: int) -> 
     state[QUIET] = state[QUIET] + 1.0 if state[TROUBLE] == 0.0 else 0.0
     if state[MODE] != STOPPED:
         state[MODE] = DEGRADED if state[QUIET] < config[RECOVERY] else OK
+    return int(state[MODE])

@@ -20,6 +20,7 @@ from nbs_pin.controllers.controller import CONTROLLER, Controller, MemorylessCon
 from nbs_pin.dynamics.momentum_observer import OBSERVER, MomentumObserver
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.kernels import guarding as at
+from nbs_pin.kernels.jit import NOT_TAKEN
 from nbs_pin.robots.robot import ARM, Robot
 from nbs_pin.runtime.guard import Counters, Fault, Guard, Mode
 from nbs_pin.runtime.outside import Outside
@@ -174,6 +175,9 @@ class Guarded:
         self.robot, self.lead = robot, 0.5 * self.guard.period if lookahead is None else lookahead
         self._model, self._using = PinocchioDynamics(robot), threading.Lock()
         self._unknown, self._nothing = np.full(robot.nv, np.nan), np.zeros(robot.nv)
+        self._rows = [slice(k * robot.nv, (k + 1) * robot.nv) for k in range(at.KEPT)]
+        self._kept = at.KEPT * robot.nv
+        self._ahead_q, self._ahead_v = self._rows[at.AHEAD_Q], self._rows[at.AHEAD_V]
         self._config = self.guard.config.copy()
         self._config[at.LEAD] = self.lead
         self._every = max(1, round(PROBE / self.guard.period))
@@ -199,7 +203,8 @@ class Guarded:
         now = wanted - self.lead * vector_of("aim.v", aim.v, n, "rad/s")  # the aim is that of a moment later
         self._state = self.guard.begin(at_rest, now, self._model.gravity(at_rest))
         self._memory, self._count, self.report = self.law.initial_memory(at_rest), 0, None
-        self._seen: deque[Seen] = deque(maxlen=LAST)
+        self._sent = self.guard.vector(self._state, at.TAU)
+        self._seen: deque[tuple[Sample, np.ndarray, JointArray]] = deque(maxlen=LAST)
         if self._outside is not None:
             self._outside.begin()
 
@@ -218,12 +223,13 @@ class Guarded:
     @property
     def tau(self) -> JointArray:
         """The torque that was sent last [N·m]; before the first, the one that holds the arm."""
-        return self.guard.vector(self.state, at.TAU).copy()
+        _ = self.state
+        return self._sent.copy()
 
     @property
     def seen(self) -> Seen:
         """What came in last, as numbers, and what was sent for it."""
-        return self._seen[-1]
+        return self._shown(*self._seen[-1])
 
     def gravity(self, q: JointArray) -> JointArray:
         """G(q) by the guard's model [N·m]."""
@@ -246,7 +252,7 @@ class Guarded:
         Raises:
             ArgumentError: Before `begin`, and if another thread is in it.
         """
-        if not self._using.acquire(blocking=False):
+        if not self._using.acquire(False):
             raise ArgumentError("a Guarded is being used by another thread; give every thread its own.")
         try:
             return self._step(sample, aim, overrun, stop)
@@ -254,58 +260,73 @@ class Guarded:
             self._using.release()
 
     def _step(self, sample: Sample, aim: Reference, overrun: bool, stop: bool) -> JointArray:
-        state, config = self.state, self._config
-        sample, aim = self._numbers(sample), Reference(*map(self._vector, aim))
-        watched = self._outside if sample.external is None and sample.fresh and state[at.MODE] < at.STOPPED else None
-        if watched is not None:
+        state, config, watched = self.state, self._config, None
+        if self._outside is not None and sample.external is None and sample.fresh and state[at.MODE] < at.STOPPED:
+            watched, sample = self._outside, self._numbers(sample)
             sent = self.guard.vector(state, at.TAU)
             sample = sample._replace(external=watched.seen(sample.t, sample.q, sample.v, sent))
-        external = self._nothing if sample.external is None else sample.external
-        fault, trace = Fault.ARM if sample.fault else Fault.REQUESTED if stop else Fault.NONE, ""
-        seen = sample.q, sample.v, aim.q, aim.v, external
-        action = at.admit(config, state, sample.t, sample.fresh, bool(overrun), *seen)
+        fault, trace = at.ARM if sample.fault else at.REQUESTED if stop else at.NONE, ""
+        action, record, aim = self._taken(sample, aim, overrun)
         if watched is not None and state[at.LOST] == 0.0:
             watched.keep()
         command, gravity = self._unknown, self._unknown
-        if action == at.COMPUTE and fault is Fault.NONE:
+        if action == at.COMPUTE and fault == at.NONE:
             try:
-                command = self._command(sample, aim)
-                if self._probed and self._count % self._every == 0 and not self._holds(aim.q):
-                    fault = Fault.MODEL
+                command = self._command(record, aim)
+                if self._probed and self._count % self._every == 0 and not self._holds(record[self._rows[at.AIM_Q]]):
+                    fault = at.MODEL
                 self._count += 1
             except Exception:  # a law may raise anything; its arm is stopped, and the report has the traceback
-                fault, trace = Fault.LAW, traceback.format_exc()
-        if self.guard.compensated or fault is not Fault.NONE or action >= at.BRAKE:
+                fault, trace = at.LAW, traceback.format_exc()
+        if self.guard.compensated or fault != at.NONE or action >= at.BRAKE:
             gravity = self._model.gravity(self.guard.vector(state, at.Q))
-        at.release(config, state, command, gravity, int(fault))
-        tau = self.tau
-        self._seen.append(Seen(sample, aim, tau))
-        if self.report is None and state[at.MODE] == at.STOPPED:
-            self.report = self._reported(sample, trace)
+        try:
+            mode = at.release(config, state, command, gravity, fault)
+        except NOT_TAKEN:
+            mode = at.release(config, state, self._vector(command), gravity, fault)
+        tau = self._sent.copy()
+        self._seen.append((sample, record, tau))
+        if mode == at.STOPPED and self.report is None:
+            self.report = self._reported(trace)
         return tau
 
+    def _taken(self, sample: Sample, aim: Reference, overrun: bool) -> tuple[int, np.ndarray, Reference]:
+        """What the guard says of a sample, and its record; the sample is used as it is where the kernel takes it."""
+        t, q, v, fresh, outside, _ = sample
+        q_ref, v_ref, a_ref = aim
+        config, state, record = self._config, self._state, np.empty(self._kept)
+        if outside is None:
+            outside = self._nothing
+        try:
+            action = at.take(config, state, t, fresh, overrun, q, v, q_ref, v_ref, a_ref, outside, record)
+        except NOT_TAKEN:  # lists, every second number of an array, text
+            q, v, q_ref, v_ref, a_ref, outside = map(self._vector, (q, v, q_ref, v_ref, a_ref, outside))
+            t, fresh, overrun, aim = _time(t), bool(fresh), bool(overrun), Reference(q_ref, v_ref, a_ref)
+            action = at.take(config, state, t, fresh, overrun, q, v, q_ref, v_ref, a_ref, outside, record)
+        return action, record, aim
+
     def _numbers(self, sample: Sample) -> Sample:
-        """A sample of its own, as the kernel takes it."""
-        t, external = _floats(sample.t), None if sample.external is None else self._vector(sample.external)
-        return Sample(
-            float(t) if t.ndim == 0 else np.nan,
-            self._vector(sample.q),
-            self._vector(sample.v),
-            bool(sample.fresh),
-            external,
-            sample.fault,
-        )
+        """A sample of its own."""
+        t, q, v = _time(sample.t), self._vector(sample.q), self._vector(sample.v)
+        return sample._replace(t=t, q=q, v=v, fresh=bool(sample.fresh))
+
+    def _shown(self, sample: Sample, record: np.ndarray, tau: JointArray) -> Seen:
+        """What came in and went out, from what is kept of it."""
+        q, v, *aim, outside, _, _ = (record[row] for row in self._rows)
+        external = None if sample.external is None else outside
+        return Seen(Sample(_time(sample.t), q, v, bool(sample.fresh), external, sample.fault), Reference(*aim), tau)
 
     def _vector(self, x: Any) -> JointArray:
         """A vector of its own; what is none of n numbers counts as not finite, which the guard judges."""
         vector = _floats(x)
         return vector if vector.shape == self._unknown.shape else self._unknown
 
-    def _command(self, sample: Sample, aim: Reference) -> JointArray:
-        lead, dv = self.lead, self.lead * aim.a
-        q, v = sample.q + lead * (sample.v + 0.5 * dv), sample.v + dv
+    def _command(self, record: np.ndarray, aim: Reference) -> Any:
+        if len(aim.a) != len(self._unknown):  # positions and velocities are looked at by the guard
+            return self._unknown
+        q, v = record[self._ahead_q], record[self._ahead_v]
         command, self._memory = self.law.step(self._memory, q, v, aim, self.guard.period)
-        return self._vector(command)
+        return command
 
     def _holds(self, q: JointArray) -> bool:
         """Whether the law, at rest where it wants to be, carries the arm."""
@@ -314,15 +335,16 @@ class Guarded:
         tolerance = np.maximum(_OF_GRAVITY * np.abs(gravity).max(), _OF_EFFORT * self.guard.effort_limit)
         return bool((np.abs(torque - gravity) <= tolerance).all())
 
-    def _reported(self, sample: Sample, trace: str) -> FaultReport:
-        code = Fault(int(self.state[at.CODE]))
+    def _reported(self, trace: str) -> FaultReport:
+        code, samples = Fault(int(self.state[at.CODE])), tuple(self._shown(*kept) for kept in self._seen)
+        sample = samples[-1].sample
         told = sample.fault if code is Fault.ARM else trace.strip().rsplit("\n", 1)[-1]
         if code is Fault.EXTERNAL and sample.external is not None:
             i = int(np.argmax(np.abs(sample.external) / self.guard.external_limit))
             pushed, unit = sample.external[i], units_of(self.robot.prismatic)[i].torque
             told = f"{self.robot.joint_names[i]}: {pushed:.3g} {unit}, limit {self.guard.external_limit[i]:.3g} {unit}"
         message = f"{code.sentence}{f' ({told})' if told else ''}"
-        return FaultReport(code, float(self.state[at.AT]), message, trace, self.counters, tuple(self._seen))
+        return FaultReport(code, float(self.state[at.AT]), message, trace, self.counters, samples)
 
 
 def _floats(x: Any) -> np.ndarray:
@@ -331,3 +353,9 @@ def _floats(x: Any) -> np.ndarray:
         return np.array(x, dtype=float)
     except (TypeError, ValueError):
         return np.array(np.nan)
+
+
+def _time(x: Any) -> float:
+    """A time as a number; NaN for what is none."""
+    t = _floats(x)
+    return float(t) if t.ndim == 0 else np.nan
