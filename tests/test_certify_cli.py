@@ -14,6 +14,7 @@ import nbs_pin as nbs
 from nbs_pin import cli
 from nbs_pin.base.records import Run
 from nbs_pin.base.versions import versions
+from nbs_pin.certificates import attack as attacking
 from nbs_pin.certificates.certify import certify
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.loads import gravity_error, payload, total
@@ -482,3 +483,38 @@ def test_climbing_poses_reach_beyond_sampled_ones():
     assert climbed.largest_found_kgm2 > sampled.largest_found_kgm2
     assert climbed.least_found_kgm2 < sampled.least_found_kgm2
     assert climbed.outside == sampled.outside == 0
+
+
+@pytest.mark.parametrize("rounds", [0, 1])
+def test_ctrl_c_in_the_search_keeps_the_bound_and_what_was_found(rounds, tmp_path, monkeypatch, capsys):
+    ascend, done = attacking._Ascent.ascend, []
+
+    def interrupted(self, *arguments, **settings):
+        if len(done) == rounds:
+            raise KeyboardInterrupt
+        done.append(self)
+        return ascend(self, *arguments, **settings)
+
+    monkeypatch.setattr(attacking._Ascent, "ascend", interrupted)
+    assert run(tmp_path, "two_link", "--disturbance", "5", "--attack") == 130
+    printed = capsys.readouterr()
+    assert "the search for the worst motion was interrupted" in " ".join(printed.out.split())
+    assert "interrupted" in printed.err
+    said, motion = summary(tmp_path), Run.load(tmp_path / "run.npz")
+    assert said["interrupted"]
+    error = np.linalg.norm(motion.q - motion.q_ref, axis=-1).max()
+    assert error == pytest.approx(said["figures"]["attack"]["error_rad"], rel=1e-9)
+    assert 0.0 < error < said["figures"]["certificate"]["error_rad"]
+
+
+def test_ctrl_c_before_any_motion_keeps_the_bound(tmp_path, monkeypatch):
+    def interrupted(*arguments, **settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(attacking.LoopEnsemble, "peaks", interrupted)
+    assert run(tmp_path, "two_link", "--disturbance", "5") == 130
+    said = summary(tmp_path)
+    assert said["interrupted"]
+    assert said["figures"]["attack"] is None
+    assert said["figures"]["certificate"]["label"] == "PROVED"
+    assert not (tmp_path / "run.npz").exists()

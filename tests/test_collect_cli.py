@@ -8,6 +8,7 @@ import nbs_pin as nbs
 from nbs_pin import cli
 from nbs_pin.base.versions import versions
 from nbs_pin.commands import collect as collecting
+from nbs_pin.identification import collect as recording
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import load_dataset
 from nbs_pin.identification.measurement import Noise
@@ -92,3 +93,32 @@ def test_the_default_folder_names_the_arm(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert cli.main(["collect", "double_pendulum", "--recipe", "uniform", "--samples", "3"]) == 0
     assert load_dataset(tmp_path / "out" / "collect-double_pendulum" / "data.npz").nv == 2
+
+
+def test_ctrl_c_keeps_the_whole_trajectories(tmp_path, monkeypatch, capsys):
+    whole = collected(tmp_path / "whole", "")
+    read, calls = recording._Instruments.read, []
+
+    def interrupted(self, bench, generator, count):
+        if len(calls) == stop:
+            raise KeyboardInterrupt
+        calls.append(count)
+        return read(self, bench, generator, count)
+
+    monkeypatch.setattr(recording._Instruments, "read", interrupted)
+    stop = 1
+    assert run(tmp_path / "part") == 130
+    printed = capsys.readouterr()
+    assert "interrupted before its end" in printed.out
+    assert "interrupted" in printed.err
+    part = load_dataset(tmp_path / "part" / "data.npz")
+    assert len(part) == 40
+    for name in ("t", "q", "v", "a", "tau"):
+        assert_array_equal(getattr(part, name), getattr(whole, name)[:40])
+    assert (part.about["interrupted"], whole.about["interrupted"]) == (True, False)
+    assert summary(tmp_path / "part")["interrupted"]
+    stop, calls[:] = 0, []
+    assert run(tmp_path / "none") == 130
+    assert not (tmp_path / "none" / "data.npz").exists()
+    monkeypatch.undo()
+    assert run(tmp_path / "part") == 2  # a part is not the result of the command

@@ -50,6 +50,8 @@ class Certified:
     watched: Monitored | None = None
     """The given run checked against the certificate."""
     proposal: Proposal | None = None
+    interrupted: bool = False
+    """Whether Ctrl-C ended the search for the worst motion early."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +138,15 @@ def assess(
             uncertainty=task.uncertainty,
         )
     watched = None if run is None else monitor(run, certificate)
-    found, diverged = _attacked(certificate, task, thorough, progress)
+    try:
+        found, diverged = _attacked(certificate, task, thorough, progress)
+        interrupted = found is not None and found.interrupted
+    except KeyboardInterrupt:  # the certificate needs no search
+        found, diverged, interrupted = None, "", True
     exceeding = None
     if found is not None and exceeds(found, certificate):
         exceeding = monitor(found.run, certificate)
-    return Certified(certificate, found, thorough, diverged, exceeding, watched, proposal)
+    return Certified(certificate, found, thorough, diverged, exceeding, watched, proposal, interrupted)
 
 
 def exceeds(found: Attack, certificate: Certificate) -> bool:

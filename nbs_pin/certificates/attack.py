@@ -57,6 +57,8 @@ class Attack(Shown):
     """Length of every motion [s]."""
     period: float
     """Control period [s]."""
+    interrupted: bool = False
+    """Whether Ctrl-C ended the ascent before its last round."""
 
     def _facts(self) -> Iterable[str]:
         unit = several(of.position for of in self.run.units)
@@ -110,6 +112,7 @@ def attack(
     Raises:
         ArgumentError: If an argument does not fit, or the law has no model for the gradients to pass through.
         SimulationDiverged: If a motion diverges.
+        KeyboardInterrupt: If Ctrl-C comes before the gradients are followed; later it ends the search.
 
     Example:
         >>> import nbs_pin as nbs
@@ -123,12 +126,15 @@ def attack(
     names, motion, waves = _waves(ensemble, admissible, rng)
     peaks = ensemble.peaks(motion, waves, progress)
     pack = _Ascent.of(motion, waves, peaks, starts)
-    history = [float(peaks.error.max())]
+    history, interrupted = [float(peaks.error.max())], False
     arm = ensemble.loop.plant.robot
     unit = several(units("position", [False] if arm is None else arm.prismatic))
-    for k in tracked(range(rounds), lambda: f"attack: {history[-1]:.4g} {unit} so far", progress):
-        pack = pack.ascend(ensemble, admissible, at_end=k % 2 == 0)
-        history.append(max(history[-1], float(pack.peaks.error.max())))
+    try:
+        for k in tracked(range(rounds), lambda: f"attack: {history[-1]:.4g} {unit} so far", progress):
+            pack = pack.ascend(ensemble, admissible, at_end=k % 2 == 0)
+            history.append(max(history[-1], float(pack.peaks.error.max())))
+    except KeyboardInterrupt:  # what was found until then is a motion as any other
+        interrupted = True
     worst = int(pack.peaks.error.argmax())
     ascent = "bang-bang ascent" if admissible.radius is None else "steepest ascent"
     found_by = ascent if pack.ascended[worst] else names[pack.origin[worst]]
@@ -141,6 +147,7 @@ def attack(
         history=np.array(history),
         duration=ensemble.loop.steps * period,
         period=period,
+        interrupted=interrupted,
     )
 
 

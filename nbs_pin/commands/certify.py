@@ -43,7 +43,10 @@ DESIGNED, CERTIFICATE, ARM = "controller.nbs", "certificate.json", "arm.urdf"
 
 
 def run(options: Certify, console: Console, notes: Console) -> int:
-    """Certify, write and print, and return the exit code; raises NbsPinError or OSError."""
+    """Certify, write and print, and return the exit code.
+
+    Raises NbsPinError, OSError, and KeyboardInterrupt after an early end.
+    """
     if options.wanted is not None and options.controller.endswith(SAVED):
         raise OptionError(f"--wanted designs a controller, and '{options.controller}' is one; give an arm.")
     with notes.status(f"loading {options.controller}"):
@@ -57,7 +60,10 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         watched = None if options.monitor is None else Run.load(options.monitor)
     results = Results.of(options, robot.name, robot, against=robot.source)
     results = results.check(
-        (*FILES, MONITOR, WATCHED, DESIGNED, CERTIFICATE, ARM), options.force, whose="another certificate"
+        (*FILES, MONITOR, WATCHED, DESIGNED, CERTIFICATE, ARM),
+        options.force,
+        whole={"interrupted": False},
+        whose="another certificate",
     )
     with results.made() as folder:
         proposal = None
@@ -69,7 +75,11 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         with notes.status(f"drawing the picture into {folder}"):
             found, written = write_results(result, results, as_file=options.json)
     print_certificate(console, found, verbose=options.verbose)
+    if result.interrupted:
+        console.print("the search for the worst motion was interrupted; the bound is whole", style="yellow")
     results.show(console, written, *(("verify", folder / CERTIFICATE) if options.json else ()))
+    if result.interrupted:
+        raise KeyboardInterrupt
     return NO_PROMISE if result.certificate.void else 0
 
 
@@ -220,7 +230,8 @@ def write_results(result: Certified, results: Results, *, as_file: bool = False)
     given, folder = results.facts["settings"], results.folder
     saved = given["controller"].endswith(SAVED)
     found = {"law": Path(given["controller"]).name if saved else "a law built for it"} | figures(result)
-    with results.replaced((FILES[1], WATCHED, DESIGNED, CERTIFICATE, ARM, FILES[0], MONITOR), found) as draft:
+    names = (FILES[1], WATCHED, DESIGNED, CERTIFICATE, ARM, FILES[0], MONITOR)
+    with results.replaced(names, found, interrupted=result.interrupted) as draft:
         if result.attack is not None:
             result.attack.run.save(draft / FILES[1])
         if result.watched is not None:

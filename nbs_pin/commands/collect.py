@@ -29,13 +29,13 @@ _AT_LIMIT = 1.0 - 1e-9
 
 
 def run(options: Collect, console: Console, notes: Console) -> None:
-    """Collect, write and print; raises NbsPinError or OSError."""
+    """Collect, write and print; raises NbsPinError, OSError, and KeyboardInterrupt after an early end."""
     with notes.status(f"loading {options.robot}"):
         robot = load_robot(options.robot, **options.arm.given())
     if options.friction and not (robot.damping.any() or robot.friction.any()):
         raise OptionError(f"--friction was given, but the URDF of {robot.name} states none; omit it.")
     results = Results.of(options, robot.name, robot, robot=robot.source)
-    results = results.check(FILES, options.force, whose="other data")
+    results = results.check(FILES, options.force, whole={"interrupted": False}, whose="other data")
     given = keywords(options, collect) | {
         "noise": Noise(0.0 if options.encoder_bits is None else 2.0**-options.encoder_bits, options.torque_noise),
         "acceleration": "differentiated" if options.differentiated else None,
@@ -44,16 +44,17 @@ def run(options: Collect, console: Console, notes: Console) -> None:
     with results.made() as folder:
         data = collect(robot, options.recipe, options.samples, options.seed, **given, progress=True)
         with notes.status(f"writing into {folder}"):
-            found = figures(data, robot)
-            with results.replaced(FILES, found) as draft:
+            found, interrupted = figures(data, robot), bool(data.about["interrupted"])
+            with results.replaced(FILES, found, interrupted=interrupted) as draft:
                 data.save(draft / FILES[0])
             with drawing(folder / FILES[1]) as path:
                 settings = chosen(results.facts["settings"], "torque_noise", "encoder_bits", "friction", "seed")
-                plot_coverage(
-                    data, path, robot, Heading(f"{robot.name}: data, {options.recipe}", settings, verdict_of(found))
-                )
-    _print(console, f"{robot.name}, {options.recipe}", found, verbose=options.verbose)
+                verdict = verdict_of(found, interrupted=interrupted)
+                plot_coverage(data, path, robot, Heading(f"{robot.name}: data, {options.recipe}", settings, verdict))
+    _print(console, f"{robot.name}, {options.recipe}", found, interrupted, verbose=options.verbose)
     results.show(console, FILES, "learn", results.folder / FILES[0])
+    if interrupted:
+        raise KeyboardInterrupt
 
 
 def figures(data: Dataset, robot: Robot) -> dict[str, Any]:
@@ -116,7 +117,7 @@ def _rms(x: np.ndarray) -> list[float]:
     return np.sqrt((x**2).mean(axis=0)).tolist()
 
 
-def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bool) -> None:
+def _print(console: Console, title: str, figures: dict[str, Any], interrupted: bool, *, verbose: bool) -> None:
     """Print what was recorded, and a row per joint; `figures` from the function of that name."""
     names = {
         "q from": ("q_least_rad", "position"),
@@ -132,5 +133,5 @@ def _print(console: Console, title: str, figures: dict[str, Any], *, verbose: bo
     shown = table(title, *(heading for heading, _ in columns))
     for joint, *row in zip(figures["joints"], *(cells for _, cells in columns), strict=True):
         shown.add_row(Text(joint), *row)
-    verdict = verdict_of(figures)
+    verdict = verdict_of(figures, interrupted=interrupted)
     tell(console, f"{title}: {verdict.said}", verdict.more, [shown], verbose=verbose)

@@ -95,6 +95,8 @@ def collect(
         ArgumentError: If the recipe is unknown or a setting does not fit it.
         RobotError: If MuJoCo cannot build the arm.
         SimulationDiverged: If the simulated state is no longer finite.
+        KeyboardInterrupt: If Ctrl-C comes before there is a whole trajectory; later the whole ones are returned, with
+            "interrupted" in `Dataset.about`.
 
     Example:
         >>> import nbs_pin as nbs
@@ -106,12 +108,13 @@ def collect(
     acting = JointFriction.of(robot) if friction is True else friction or None
     counts, interval, stride = _parts(recipe, samples, sampling, duration, reference)
     generator, differentiated = np.random.default_rng(seed), acceleration == "differentiated" or noise.encoder > 0.0
-    bench = _bench(recipe, robot, acting, speed, reference)
+    bench, interrupted = _bench(recipe, robot, acting, speed, reference), False
     if recipe == "uniform":
         counts, columns = [1] * samples, _states(bench, samples, speed, generator)
     else:
         instruments = _Instruments(stride, noise, differentiated)
-        seen = [instruments.read(bench, generator, k) for k in tracked(counts, "collecting data", progress)]
+        seen, interrupted = _readings(instruments, bench, generator, counts, progress)
+        counts = counts[: len(seen)]
         columns = tuple(np.concatenate(parts) for parts in zip(*seen, strict=True))
     about: dict[str, Any] = {
         "recipe": recipe,
@@ -121,12 +124,27 @@ def collect(
         "friction": acting and {"viscous": acting.viscous.tolist(), "coulomb": acting.coulomb.tolist()},
         "sampling": None if recipe == "uniform" else interval,
         "speed": speed,
+        "interrupted": interrupted,
         "robot": {"source": robot.source, "sha256": robot.sha256, "options": robot.options},
     }
     t, q, v, a, tau = columns
     tau = tau + noise.torque * generator.standard_normal(tau.shape)
     of = np.repeat(np.arange(len(counts)), counts)
     return Dataset(q, v, a, tau, t, of, robot.parents, robot.prismatic, robot.name, about)
+
+
+def _readings(
+    instruments: "_Instruments", bench: "_Bench", generator: np.random.Generator, counts: list[int], progress: bool
+) -> tuple[list[tuple[np.ndarray, ...]], bool]:
+    """What is read of every trajectory, and whether Ctrl-C ended the collection before the last."""
+    seen: list[tuple[np.ndarray, ...]] = []
+    try:
+        for k in tracked(counts, "collecting data", progress):
+            seen.append(instruments.read(bench, generator, k))
+    except KeyboardInterrupt:
+        if not seen:
+            raise
+    return seen, len(seen) < len(counts)
 
 
 class _Idle(MemorylessController):

@@ -105,11 +105,11 @@ def picture(
 
 
 def _lay_out(figure: Figure) -> None:
-    """Arrange the axes, as savefig would by drawing the figure once in vain."""
+    """Arrange the axes once; with a layout engine, "none" included, savefig would draw the figure once in vain."""
     engine = figure.get_layout_engine()
     assert engine is not None
     engine.execute(figure)
-    figure.set_layout_engine("none")
+    figure.set_layout_engine(None)
 
 
 def _head(figure: Figure, heading: Heading) -> None:

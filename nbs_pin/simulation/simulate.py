@@ -10,7 +10,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import joblib
 import numpy as np
 
 from nbs_pin.base.arguments import DURATION, MOST_PERIODS, PERIOD, called, checked, count, flag, function, maybe, number
@@ -111,6 +110,8 @@ def simulate(
 
 def _shared(loop: "_Closed", reference: DesiredMotion, start: tuple[np.ndarray, np.ndarray], workers: int) -> Run:
     """The run of all starts, simulated in slices by several processes and joined along the first batch axis."""
+    import joblib  # takes a while, and one process does without
+
     q0, v0 = start
     if q0.ndim < 2:
         raise ArgumentError(f"workers share starts, but q0 has shape {q0.shape}; give q0 of shape (starts, ..., nv).")
