@@ -1,164 +1,245 @@
-"""The fair comparison: one budget for all, starts that nobody trained on, and no claim beyond the table."""
+"""The fair comparison: one budget for all, trials that nobody was tuned on, and no claim beyond the table."""
 
 import csv
 import json
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from nbs_pin.benchmarks import fair
-from nbs_pin.controllers.computed_torque import ComputedTorque
-from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.training.train import Training, train
+import nbs_pin as nbs
+from nbs_pin.benchmarks import fair, fair_tuning, real_arms
+from nbs_pin.benchmarks.fair_tuning import Budget
+from nbs_pin.benchmarks.real_arms import Figures, RealArm
+from nbs_pin.robots.places import tool_frame
+from nbs_pin.training.train import train
 
-SMALL = fair.Setting(
-    "two_link", 0.02, starts=2, checking=1, start_error=1.0, search=2, epochs=3, duration=0.4, judged=2.0
-)
+TINY = Budget(trials=2, rates=(0.1, 0.2), epochs=1, trained=0.02, evaluations=3, searched=0.05)
+SMALL = fair.Study(("ur5",), fair.FAMILIES[:1], TINY, held_out=2, judged=0.1)
+
+
+@pytest.fixture(scope="module")
+def ur5():
+    return RealArm.of("ur5", 0)
+
+
+@pytest.fixture(scope="module")
+def trials(ur5):
+    return ur5.trials(2, 0, 1)
 
 
 @pytest.fixture(scope="module")
 def rows():
-    return fair.compare_fairly([SMALL], held_out_starts=5)
+    return fair.rows_of(SMALL, "ur5", fair.FAMILIES[0], 0)
 
 
-def test_every_law_meets_every_reference_within_the_limits(rows):
-    assert [(r.frequency_rad_per_s, r.law) for r in rows] == [(w, law) for law in fair.LAWS for w in fair.FREQUENCIES]
-    for row in rows:
-        assert row.convergence_time_median_s <= row.convergence_time_worst_s
-        assert row.rms_torque_Nm > 0.0
-        assert row.peak_torque_Nm <= 100.0
-        assert 0.0 <= row.saturated_fraction <= 1.0
+@pytest.mark.parametrize("name", real_arms.LOADS)
+def test_the_true_arm_has_what_its_laws_are_not_told(name):
+    arm = RealArm.of(name, 3)
+    assert not np.concatenate([arm.told.armature, arm.told.friction, arm.told.damping]).any()
+    assert np.concatenate([arm.rotors, arm.friction.coulomb, arm.friction.viscous]).min() > 0.0
+    bare, loaded = arm.true(), arm.true(1.5, np.array([0.0, 0.02, 0.0]))
+    q = np.linspace(-0.5, 0.5, arm.told.nv)
+    told, true = (nbs.PinocchioDynamics(x).mass_matrix(q) for x in (arm.told, bare))
+    assert np.linalg.eigvalsh(true - np.diag(arm.rotors) - 0.95 * told).min() > -1e-9
+    assert np.linalg.eigvalsh(1.05 * told + np.diag(arm.rotors) - true).min() > -1e-9
+    masses = [sum(body.mass for body in list(x.model.inertias)[1:]) for x in (bare, loaded)]
+    assert masses[1] - masses[0] == pytest.approx(1.5, abs=1e-9)
+    np.testing.assert_array_equal(loaded.effort_limit, arm.told.effort_limit)
 
 
-@pytest.fixture
-def asked(monkeypatch):
-    """Every training that is asked for, and what came of it."""
-    asked = []
-
-    def noted(law, plant, references, **settings):
-        asked.append((law, repr(plant), references, settings, train(law, plant, references, **settings)))
-        return asked[-1][-1]
-
-    monkeypatch.setattr(fair, "train", noted)
-    return asked
+def test_fr3_is_that_of_its_description():
+    arm, described = RealArm.of("fr3", 0), nbs.load_robot("fr3")
+    np.testing.assert_array_equal(arm.rotors, described.armature)
+    np.testing.assert_array_equal(arm.friction.coulomb, described.friction)
 
 
-def score(training):
-    return training.held_out[training.best_epoch]
+def test_trials_of_judging_are_none_of_tuning(ur5, trials):
+    again, others = ur5.trials(2, 0, 1), ur5.trials(2, 0, 2)
+    for one, same in zip(trials, again, strict=True):
+        np.testing.assert_array_equal(one.start, same.start)
+        assert one.true.model.inertias[6].mass == same.true.model.inertias[6].mass
+    every = [*trials, *others]
+    loads = {round(trial.true.model.inertias[6].mass, 9) for trial in every}
+    assert len(loads) == len({trial.motion.frequency[0] for trial in every}) == len(every)
+    for trial in every:
+        assert (np.abs(trial.start - trial.motion(0.0).q) <= real_arms.AWAY).all()
+        assert 0.7 <= trial.friction.coulomb[0] / ur5.friction.coulomb[0] <= 1.3
 
 
-def test_one_budget_for_all(asked):
-    """Law by law the same words; only which rate goes on is the law's own."""
-    known = None
-    for name in fair.LAWS:
+def test_a_law_is_given_readings_and_their_differences():
+    class Noted(nbs.Controller):
+        nv, seen = 2, ()
+
+        def initial_memory(self, q):
+            return 0
+
+        def step(self, memory, q, v, reference, period):
+            self.seen = (*self.seen, (q, v))
+            return 0.0 * q, memory + 1
+
+    law, q = Noted(), np.array([[0.1, -0.2], [0.10011, -0.2], [0.10021, -0.2003]])
+    encoded = real_arms.Encoded(law, np.array([False, True]), encoder=2**-12)
+    memory = encoded.initial_memory(q[0])
+    for x in q:
+        _, memory = encoded.step(memory, x, np.full(2, np.nan), None, 0.001)
+    step = np.array([2.0 * np.pi, 1.0]) * 2**-12
+    read = np.array([x for x, _ in law.seen])
+    np.testing.assert_allclose(read / step, np.round(read / step), atol=1e-9)
+    assert (np.abs(read - q) <= 0.5 * step + 1e-15).all()
+    np.testing.assert_allclose([v for _, v in law.seen], np.diff(read, axis=0, prepend=read[:1]) / 0.001)
+    assert memory[1] == 3
+
+
+def test_a_law_that_diverges_has_no_error(trials):
+    wild = nbs.ComputedTorque(nbs.PinocchioDynamics(trials[0].arm.told), kp=1e9, kd=1e6)
+    figures = real_arms.attempt(wild, replace(trials[0], true=trials[0].true.with_effort_limit(1e9)), 0.3)
+    assert figures.error == math.inf
+    assert fair_tuning.cost(figures) == fair_tuning.cost(figures._replace(error=math.nan)) == 20.0
+
+
+def test_roughness_is_charged_above_its_leave_alone():
+    calm = Figures(2e-3, 0.0, 0.0, 0.9 * fair_tuning.ROUGH, 0.0)
+    assert fair_tuning.cost(calm) == pytest.approx(math.log(2.0))
+    rough = calm._replace(roughness=math.e * fair_tuning.ROUGH)
+    assert fair_tuning.cost(rough) == pytest.approx(math.log(2.0) + 3.0)
+
+
+@pytest.mark.parametrize("change", [0.1, 5.0])
+def test_training_minimises_the_cost_of_the_search(change):
+    """One joint that moves is the worst one, so both are the same number."""
+    limit, rows = np.array([80.0, 10.0]), 20
+    z1, tau = torch.zeros(3, rows, 2), torch.zeros(3, rows, 2)
+    z1[:, rows // 2 :, 0], z1[:, : rows // 2] = 0.004, 1.0
+    tau[:, ::2, 1] = change
+    price = fair_tuning.LateCost(limit)(z1, z1, tau).sum(dim=-1) * real_arms.PERIOD
+    same = fair_tuning.cost(Figures(0.004, 0.0, 0.0, change / 10.0, 0.0))
+    np.testing.assert_allclose(price.numpy(), same, rtol=1e-6)
+
+
+def test_factors_scale_all_joints_of_a_group(ur5):
+    for law, name in ((nbs.SlotineLi.for_robot(ur5.told), "gain"), (nbs.PD.for_robot(ur5.told), "kd")):
+        twice = fair_tuning.scaled(law, [1.0, 2.0])
+        np.testing.assert_allclose(getattr(twice, name), 2.0 * getattr(law, name))
+    law = nbs.NeuralBackstepping.for_robot(ur5.told, least_share=0.0)
+    other = fair_tuning.scaled(law, [2.0, 3.0, 5.0])
+    np.testing.assert_allclose(other.potential.stiffness.numpy(), 2.0 * law.potential.stiffness.numpy())
+    np.testing.assert_allclose(other.rate.numpy(), 3.0 * law.rate.numpy())
+    np.testing.assert_allclose(other.damping.floor.numpy(), 5.0 * law.damping.floor.numpy())
+    assert other.inertial_rate == pytest.approx(6.0 * law.inertial_rate)
+
+
+def test_the_search_keeps_the_best_within_its_evaluations(monkeypatch, trials):
+    made = []
+
+    def figures(law, trial, duration):
+        return Figures(1e-3 * math.exp((law - 0.4) ** 2), 0.0, 0.0, 0.0, 0.0)
+
+    monkeypatch.setattr(fair_tuning, "attempt", figures)
+    found = fair_tuning.searched(lambda x: made.append(x) or float(np.log(x[0])), 1, trials, Budget(evaluations=25))
+    assert len(made) <= 26
+    assert found.law == pytest.approx(0.4, abs=0.02)
+    assert found.factors == (pytest.approx(math.exp(0.4), rel=0.02),)
+
+
+def test_one_budget_for_all(monkeypatch, ur5):
+    """Every law is trained by the same words on the same plants and motions, and is searched as often."""
+    asked, tried = [], Counter()
+
+    def noted(law, plants, references, **settings):
+        described = ([repr(plant) for plant in plants], [m(0.3).q.tolist() for m in references])
+        asked.append((described, {k: v for k, v in settings.items() if k not in ("learning_rate", "cost")}))
+        return train(law, plants, references, **settings)
+
+    def figures(law, trial, duration):
+        tried[duration] += 1
+        return Figures(1e-3, 1e-3, 1e-3, 1e-3, 0.0)
+
+    def known(data, model, seed, *, robot, **_):
+        own = np.stack([body.toDynamicParameters() for body in list(robot.model.inertias)[1:]])
+        return nbs.IdentifiedDynamics(robot, own, friction=nbs.JointFriction(np.zeros(6), np.ones(6)))
+
+    monkeypatch.setattr(fair_tuning, "train", noted)
+    for module in (fair, fair_tuning):
+        monkeypatch.setattr(module, "attempt", figures)
+    monkeypatch.setattr(fair, "fit", known)
+    monkeypatch.setattr(fair, "collect", lambda *_, **__: None)
+    for family in fair.FAMILIES:
         asked.clear()
-        fair.tune(SMALL, name)
-        if name == "NBS, untrained":
-            assert not asked
-            continue
-        rates = [settings.pop("learning_rate") for *_, settings, _ in asked]
-        assert rates[:-1] == list(fair.LEARNING_RATES)
-        assert rates[-1] in fair.LEARNING_RATES
-        words = [(plant, settings) for _, plant, _, settings, _ in asked]
-        assert [w["epochs"] for _, w in words] == [SMALL.search] * len(fair.LEARNING_RATES) + [SMALL.epochs]
-        curves = [[reference(np.linspace(0.0, 1.0, 7)).q for reference in entry[2]] for entry in asked]
-        known = known or (words, curves)
-        assert words == known[0]
-        np.testing.assert_array_equal(curves, known[1])
+        tried.clear()
+        found = fair.rows_of(SMALL, "ur5", family, 0)
+        assert [row.law for row in found if row.cost is not None] == list(family.rows)
+        assert len(asked) == len(TINY.rates)
+        first = first if family is not fair.FAMILIES[0] else asked[0]
+        assert all(entry == first for entry in asked)
+        assert tried[TINY.searched] <= (TINY.evaluations + 2) * TINY.trials * len(family.rows)
+        assert tried[SMALL.judged] == SMALL.held_out * len(found)
 
 
-@pytest.mark.parametrize("law", ["PD+", "NBS, trained"])
-def test_the_best_learning_rate_goes_on_from_where_it_came(asked, law):
-    tuned = fair.tune(SMALL, law)
-    *searched, longer = (entry[-1] for entry in asked)
-    best = int(np.argmin([score(training) for training in searched]))
-    assert tuned.learning_rate == fair.LEARNING_RATES[best] == asked[-1][3]["learning_rate"]
-    assert asked[-1][0] is searched[best].controller
-    assert longer.held_out[0] == pytest.approx(score(searched[best]), rel=1e-12)
-    assert score(tuned.training) == min(score(searched[best]), score(longer)) < searched[0].held_out[0]
-
-
-def test_a_longer_training_that_betters_nothing_is_not_taken(monkeypatch):
-    law = ComputedTorque(PinocchioDynamics(SMALL.robot()), kp=60.0, kd=16.0)
-
-    def given(law, *_, epochs, learning_rate, **__):
-        held_out = np.array([1.0, 2.0 if epochs == SMALL.epochs else learning_rate])
-        return Training(law, held_out, held_out, int(held_out.argmin()), "epochs", 0.0)
-
-    monkeypatch.setattr(fair, "train", given)
-    monkeypatch.setattr(fair, "build_law", lambda *_, **__: law)
-    tuned = fair.tune(SMALL, "computed torque")
-    assert tuned.learning_rate == score(tuned.training) == min(fair.LEARNING_RATES)
-
-
-def test_ctrl_c_ends_the_comparison_and_not_one_tuning(monkeypatch):
-    def interrupted(*arguments, **settings):
-        return replace(train(*arguments, **settings | {"epochs": 1}), stopped="interrupted")
-
-    monkeypatch.setattr(fair, "train", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        fair.compare_fairly([SMALL], held_out_starts=2)
-
-
-def test_a_law_that_diverges_is_not_converged():
-    law = fair.tune(SMALL, "NBS, untrained").law
-    wild = ComputedTorque(law.dynamics, kp=1e6, kd=1e3)
-    calm = fair.judge(SMALL, "calm", law, count=3, seed=0)
-    assert all(math.isfinite(row.convergence_time_worst_s) for row in calm)
-    assert not math.isfinite(
-        fair.judge(replace(SMALL, judged=0.2), "wild", wild, count=3, seed=0)[0].convergence_time_worst_s
-    )
+def test_every_row_is_judged_and_as_it_comes_is_not_tuned(rows):
+    assert [row.law for row in rows] == [fair.AS_IT_COMES, *fair.FAMILIES[0].rows]
+    assert [row.cost is None for row in rows] == [True, False, False, False]
+    for row in rows:
+        assert 0.0 < row.error_median_rad <= row.error_worst_rad
+        assert row.error_median_rad <= row.peak_median_rad
+        assert row.roughness_median > 0.0
+        assert 0.0 <= row.saturated_mean <= 1.0
+        assert len(row.factors) == {fair.AS_IT_COMES: 0, "NBS": 3}.get(row.law, 4)
 
 
 def test_the_page_the_csv_and_the_figures_carry_one_table(rows, monkeypatch, tmp_path):
-    monkeypatch.setattr(fair, "compare_fairly", lambda *_, **__: rows)
-    sections = fair.fair_part(tmp_path, 0, False, (SMALL,))
-    page = "\n".join(section.markdown for section in sections)
+    monkeypatch.setattr(fair, "compare_fairly", lambda *_, **__: iter([rows]))
+    (section,) = fair.fair_part(tmp_path, 0, False, SMALL)
     with (tmp_path / "fair.csv").open() as file:
         written = list(csv.DictReader(file))
-    tables = "".join(section.markdown for section in sections[1:])
-    assert len(written) == len(rows) == tables.count("\n| ") - 2 - len(fair.LAWS)
-    assert tables.count(f"| {rows[3].learning_rate:g} | {rows[3].checking_cost:.4f} |") >= 1
-    assert all(row.checking_cost_tuned <= row.checking_cost for row in rows if row.law != "NBS, untrained")
+    assert len(written) == len(rows) == section.markdown.count("\n| ") - 2
     for row, entry in zip(rows, written, strict=True):
-        assert float(entry["convergence_time_median_s"]) == row.convergence_time_median_s
-        assert f"{row.steady_error_rad2:.1e} | {row.rms_torque_Nm:.1f} | {row.peak_torque_Nm:.1f} |" in page
-    best = min(r.convergence_time_median_s for r in rows if r.frequency_rad_per_s == 1.0)
-    assert f"20 ms, 1 rad/s: lowest median {best:.3f} s" in page
-    assert len(json.loads(json.dumps(sections[0].figures, allow_nan=False))["fair"]) == len(rows)
+        assert float(entry["error_median_rad"]) == row.error_median_rad
+        assert f"| {row.law} | {1e3 * row.error_median_rad:.3g} | {1e3 * row.error_worst_rad:.3g} |" in section.markdown
+    best = min(rows, key=lambda row: row.error_median_rad)
+    assert f"* ur5: lowest median error {1e3 * best.error_median_rad:.3g} mrad ({best.law})" in section.markdown
+    assert len(json.loads(json.dumps(section.figures, allow_nan=False))["fair"]) == len(rows)
     assert (tmp_path / "fair.png").stat().st_size > 10_000
 
 
-def test_the_protocol_is_made_from_the_settings(rows, monkeypatch):
-    odd = replace(SMALL, starts=17, checking=7, start_error=0.37, search=19, epochs=23, duration=0.43, judged=2.9)
-    monkeypatch.setattr(fair, "SETTINGS", (odd,))
-    said = fair._protocol(rows, seed=41)
-    assert "| two_link, 20 ms | 19 | 23 | 17 | 7 | 0.37 | 0.43 | 20 | 5 | 2.9 |" in said
-    assert "one seed (41)" in said
-    assert "at least 10 % of its S, Λ and D₀" in said
+def test_ctrl_c_keeps_the_rows_that_are_done(rows, monkeypatch, tmp_path):
+    def stopped(*_, **__):
+        yield rows
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fair, "compare_fairly", stopped)
+    sections = fair.fair_part(tmp_path, 0, False, SMALL)
+    assert "interrupted" in next(sections).title
+    with pytest.raises(KeyboardInterrupt):
+        next(sections)
+    assert (tmp_path / "fair.csv").read_text().count("\n") == len(rows) + 1
 
 
-@pytest.mark.parametrize(
-    ("second", "words"),
-    [
-        (0.5, "lowest median 0.500 s, shared by NBS, trained and PD+, less than one control period apart"),
-        (0.51, "(NBS, trained), then 0.510 s (PD+), less than one control period apart"),
-        (0.52, "(NBS, trained), then 0.520 s (PD+)."),
-        (math.inf, "(NBS, trained), then ∞ s (PD+)."),
-    ],
-)
-def test_a_lead_of_less_than_a_period_is_told(second, words):
-    ours = fair.Row("two_link", 0.02, 1.0, "NBS, trained", 0.5, 0.7, 1e-9, 90.0, 20.0, 0.1)
-    other = ours._replace(law="PD+", convergence_time_median_s=second)
-    told = fair._findings([other, ours] if second > 0.5 else [ours, other])
-    assert words in told
-    assert ", as it was built" in fair._findings([ours._replace(checking_cost=0.2, checking_cost_tuned=0.2)] * 2)
-    assert told.endswith("Trained NBS: median 0.500 s, worst start 0.700 s, steady error 1.0e-09 rad².")
+def test_ctrl_c_ends_the_comparison_and_not_one_tuning(monkeypatch, trials):
+    monkeypatch.setattr(fair_tuning, "train", lambda *a, **s: replace(train(*a, **s), stopped="interrupted"))
+    with pytest.raises(KeyboardInterrupt):
+        fair_tuning.trained(nbs.PD.for_robot(trials[0].arm.told), trials, TINY, 0)
 
 
-def test_no_law_is_first_where_none_converges():
-    row = fair.Row("two_link", 0.02, 1.0, "NBS, trained", math.inf, math.inf, math.nan, math.nan, math.nan, math.nan)
-    assert "no law converges from most starts. " in fair._findings([row, row._replace(law="PID")])
-    assert fair._tables([row]).count("not finite") == 4
+def test_the_protocol_is_made_from_the_settings():
+    odd = replace(SMALL, budget=TINY._replace(trials=17, epochs=23, evaluations=29), held_out=31, judged=2.9)
+    said = fair._protocol(odd, seed=41)
+    for words in ("on 17 trials", "0.1 and 0.2, 23 epochs", "29\nevaluations", "31 further trials of 2.9 s", "Seed 41"):
+        assert words in said
+
+
+def test_no_law_is_first_where_all_diverge(rows):
+    lost = [
+        row._replace(error_median_rad=math.inf, error_worst_rad=math.inf, roughness_median=math.inf) for row in rows
+    ]
+    assert "every law diverges in most trials. " in fair._findings(lost)
+    assert "| ∞ | ∞ |" in fair._tables(lost)
+
+
+def test_tools_are_where_the_loads_are(ur5, trials):
+    figures = real_arms.attempt(nbs.NeuralBackstepping.for_robot(ur5.told), trials[0], 0.1)
+    assert tool_frame(ur5.told) in ur5.told.frames
+    assert 0.0 < figures.tool < 0.5

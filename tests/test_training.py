@@ -366,3 +366,54 @@ def test_stage_costs_are_what_they_say():
     for bad in (lambda: TorqueAware(torch.ones(2), rate=-1.0), lambda: TimeOutside(0), lambda: TimeOutside(0.1, -1.0)):
         with pytest.raises(ArgumentError):
             bad()
+
+
+def heavier(mass):
+    return nbs.DynamicsPlant(nbs.PinocchioDynamics(ROBOT.with_payload("tip", mass)))
+
+
+BRIEF = {"starts": [[0.3, 0.2], [0.1, -0.4]], "duration": 0.1, "period": PERIOD, "epochs": 2}
+
+
+def test_several_plants_count_alike():
+    plants, law = [PLANT, heavier(2.0)], nbs.SlotineLi.for_robot(ROBOT, period=PERIOD)
+    both = nbs.train(law, plants, [REFERENCE], **BRIEF)
+    single = [nbs.train(law, plant, [REFERENCE], **BRIEF).history for plant in plants]
+    assert single[0][0] != pytest.approx(single[1][0], rel=1e-2)
+    assert both.history[0] == pytest.approx(0.5 * (single[0][0] + single[1][0]), rel=1e-12)
+    assert not np.allclose(both.controller.rate, nbs.train(law, PLANT, [REFERENCE], **BRIEF).controller.rate, rtol=1e-9)
+
+
+def test_a_training_on_several_plants_goes_on_with_these_alone(tmp_path):
+    law, file = nbs.PD.for_robot(ROBOT, period=PERIOD), tmp_path / "law.nbs"
+    task = {"starts": 2, "held_out": 1, "duration": 0.1, "period": PERIOD, "encoder": 2**-16}
+    plants = [PLANT, heavier(1.0)]
+    whole = nbs.train(law, plants, [REFERENCE], epochs=4, **task)
+    nbs.train(law, plants, [REFERENCE], epochs=4, checkpoint=file, **task)
+    again = nbs.train(law, plants, [REFERENCE], epochs=4, checkpoint=file, resume=True, **task)
+    np.testing.assert_array_equal(again.history, whole.history)
+    for other in ([PLANT, heavier(1.5)], [PLANT]):
+        with pytest.raises(ArgumentError, match="not a checkpoint of this training"):
+            nbs.train(law, other, [REFERENCE], epochs=4, checkpoint=file, resume=True, **task)
+
+
+def test_a_plant_without_derivatives_among_several_is_refused():
+    with pytest.raises(ArgumentError, match="has no derivatives"):
+        nbs.train(nbs.PD.for_robot(ROBOT), [PLANT, nbs.MujocoPlant(ROBOT)], [REFERENCE], starts=1)
+
+
+def test_encoders_disturb_a_training_as_they_disturb_the_law():
+    """The torque of the first instants is that of a law which reads encoders, up to products with the error."""
+    law, encoder = nbs.NeuralBackstepping.for_robot(ROBOT, period=PERIOD), 2**-12
+    loop = Loop.of(PLANT, 2, 0.05, PERIOD, plant_step=PERIOD, effort_limit=None, lookahead=0.0)
+    batch = Batch.of(loop, REFERENCE, [REFERENCE(0.0).q + np.array([0.1, -0.2])])
+    misread = batch.misread(encoder, np.random.default_rng(7))
+    error = 2.0 * np.pi * encoder * np.random.default_rng(7).uniform(-0.5, 0.5, (1, loop.steps, 2))[0]
+    motion = motions(law, misread)
+    q, v, command = (x[0].detach().numpy() for x in motion)
+    for k in range(loop.steps):
+        aim, rate = REFERENCE(k * PERIOD), (error[k] - (error[k - 1] if k else 0.0)) / PERIOD
+        exact = law.torque(q[k], v[k], *aim)
+        read = law.torque(q[k] + error[k], v[k] + rate, *aim)
+        assert np.linalg.norm(command[k] - read) < 0.05 * np.linalg.norm(read - exact)
+    np.testing.assert_array_equal(batch.misread(0.0, np.random.default_rng(7)).aims, batch.aims)

@@ -93,49 +93,38 @@ def _draw_errors(axes: Axes, runs: Mapping[str, Run]) -> None:
 
 
 def plot_comparison(rows: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
-    """Plot the convergence times of the fair comparison and write the picture (PNG); returns its path.
+    """Plot the errors of the fair comparison and write the picture (PNG); returns its path.
 
-    rows: `benchmarks.fair.Row` as dictionaries. There is a panel per arm and period, on a common time axis, with a dot
-    per law and reference at the median of the starts and a line to the worst one. A line of starts that do not converge
-    ends in an arrow at the right edge.
+    rows: `benchmarks.fair.Row` as dictionaries. There is a panel per arm, on a common axis, with a dot per law at the
+    median of the trials and a line to the worst one, which ends in an arrow at the right edge where that diverged.
     """
-    panels = list(dict.fromkeys((row["arm"], row["period_s"]) for row in rows))
-    times = np.array([[row["convergence_time_median_s"], row["convergence_time_worst_s"]] for row in rows])
-    seen = times[np.isfinite(times) & (times > 0.0)]
-    limits = 0.85 * seen.min(initial=1.0), 1.5 * seen.max(initial=1.0)
-    with picture(path, 11.0, 0.6 + 2.6 * math.ceil(len(panels) / 2)) as figure:
-        grid = figure.subplots(math.ceil(len(panels) / 2), min(2, len(panels)), squeeze=False).ravel()
-        for axes, panel in zip(grid, panels, strict=False):
-            _draw_comparison(axes, [row for row in rows if (row["arm"], row["period_s"]) == panel], limits)
-            axes.set_title(f"{panel[0]}, control at {1000 * panel[1]:g} ms", loc="left")
-        for axes in grid[-2:]:
-            axes.set_xlabel("time of convergence [s]: median (dot) to worst start (bar), never (arrow)")
-        handles, labels = grid[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), frameon=False)
+    arms = list(dict.fromkeys(row["arm"] for row in rows))
+    errors = 1e3 * np.array([[row["error_median_rad"], row["error_worst_rad"]] for row in rows])
+    seen = errors[np.isfinite(errors) & (errors > 0.0)]
+    limits = 0.7 * seen.min(initial=100.0), 1.5 * seen.max(initial=0.1)
+    with picture(path, 2.6 + 3.4 * len(arms), 1.0 + 0.26 * math.ceil(len(rows) / len(arms))) as figure:
+        grid = figure.subplots(1, len(arms), squeeze=False, sharey=True)[0]
+        for axes, arm in zip(grid, arms, strict=True):
+            _draw_comparison(axes, [row for row in rows if row["arm"] == arm], limits)
+            axes.set_title(arm, loc="left")
+            axes.set_xlabel("RMS error, worst joint [mrad]")
     return Path(path)
 
 
 def _draw_comparison(axes: Axes, rows: Sequence[Mapping[str, Any]], limits: tuple[float, float]) -> None:
-    laws = list(dict.fromkeys(row["law"] for row in rows))
-    frequencies = list(dict.fromkeys(row["frequency_rad_per_s"] for row in rows))
     edge = limits[1] / 1.08
-    for k, (frequency, colour) in enumerate(zip(frequencies, (TORQUE, ACTUAL, ERROR), strict=False)):
-        chosen = [row for row in rows if row["frequency_rad_per_s"] == frequency]
-        for row in chosen:
-            y = laws.index(row["law"]) + 0.24 * (k - 0.5 * (len(frequencies) - 1))
-            median, worst = row["convergence_time_median_s"], row["convergence_time_worst_s"]
-            axes.plot([min(median, edge), min(worst, edge)], [y, y], color=colour, linewidth=1.0, alpha=0.6)
-            axes.plot(min(worst, edge), y, "|" if math.isfinite(worst) else ">", color=colour, markersize=5)
-            if math.isfinite(median):
-                axes.plot(median, y, "o", color=colour, markersize=4.5)
-        axes.plot([], [], "o-", color=colour, markersize=4.5, linewidth=1.0, label=f"ω = {frequency:g} rad/s")
+    for y, row in enumerate(rows):
+        colour = ACTUAL if row["law"].startswith("NBS") else LIMIT
+        median, worst = 1e3 * row["error_median_rad"], 1e3 * row["error_worst_rad"]
+        axes.plot([min(median, edge), min(worst, edge)], [y, y], color=colour, linewidth=1.0, alpha=0.6)
+        axes.plot(min(worst, edge), y, "|" if math.isfinite(worst) else ">", color=colour, markersize=5)
+        if math.isfinite(median):
+            axes.plot(median, y, "o", color=colour, markersize=4.5)
     axes.set_xscale("log")
-    axes.set(xlim=limits, ylim=(len(laws) - 0.5, -0.5))
-    axes.set_yticks(range(len(laws)), laws)
+    axes.set(xlim=limits, ylim=(len(rows) - 0.5, -0.5))
+    axes.set_yticks(range(len(rows)), [row["law"] for row in rows])
     axes.grid(False, axis="y")
-    for boundary in range(1, len(laws)):
-        axes.axhline(boundary - 0.5, color=LIMIT, linewidth=0.4, alpha=0.5)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_locator(NullLocator())
 

@@ -83,6 +83,20 @@ class Batch:
         joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in batches]) for name in named}
         return replace(batches[0], **joined)
 
+    def misread(self, encoder: float, draw: np.random.Generator) -> "Batch":
+        """The motions with encoders of that step [shares of a turn, of 1 m] and differences of readings as velocities.
+
+        An error of the reading acts on the law as its negative does in the reference, up to products with the error in
+        the model's terms. Errors of rounding are independent, uniform and drawn once; the start is read exactly before.
+        """
+        robot, h = self.loop.plant.robot, self.loop.period
+        step = encoder * (2.0 * np.pi if robot is None else np.where(robot.prismatic, 1.0, 2.0 * np.pi))
+        error = step * draw.uniform(-0.5, 0.5, self.aims[:, :, 1].shape)
+        aims = self.aims.copy()
+        aims[:, :, 1] -= error
+        aims[:, :, 2] -= np.diff(error, axis=1, prepend=0.0) / h
+        return replace(self, aims=aims)
+
     def beginning(self) -> "Batch":
         """The first period of the first motion."""
         one = {name: getattr(self, name)[:1] for name in ("q0", "v0")}

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,21 +16,22 @@ _TYPED = ("epochs", "optimiser", "learning_rate", "period", "duration", "seed")
 """Settings that a message gives as they are typed, before and now."""
 
 
-def statement(controller: Any, training: Batch, held_out: Batch | None, costs: list[float], **settings: Any) -> Any:
+def statement(
+    controller: Any, training: Sequence[Batch], held_out: Sequence[Batch], costs: list[float], **settings: Any
+) -> Any:
     """What determines a training, as JSON can store it; arrays and the law by hash.
 
     Cost, regulariser, model and plant may be any callables; they are identified by the initial costs.
     Raises ArgumentError if the controller cannot be stored.
     """
-    loop = training.loop
-    batches = [batch for batch in (training, held_out) if batch is not None]
+    loop, batches = training[0].loop, [*training, *held_out]
     law, tensors = describe(controller)
     return {
         **settings,
         "period": loop.period,
         "duration": loop.steps * loop.period,
         "plant_step": loop.period / loop.substeps,
-        "plant": repr(loop.plant),
+        "plant": "; ".join(repr(batch.loop.plant) for batch in training),
         "effort_limit": _hash(loop.limit),
         "number": [len(batch.q0) for batch in batches],
         "law": _hash(json.dumps(law, sort_keys=True).encode(), *(x.detach().cpu().numpy() for x in tensors.values())),

@@ -17,6 +17,7 @@ from nbs_pin.base.arguments import (
     checked,
     choice,
     count,
+    either,
     flag,
     function,
     many,
@@ -41,13 +42,14 @@ __all__ = ["Regulariser", "Training", "train"]
 
 @checked(
     controller=CONTROLLER,
-    plant=PLANT,
+    plant=either(many(PLANT, 1, 1000, "plants"), PLANT),
     references=many(MOTION, 1, 100_000, "motions"),
     start_error=number(least=0.0, unit="rad"),
     duration=DURATION,
     period=PERIOD,
     plant_step=maybe(PERIOD),
     lookahead=maybe(number(least=0.0, most=1000.0, unit="s")),
+    encoder=number(least=0.0, below=0.5, unit="of a turn"),
     cost=maybe(function(3, "a cost, a function of error, its rate and torque, such as TorqueAware.for_robot(robot)")),
     regulariser=maybe(function(1, "a regulariser, a function of the controller, or None")),
     gains=flag,
@@ -63,7 +65,7 @@ __all__ = ["Regulariser", "Training", "train"]
 )
 def train(
     controller: Controller,
-    plant: Plant,
+    plant: Plant | Sequence[Plant],
     references: Sequence[DesiredMotion],
     *,
     starts: Any = 32,
@@ -75,6 +77,7 @@ def train(
     effort_limit: Any = None,
     lookahead: float | None = None,
     disturbance: Any = None,
+    encoder: float = 0.0,
     cost: StageCost | None = None,
     regulariser: Regulariser | None = None,
     gains: bool = True,
@@ -94,13 +97,16 @@ def train(
     (paper eq. (13), docs/theory.md §7). Ctrl-C ends the training and keeps the best epoch.
 
     Args:
-        plant: A `DynamicsPlant`.
+        plant: A `DynamicsPlant`, or several, such as one arm with other loads and friction: the law is trained for all
+            of them at once, and every motion is drawn for each.
         references: Desired motions, each followed from every start.
         starts: Configurations (starts, n) at rest, a pair (q0, v0), or the number of random starts per reference.
         held_out: As starts, only to choose the best epoch; None draws a quarter as many, or none if starts are given.
         start_error: Random starts are within ±start_error [rad] of the reference in each joint.
         plant_step: Plant step [s]; None is the period, unlike in `simulate`.
         disturbance: Constant torque [N·m], a number or (n,).
+        encoder: Step of the encoders as a share of a turn, such as 2**-18, with velocities as differences of their
+            readings; 0 for exact ones. Errors are drawn once (docs/theory.md §7).
         cost: l; None takes `TorqueAware` with the effort limits.
         regulariser: Cost of the parameters themselves, a function of the controller.
         gains: Whether gains, such as S, Λ and D₀, are trained as well, never below their least_share.
@@ -125,14 +131,21 @@ def train(
         raise ArgumentError(f"{type(controller).__name__} has no parameters to train; give one of the package's laws.")
     step = period if plant_step is None else plant_step
     settings = {"plant_step": step, "effort_limit": effort_limit, "lookahead": lookahead}
-    loop = Loop.of(plant, controller.nv, duration, period, **settings)
-    check_plant(loop)
-    training, checking = _batches(loop, references, starts, held_out, start_error, disturbance, seed)
+    plants = [plant] if isinstance(plant, Plant) else plant
+    loops = [Loop.of(x, controller.nv, duration, period, **settings) for x in plants]
+    draw, training, checking = np.random.default_rng(seed), [], []
+    for loop in loops:
+        check_plant(loop)
+        ours, others = _batches(loop, references, starts, held_out, start_error, disturbance, draw)
+        training.append(ours)
+        checking += [] if others is None else [others]
+    if encoder:
+        training, checking = ([x.misread(encoder, draw) for x in batches] for batches in (training, checking))
     task = Task(
         controller=copy.deepcopy(controller),
         training=training,
         held_out=checking,
-        cost=TorqueAware(torch.as_tensor(loop.limit)) if cost is None else cost,
+        cost=TorqueAware(torch.as_tensor(loops[0].limit)) if cost is None else cost,
         regulariser=regulariser,
         gains=gains,
         epochs=epochs,
@@ -140,18 +153,28 @@ def train(
         learning_rate=LEARNING_RATES.get(optimiser, 1.0) if learning_rate is None else learning_rate,
         patience=patience,
         seed=seed,
-        engine=engine_for(controller, loop) if engine is None else engine,
+        engine=_engine(controller, loops) if engine is None else engine,
         checkpoint=None if checkpoint is None else Path(checkpoint),
     )
     with one_thread():  # steps of a loop are small: threads of torch wait for each other longer than these take
         return Trainer(task, resume, progress).run(progress)
 
 
+def _engine(controller: Controller, loops: Sequence[Loop]) -> Engine:
+    """The fastest engine that runs all loops."""
+    return "kernels" if all(engine_for(controller, loop) == "kernels" for loop in loops) else "torch"
+
+
 def _batches(
-    loop: Loop, references: Sequence[DesiredMotion], starts: Any, held_out: Any, error: float, tau_d: Any, seed: int
+    loop: Loop,
+    references: Sequence[DesiredMotion],
+    starts: Any,
+    held_out: Any,
+    error: float,
+    tau_d: Any,
+    draw: np.random.Generator,
 ) -> tuple[Batch, Batch | None]:
-    """The training and the held-out motions."""
-    draw = np.random.default_rng(seed)
+    """The training and the held-out motions of one plant."""
     training = _motions(loop, references, starts, error, tau_d, draw)
     if held_out is None:
         number_of_starts = _count_of(starts)

@@ -3,7 +3,7 @@
 import copy
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -72,8 +72,10 @@ class Task:
     """Cost to minimise, and settings of the optimiser."""
 
     controller: Any
-    training: Batch
-    held_out: Batch | None
+    training: Sequence[Batch]
+    """The motions of training, one batch for every plant."""
+    held_out: Sequence[Batch]
+    """Likewise; empty without any."""
     cost: StageCost
     regulariser: Regulariser | None
     gains: bool
@@ -85,13 +87,13 @@ class Task:
     engine: Engine
     checkpoint: Path | None
 
-    def value(self, batch: Batch) -> torch.Tensor:
-        """Mean cost of the motions of a batch."""
+    def value(self, batches: Sequence[Batch]) -> torch.Tensor:
+        """Mean cost of all motions."""
         try:
-            motion = motions(self.controller, batch, self.engine)
+            costs = [running_cost(motions(self.controller, x, self.engine), x, self.cost) for x in batches]
         except SimulationDiverged:  # raised by the torch engine's plant; the kernels give NaN
             return torch.tensor(math.nan, dtype=torch.float64)
-        return running_cost(motion, batch, self.cost).mean()
+        return torch.cat(costs).mean()
 
     def loss(self) -> torch.Tensor:
         """Cost to minimise: mean cost of the training motions plus regulariser."""
@@ -106,13 +108,13 @@ class Task:
     def warm_up(self) -> None:
         """Compile everything: run one period of one motion, and its gradient."""
         if self.engine == "kernels":
-            first = self.training.beginning()
+            first = self.training[0].beginning()
             motions(self.controller, first, self.engine).command.sum().backward()  # type: ignore[no-untyped-call]
 
     def statement(self) -> dict[str, Any]:
         """What a resumed training must share with the one that wrote the checkpoint (`same_training.py`)."""
         with torch.no_grad():
-            costs = [float(self.loss()), *([] if self.held_out is None else [float(self.value(self.held_out))])]
+            costs = [float(self.loss()), *([float(self.value(self.held_out))] if self.held_out else [])]
         names = ("epochs", "optimiser", "learning_rate", "gains", "engine", "seed")
         settings = {name: getattr(self, name) for name in names}
         stated: dict[str, Any] = statement(self.controller, self.training, self.held_out, costs, **settings)
@@ -229,12 +231,12 @@ class Trainer:
         del at.history[row:], at.held_out[row:]  # the final row of a training that had ended and is resumed
         at.history.append(value if math.isfinite(value) else None)
         score = value
-        if task.held_out is not None:
+        if task.held_out:
             with torch.no_grad():
                 score = float(task.value(task.held_out))
             at.held_out.append(score if math.isfinite(score) else None)
         if not at.best and not math.isfinite(score):
-            which = "training" if task.held_out is None or not math.isfinite(value) else "held-out"
+            which = "training" if not task.held_out or not math.isfinite(value) else "held-out"
             raise SimulationDiverged(
                 f"the {which} motions diverge before any training; take a shorter period or plant step, starts nearer"
                 " to the reference, or lower gains."
