@@ -142,12 +142,12 @@ def build(family: Family, arm: RealArm, seed: int) -> Any:
     """The law of the family with its own `for_robot`, on the description or on a learned model."""
     settings: dict[str, Any] = {"period": PERIOD, "seed": seed, "least_share": LEAST_SHARE}
     n = arm.told.nv
-    friction = JointFriction(np.zeros(n), np.zeros(n), TRANSITION)  # what adapts begins with it
+    friction: JointFriction | None = JointFriction(np.zeros(n), np.zeros(n), TRANSITION)  # where an adaptive law begins
     if family.model is not None:
         noise = Noise(encoder=ENCODER, torque=TORQUE_NOISE)
         data = collect(arm.true(), "excited", samples=SAMPLES, seed=seed, noise=noise, friction=arm.friction)
-        asked = {"friction": True, "rotor_inertia": True if family.model == "identified" else None}
-        model = fit(data, family.model, seed, robot=arm.told, transition=TRANSITION, **asked)
+        asked: dict[str, Any] = {"friction": True, "rotor_inertia": True, "transition": TRANSITION}
+        model = fit(data, family.model, seed, robot=arm.told, **asked)
         settings["dynamics"], friction = model, model.friction
     return build_law(family.law, arm.told, friction=friction, **settings)
 
@@ -198,8 +198,8 @@ def _protocol(study: Study, seed: int) -> str:
     loads = ", ".join(f"{arm} {LOADS[arm]:g} kg" for arm in study.arms)
     return f"""**The arms as they are.** MuJoCo at {1000 * PERIOD:g} ms with the arm's own torque limits. Rotors and
 friction of fr3 are those of its description; panda and ur5 have rotors of 0.1 kg·m² at every joint, Coulomb friction of
-2 % of the effort limit and as much viscous friction at full speed. Every body is up to {percent(BODIES)} heavier or lighter
-than described. In each trial the tool carries a load from nothing up to ({loads}), its centre up to
+2 % of the effort limit and as much viscous friction at full speed. Every body is up to {percent(BODIES)} heavier or
+lighter than described. In each trial the tool carries a load from nothing up to ({loads}), its centre up to
 {100 * OFF_CENTRE:g} cm off on every axis, friction is up to {percent(WARMTH)} more or less, the motion is a sinusoid of
 another amplitude (0.2 to 0.5 rad) and frequency (0.5 to 2.5 rad/s), and the start is at rest up to {AWAY:g} rad off in
 every joint. Encoders have {-round(math.log2(ENCODER))} bits a turn, and velocities are differences of readings.

@@ -120,7 +120,7 @@ def scaled(law: Any, factors: Sequence[float]) -> Any:
     law = copy.deepcopy(law)
     with torch.no_grad():
         for gain, factor in zip(gain_groups(law), factors, strict=True):
-            gain.change += 0.5 * math.log(factor)
+            gain.change.add_(0.5 * math.log(factor))
     if isinstance(law, NeuralBackstepping):
         law.inertial_rate *= factors[0] * factors[1]
     return law

@@ -16,7 +16,6 @@ from nbs_pin.base.records import Reference, Run
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
-from nbs_pin.identification.measurement import quantised
 from nbs_pin.motions.references import Sinusoid
 from nbs_pin.robots.joint_drive import Drive
 from nbs_pin.robots.places import tool_frame
@@ -166,7 +165,7 @@ class Encoded(Controller):
     """
 
     def __init__(self, law: Controller, prismatic: np.ndarray, encoder: float = ENCODER) -> None:
-        self.law, self.prismatic, self.encoder = law, prismatic, encoder
+        self.law, self._step = law, encoder * np.where(prismatic, 1.0, 2.0 * np.pi)
 
     @property
     def nv(self) -> int:
@@ -187,4 +186,4 @@ class Encoded(Controller):
         return tau, (seen, inner)
 
     def _read(self, q: Vectors) -> np.ndarray:
-        return quantised(np.asarray(q), self.encoder, self.prismatic)
+        return np.asarray(self._step * np.round(q / self._step))

@@ -20,7 +20,8 @@ class Reproduce(Reported):
     """
 
     part: Literal["paper", "fair", "lnn", "models", "certificates", "all"] = "paper"
-    """paper: its Table I, figures and sweep over α. fair: every law, tuned alike, on fresh starts.
+    """paper: its Table I, figures and sweep over α.
+    fair: every law, tuned alike, on arms with rotors, friction, loads and encoders.
     lnn: its Figure 5, control with learned models, and what data without torque do not determine.
     models: learned models against the truth, from clean and noisy data, with and without structure; about an hour.
     certificates: certified errors against the worst ones found, a counterexample to the paper's bound,

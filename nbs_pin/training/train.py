@@ -133,14 +133,7 @@ def train(
     settings = {"plant_step": step, "effort_limit": effort_limit, "lookahead": lookahead}
     plants = [plant] if isinstance(plant, Plant) else plant
     loops = [Loop.of(x, controller.nv, duration, period, **settings) for x in plants]
-    draw, training, checking = np.random.default_rng(seed), [], []
-    for loop in loops:
-        check_plant(loop)
-        ours, others = _batches(loop, references, starts, held_out, start_error, disturbance, draw)
-        training.append(ours)
-        checking += [] if others is None else [others]
-    if encoder:
-        training, checking = ([x.misread(encoder, draw) for x in batches] for batches in (training, checking))
+    training, checking = _batches(loops, references, starts, held_out, start_error, disturbance, encoder, seed)
     task = Task(
         controller=copy.deepcopy(controller),
         training=training,
@@ -166,21 +159,28 @@ def _engine(controller: Controller, loops: Sequence[Loop]) -> Engine:
 
 
 def _batches(
-    loop: Loop,
+    loops: Sequence[Loop],
     references: Sequence[DesiredMotion],
     starts: Any,
     held_out: Any,
     error: float,
     tau_d: Any,
-    draw: np.random.Generator,
-) -> tuple[Batch, Batch | None]:
-    """The training and the held-out motions of one plant."""
-    training = _motions(loop, references, starts, error, tau_d, draw)
+    encoder: float,
+    seed: int,
+) -> tuple[list[Batch], list[Batch]]:
+    """The training and the held-out motions of every plant."""
+    draw, training, checking = np.random.default_rng(seed), [], []
+    number_of_starts = _count_of(starts)
     if held_out is None:
-        number_of_starts = _count_of(starts)
         held_out = 0 if number_of_starts is None else math.ceil(number_of_starts / 4)
-    kept = None if _count_of(held_out) == 0 else held_out
-    return training, None if kept is None else _motions(loop, references, kept, error, tau_d, draw)
+    for loop in loops:
+        check_plant(loop)
+        training.append(_motions(loop, references, starts, error, tau_d, draw))
+        if _count_of(held_out) != 0:
+            checking.append(_motions(loop, references, held_out, error, tau_d, draw))
+    if encoder:
+        training, checking = ([x.misread(encoder, draw) for x in batches] for batches in (training, checking))
+    return training, checking
 
 
 def _motions(
