@@ -126,15 +126,8 @@ def attack(
     names, motion, waves = _waves(ensemble, admissible, rng)
     peaks = ensemble.peaks(motion, waves, progress)
     pack = _Ascent.of(motion, waves, peaks, starts)
-    history, interrupted = [float(peaks.error.max())], False
-    arm = ensemble.loop.plant.robot
-    unit = several(units("position", [False] if arm is None else arm.prismatic))
-    try:
-        for k in tracked(range(rounds), lambda: f"attack: {history[-1]:.4g} {unit} so far", progress):
-            pack = pack.ascend(ensemble, admissible, at_end=k % 2 == 0)
-            history.append(max(history[-1], float(pack.peaks.error.max())))
-    except KeyboardInterrupt:  # what was found until then is a motion as any other
-        interrupted = True
+    history = [float(peaks.error.max())]
+    pack = _ascended(pack, ensemble, admissible, rounds, history, progress)
     worst = int(pack.peaks.error.argmax())
     ascent = "bang-bang ascent" if admissible.radius is None else "steepest ascent"
     found_by = ascent if pack.ascended[worst] else names[pack.origin[worst]]
@@ -147,7 +140,7 @@ def attack(
         history=np.array(history),
         duration=ensemble.loop.steps * period,
         period=period,
-        interrupted=interrupted,
+        interrupted=len(history) <= rounds,
     )
 
 
@@ -254,6 +247,21 @@ class _Ascent:
             share=np.where(better, np.minimum(1.0, 2.0 * self.share), 0.25 * self.share),
             joint_errors=np.maximum(self.joint_errors, found.joint_errors.max(axis=0)),
         )
+
+
+def _ascended(
+    pack: _Ascent, ensemble: LoopEnsemble, admissible: Admissible, rounds: int, history: list[float], progress: bool
+) -> _Ascent:
+    """The disturbances after some rounds, or after those before Ctrl-C; the largest error of each → history."""
+    arm = ensemble.loop.plant.robot
+    unit = several(units("position", [False] if arm is None else arm.prismatic))
+    try:
+        for k in tracked(range(rounds), lambda: f"attack: {history[-1]:.4g} {unit} so far", progress):
+            pack = pack.ascend(ensemble, admissible, at_end=k % 2 == 0)
+            history.append(max(history[-1], float(pack.peaks.error.max())))
+    except KeyboardInterrupt:  # what was found until then is a motion as any other
+        pass
+    return pack
 
 
 def _towards(

@@ -95,8 +95,7 @@ def collect(
         ArgumentError: If the recipe is unknown or a setting does not fit it.
         RobotError: If MuJoCo cannot build the arm.
         SimulationDiverged: If the simulated state is no longer finite.
-        KeyboardInterrupt: If Ctrl-C comes before there is a whole trajectory; later the whole ones are returned, with
-            "interrupted" in `Dataset.about`.
+        KeyboardInterrupt: On Ctrl-C in the first trajectory; later, whole ones are returned (`about["interrupted"]`).
 
     Example:
         >>> import nbs_pin as nbs
@@ -112,10 +111,8 @@ def collect(
     if recipe == "uniform":
         counts, columns = [1] * samples, _states(bench, samples, speed, generator)
     else:
-        instruments = _Instruments(stride, noise, differentiated)
-        seen, interrupted = _readings(instruments, bench, generator, counts, progress)
-        counts = counts[: len(seen)]
-        columns = tuple(np.concatenate(parts) for parts in zip(*seen, strict=True))
+        read = partial(_Instruments(stride, noise, differentiated).read, bench, generator)
+        columns, counts, interrupted = _readings(read, counts, progress)
     about: dict[str, Any] = {
         "recipe": recipe,
         "seed": seed,
@@ -128,23 +125,23 @@ def collect(
         "robot": {"source": robot.source, "sha256": robot.sha256, "options": robot.options},
     }
     t, q, v, a, tau = columns
-    tau = tau + noise.torque * generator.standard_normal(tau.shape)
-    of = np.repeat(np.arange(len(counts)), counts)
+    tau, of = tau + noise.torque * generator.standard_normal(tau.shape), np.repeat(np.arange(len(counts)), counts)
     return Dataset(q, v, a, tau, t, of, robot.parents, robot.prismatic, robot.name, about)
 
 
 def _readings(
-    instruments: "_Instruments", bench: "_Bench", generator: np.random.Generator, counts: list[int], progress: bool
-) -> tuple[list[tuple[np.ndarray, ...]], bool]:
-    """What is read of every trajectory, and whether Ctrl-C ended the collection before the last."""
+    read: Callable[[int], tuple[np.ndarray, ...]], counts: list[int], progress: bool
+) -> tuple[tuple[np.ndarray, ...], list[int], bool]:
+    """t, q, v, v̇ and τ of all trajectories, their lengths, and whether Ctrl-C came before the last of them."""
     seen: list[tuple[np.ndarray, ...]] = []
     try:
         for k in tracked(counts, "collecting data", progress):
-            seen.append(instruments.read(bench, generator, k))
+            seen.append(read(k))
     except KeyboardInterrupt:
         if not seen:
             raise
-    return seen, len(seen) < len(counts)
+    columns = tuple(np.concatenate(parts) for parts in zip(*seen, strict=True))
+    return columns, counts[: len(seen)], len(seen) < len(counts)
 
 
 class _Idle(MemorylessController):
