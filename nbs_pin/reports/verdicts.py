@@ -9,7 +9,7 @@ import numpy as np
 from nbs_pin.base.doors import option
 from nbs_pin.base.units import counted, measured, percent, several
 from nbs_pin.reports.challenge_told import challenge_told
-from nbs_pin.simulation.run_figures import LIGHT, load_deviation, load_of
+from nbs_pin.reports.loads_told import load_learned, loads_told
 
 GOOD, WARNING, BAD, NOTE = "good", "warning", "bad", "note"
 """How a verdict is coloured: kept, to be looked at, broken, and neither."""
@@ -89,7 +89,7 @@ def _finished(figures: Mapping[str, Any]) -> Verdict:
 
 def _tracking(figures: Mapping[str, Any]) -> Verdict:
     stopped = figures.get("stopped")
-    loads = (*_loads(figures), *_load_learned(figures))
+    loads = (*loads_told(figures), *load_learned(figures))
     if stopped:
         said = f"the guard stopped the arm after {stopped['time_s']:.3g} s: {stopped['why']}".rstrip(".")
         return Verdict(BAD, said, loads)
@@ -123,35 +123,6 @@ def _tracking(figures: Mapping[str, Any]) -> Verdict:
     return Verdict(WARNING if level == GOOD and (left or late_cut) else level, said, (*more, *left))
 
 
-def _loads(figures: Mapping[str, Any]) -> tuple[str, ...]:
-    """What appeared in the plant before the end of the run."""
-    told = []
-    for load in figures.get("loads", []):
-        begin, end, last = load["from_s"], load["until_s"], figures.get("duration_s", 0.0)
-        if begin < last:
-            where = f" at {load['link']}" if load["link"] else ""
-            then = f" and was gone at {end:g} s" if end is not None and end < last else ""
-            told.append(f"a load of {load['mass_kg']:g} kg{where}, unknown to the law, appeared at {begin:g} s{then}")
-    return tuple(told)
-
-
-def _load_learned(figures: Mapping[str, Any]) -> tuple[str, ...]:
-    """The load that a law believed in the end, if it learns one."""
-    found = load_of({name: x for name, x in figures.get("estimates", {}).items() if isinstance(x, int | float)})
-    if found is None:
-        return ()
-    link, mass, centre = found
-    if abs(mass) < LIGHT:
-        return (f"the law believes that {link} carries no load",)
-    at = ", ".join(f"{1e3 * x:z.0f}" for x in centre)
-    told = f"the law believes in a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm"
-    off = load_deviation(figures["estimates"], figures.get("estimates_deviation", {}))
-    if off is not None:
-        apart = ", ".join(f"{1e3 * x:.2g}" for x in off[1])
-        told += f"; the mass may be off by {off[0]:.2g} kg, the centre by ({apart}) mm"
-    return (told,)
-
-
 def _convergence(figures: Mapping[str, Any]) -> tuple[str, str]:
     units, duration, times = figures["units"]["position"], figures["duration_s"], _times(figures)
     bound = measured(0.1, "rad") if set(units) == {"rad"} else f"0.1 {several(units)}"
@@ -174,7 +145,7 @@ def _laws(figures: Mapping[str, Any]) -> Verdict:
     found = figures["laws"]
     off = {name: largest_late_errors(of) for name, of in found.items() if has_converged(of)}
     lost = [name for name in found if name not in off]
-    loads = _loads(next(iter(found.values())))
+    loads = loads_told(next(iter(found.values())))
     if not off:
         return Verdict(BAD, f"none of {', '.join(found)} converged in the first {percent(_IN_TIME)} of the time", loads)
     told = {name: " and ".join(measured(error, unit) for error, unit, _ in of) for name, of in off.items()}
