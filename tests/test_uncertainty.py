@@ -291,3 +291,12 @@ def test_between_instants_accelerations_may_change_by_all_that_separates_two_of_
 def test_bounds_reach_to_the_neighbours_of_an_instant():
     found = _nearby(np.array([1.0, 5.0, 2.0, 0.0, 3.0]))
     assert found.tolist() == [5.0, 5.0, 5.0, 3.0, 3.0]
+
+
+def test_a_load_that_moves_nothing_leaves_no_error():
+    """A point on the axis of the first joint: no torque of the arm changes with it."""
+    robot = nbs.load_robot("two_link")
+    law = nbs.NeuralBackstepping.for_robot(robot)
+    payload = nbs.Uncertainty(payload=nbs.Payload(0.3, link="link1"))
+    found = nbs.certify(law, [0.0, 0.0], reference=nbs.Sinusoid.for_robot(robot), uncertainty=payload)
+    assert (found.joint_errors < 1e-6).all()

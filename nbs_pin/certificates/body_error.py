@@ -34,6 +34,8 @@ _ROOM = 1.02
 """Room around the set of motions within which the terms are bounded, so that its border lies inside."""
 _ROUNDS, _FARTHEST = 40, 1e3
 """How often the set is widened, and the ‖z1‖ at which that ends [rad, m]: a larger bound is of no use to anyone."""
+_LEAST_ENERGY = 1e-30
+"""Least z1ᵀSz1 of a set [J]."""
 
 
 class Local(NamedTuple):
@@ -160,7 +162,8 @@ class Terms:
         return least, max(largest, least), spread
 
     def _radii(self, potential: float) -> JointArray:
-        return np.sqrt(potential / diagonal_below(self.constants.stiffness))
+        # A load that moves nothing leaves no error; its set is taken a little larger than a point.
+        return np.sqrt(max(potential, _LEAST_ENERGY) / diagonal_below(self.constants.stiffness))
 
     def best(self, base: ComparisonSystem, storage: float) -> tuple[ComparisonSystem, float, Scalars]:
         """The inequalities while V' ≤ `storage`, with the shares of ω and x² of the least V∞; V' from 0; t.
