@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import pytest
 
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError, SimulationDiverged
-from nbs_pin.campaigns.journal import JOURNAL, Journal, Outcome
+from nbs_pin.campaigns.journal import JOURNAL, Journal, Outcome, forget
 from nbs_pin.campaigns.runner import run_jobs
 
 PLAN = {"seed": 0, "arm": {"name": "panda", "load": 2.0}}
@@ -126,6 +126,32 @@ def test_a_file_of_something_else_is_refused(tmp_path):
     (tmp_path / JOURNAL).write_text('{"format": "other"}\n')
     with pytest.raises(FileFormatError, match="first line"):
         run_jobs(square, jobs(3), tmp_path, PLAN)
+
+
+@pytest.mark.parametrize("content", [b'{"my": "precious data"}', b"1, 2\n3, 4", b"x"])
+def test_a_file_of_something_else_stays_as_it_is(tmp_path, content):
+    (tmp_path / JOURNAL).write_bytes(content)
+    with pytest.raises(FileFormatError):
+        run_jobs(square, jobs(2), tmp_path, PLAN)
+    assert (tmp_path / JOURNAL).read_bytes() == content
+
+
+def test_line_ends_of_another_system_cost_nothing(tmp_path):
+    before = run_jobs(square, jobs(4), tmp_path, PLAN)
+    path = tmp_path / JOURNAL
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    run_jobs(square, jobs(6), tmp_path, PLAN)
+    assert told(run_jobs(square, jobs(4), tmp_path, PLAN)) == told(before)
+
+
+def test_a_journal_that_another_process_has_open_is_not_emptied(tmp_path):
+    with Journal.opened(tmp_path, PLAN) as journal:
+        journal.add(Outcome("a", {"x": 1}, "", 0.0))
+        with pytest.raises(ArgumentError, match="another process"):
+            forget(tmp_path)
+    forget(tmp_path)
+    with Journal.opened(tmp_path, {"another": "plan"}) as journal:
+        assert not journal.outcomes
 
 
 def test_two_processes_do_not_share_a_folder(tmp_path):

@@ -60,6 +60,14 @@ def raises(robot, period):
         return np.zeros(robot.nv)
     return torque
 
+def leaves(robot, period):
+    os.closerange(3, 256)
+    while True:
+        time.sleep(1.0)
+
+def odd(robot, period):
+    raise ValueError("bad \\udc80")
+
 def nan(robot, period):
     return lambda q, v, q_d, v_d, a_d, t: q * np.nan
 
@@ -280,6 +288,25 @@ def test_an_entrant_that_sleeps_is_ended_with_its_process(file):
     assert not [child for child in own if child.is_running() and "entrant_process" in " ".join(child.cmdline())]
 
 
+def test_an_entrant_that_closes_its_connection_is_told(file):
+    found = judge(job(f"{file}:leaves", ("nominal",), run=30.0))
+    assert found == {"sinusoid nominal": {"failure": "its process closed its connection during a run"}}
+
+
+def test_a_reason_that_is_no_text_is_told(file):
+    (answer,) = judge(job(f"{file}:odd", ("nominal",))).values()
+    assert "ValueError" in answer["failure"]
+    answer["failure"].encode()
+
+
+def test_entrants_that_tables_would_call_the_same_are_refused(file, tmp_path):
+    other = tmp_path / "elsewhere" / file.name
+    other.parent.mkdir()
+    other.write_text(file.read_text())
+    with pytest.raises(ArgumentError, match="two entrants are called"):
+        entrants_of([f"{file}:spring", f"{other}:spring"])
+
+
 def test_after_a_stop_the_next_tasks_are_run(file, tmp_path, monkeypatch):
     monkeypatch.setenv("MARK", str(tmp_path / "mark"))
     found = judge(job(f"{file}:once", ("nominal", "delay"), run=15.0))
@@ -471,6 +498,13 @@ def test_the_command_writes_its_page_and_tables(file, tmp_path, capsys):
     capsys.readouterr()
     assert "another plan" in refusal(cli.main([*map(str, ("challenge", *options, "--seed", 1))]), capsys)
     assert json.loads((tmp_path / "out" / JOURNAL).read_text().splitlines()[0])["plan"]["seed"] == 0
+
+
+def test_results_of_another_command_stay(tmp_path, capsys):
+    (tmp_path / "tasks.csv").write_text("mine")
+    told = refusal(cli.main(["challenge", "--quick", "--out", str(tmp_path)]), capsys)
+    assert "--force" in told
+    assert (tmp_path / "tasks.csv").read_text() == "mine"
 
 
 @pytest.mark.parametrize(("options", "words"), [

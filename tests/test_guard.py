@@ -471,3 +471,41 @@ def test_a_reference_without_accelerations_of_every_joint_holds_the_torque(a_ref
     assert held.tolist() == tau.tolist()
     assert guarded.mode is nbs.Mode.DEGRADED
     assert guarded.counters.held == 1
+
+
+class Remembering(MemorylessController):
+    """A law that keeps the references that it was given."""
+
+    def __init__(self, law):
+        self.law, self.aims = law, []
+
+    @property
+    def nv(self):
+        return self.law.nv
+
+    def torque(self, q, v, q_ref, v_ref, a_ref):
+        self.aims.append((q_ref, v_ref, a_ref))
+        return self.law.torque(q, v, q_ref, v_ref, a_ref)
+
+
+def test_neither_the_caller_nor_the_law_can_change_what_the_guard_has_seen():
+    law = Remembering(LAW)
+    guarded, aim = nbs.Guarded(law, ROBOT), nbs.Reference(*map(np.array, MOTION(0.0)))
+    guarded.begin(aim.q, aim)
+    law.aims.clear()
+    tau = guarded.step(nbs.Sample(0.0, aim.q.copy(), aim.v.copy()), aim)
+    sent = tau.copy()
+    tau[:] = 99.0
+    for x in aim:
+        x[:] = 99.0
+    np.testing.assert_array_equal(guarded.seen.tau, sent)
+    for found, expected in zip(law.aims[0], MOTION(0.0), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("sample", [nbs.Sample(10**400, [0.0, 0.0], [0.0, 0.0]), nbs.Sample(H, [10**400, 0], [0, 0])])
+def test_a_number_beyond_every_float_is_held(sample):
+    guarded, aim = begun(), MOTION(0.0)
+    tau = guarded.step(nbs.Sample(0.0, aim.q, aim.v), aim)
+    assert guarded.step(sample, aim).tolist() == tau.tolist()
+    assert guarded.mode is nbs.Mode.DEGRADED

@@ -7,7 +7,7 @@ import nbs_pin as nbs
 from nbs_pin.base.claims import Label
 from nbs_pin.certificates import tried_motions
 from nbs_pin.certificates.claims import Assumption, Role
-from nbs_pin.certificates.tried_motions import MOTIONS, PERIODS, TriedMotions
+from nbs_pin.certificates.tried_motions import MOTIONS, PERIODS, PLANT_STEPS, TriedMotions
 
 SIMULATED = "in simulation"
 
@@ -16,10 +16,10 @@ def motion_of(robot, frequency=1.0):
     return nbs.Sinusoid.for_robot(robot, frequency=frequency)
 
 
-def tried(law, robot, *, torque=1.0, period=1e-3, duration=0.5, start=None, friction=None):
+def tried(law, robot, *, torque=1.0, period=1e-3, duration=0.5, start=None, friction=None, lookahead=None):
     none = nbs.JointFriction(np.zeros(robot.nv), np.zeros(robot.nv))
     box = torque if isinstance(torque, nbs.Admissible) else nbs.Admissible.of(np.full(robot.nv, torque), robot.nv)
-    return TriedMotions.of(law, robot, friction or none, box, motion_of(robot), duration, period, start)
+    return TriedMotions.of(law, robot, friction or none, box, motion_of(robot), duration, period, start, lookahead)
 
 
 @pytest.mark.parametrize("limit", [79.0, 1000.0])
@@ -89,3 +89,48 @@ def test_a_payload_moves_with_the_arm():
     arm, loaded = (abs(nbs.PinocchioDynamics(x).gravity(np.zeros(6))[1]) for x in (robot, payload.on(robot)))
     assert loaded > 1.05 * arm
     assert loaded < seen.right < 1.05 * loaded
+
+
+POINTS = """<robot name="points"><link name="base"/>
+{links}</robot>"""
+LINK = """<link name="l{k}"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+<inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial></link>
+<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>
+<origin xyz="0 0 {z}"/><axis xyz="0 1 0"/>
+<limit lower="-3" upper="3" effort="100" velocity="10"/><dynamics damping="0.1"/></joint>"""
+
+
+def test_an_arm_of_point_masses_with_friction_which_mujoco_refuses_is_tried_too(tmp_path):
+    path = tmp_path / "points.urdf"
+    links = "".join(LINK.format(k=k, parent="l0" if k else "base", z=-1.0 if k else 0.0) for k in range(2))
+    path.write_text(POINTS.format(links=links))
+    robot = nbs.load_robot(path)
+    law = nbs.NeuralBackstepping.for_robot(robot)
+    found = nbs.certify(law, [0.5, 0.5], reference=nbs.Hold([0.3, 0.2]), duration=0.2, period=1e-3)
+    (seen,) = [x for x in found.conditions if x.checks is Assumption.TIME and SIMULATED in x.name]
+    assert 0.0 < seen.right < seen.left
+
+
+def test_a_look_ahead_is_that_of_the_loop_and_late_loops_are_not_simulated():
+    robot = nbs.load_robot("two_link")
+    law = nbs.NeuralBackstepping.for_robot(robot)
+    errors = [tried(law, robot, torque=0.0, period=5e-3, lookahead=x).errors.max() for x in (None, 0.0, 5e-3)]
+    assert errors[0] < 0.2 * min(errors[1:])
+    found = nbs.certify(law, [1.0, 1.0], reference=motion_of(robot), period=1e-3, delay=1e-3)
+    assert not [x for x in found.conditions if SIMULATED in x.name]
+
+
+def test_joints_without_a_limit_are_not_blamed_for_a_motion_that_diverged():
+    robot = nbs.load_robot("panda").with_effort_limit([np.inf] * 6 + [12.0])
+    none = np.full(7, np.inf)
+    _, cut = TriedMotions(MOTIONS, 1.0, none, none).conditions(robot, none)
+    assert cut.name.startswith("effort limit of panda_joint7")
+    assert not cut.holds
+
+
+def test_plant_steps_are_limited_too():
+    robot = nbs.load_robot("two_link")
+    law = nbs.NeuralBackstepping.for_robot(robot, period=0.02)
+    found = tried(law, robot, torque=0.0, period=0.02, duration=1e3)
+    assert found.count == 1
+    assert found.duration == pytest.approx(0.02 * (PLANT_STEPS // 20))

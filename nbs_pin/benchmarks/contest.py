@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nbs_pin.base.exceptions import ArgumentError
 from nbs_pin.base.versions import versions
 from nbs_pin.benchmarks.challenge_tasks import ARMS, DURATION, MOTIONS, PERIOD, SETTLED, START_ERROR
 from nbs_pin.benchmarks.conditions import CONDITIONS
@@ -81,6 +82,14 @@ def _key(kind: str, entrant: Entrant, arm: str) -> str:
 
 
 def entrants_of(names: Sequence[str], *, alone: bool = False) -> tuple[Entrant, ...]:
-    """The entrants shipped, unless `alone`, and those of these names, each once; ArgumentError for an unknown name."""
+    """The entrants shipped, unless `alone`, and those of these names, each once.
+
+    Raises ArgumentError for an unknown name, or for two that the tables would call the same.
+    """
     shipped = () if alone else map(Entrant, SHIPPED)
-    return tuple(dict.fromkeys((*shipped, *map(Entrant.read, names))))
+    found = tuple(dict.fromkeys((*shipped, *map(Entrant.read, names))))
+    called = [entrant.shown for entrant in found]
+    for name in called:
+        if called.count(name) > 1:
+            raise ArgumentError(f"two entrants are called '{name}' in the tables; rename a file or its function.")
+    return found

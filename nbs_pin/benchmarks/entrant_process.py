@@ -26,7 +26,10 @@ def main(socket: int) -> None:
         os.dup2(silence, stream)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with Connection(socket) as parent:
-        work = _prepared(parent.recv())
+        about = parent.recv()
+        signal.alarm(int(about["limit"] + _GRACE))
+        work = _prepared(about)
+        signal.alarm(0)
         parent.send({})
         while True:
             try:
@@ -40,9 +43,9 @@ def main(socket: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """The other end holds standard input open for as long as it lives."""
+    """The other end holds standard input open for as long as it lives; the session ends with it, children included."""
     sys.stdin.buffer.read()
-    os._exit(1)
+    os.killpg(0, signal.SIGKILL)
 
 
 def _prepared(about: dict[str, Any]) -> Any:
@@ -79,9 +82,10 @@ def _answered(work: Any, request: dict[str, Any]) -> dict[str, Any]:
     try:
         return {"result": work(request["motion"], request["condition"])}
     except NbsPinError as error:
-        return {"failure": str(error)}
+        said = str(error)
     except (Exception, SystemExit) as error:  # whatever an entrant raises costs only itself
-        return {"failure": f"{type(error).__name__}: {error!s:.300}"}
+        said = f"{type(error).__name__}: {error!s:.300}"
+    return {"failure": said.encode(errors="replace").decode()}  # names of files may be no text
 
 
 if __name__ == "__main__":

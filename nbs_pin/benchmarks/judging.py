@@ -11,6 +11,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, Literal, NamedTuple
 
+_CLOSING = 5.0  # for a process whose connection is closed to end [s]
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")} | {"MUJOCO_GL": "disable"}
 
 
@@ -81,6 +82,7 @@ class _Process:
     def begin(self) -> str:
         """Wait until it is ready; a sentence if it is not."""
         about = {"kind": self.job.kind, "entrant": self.job.entrant, "arm": self.job.arm, "seed": self.job.seed}
+        about["limit"] = self.job.budget.start
         _, said = self._answer(about, self.job.budget.start, "its start")
         return said
 
@@ -97,7 +99,10 @@ class _Process:
             if self.parent.poll(limit):
                 return self.parent.recv(), ""
         except (EOFError, OSError):
-            code = self.process.wait()
+            try:
+                code = self.process.wait(timeout=_CLOSING)
+            except subprocess.TimeoutExpired:
+                return {}, f"its process closed its connection during {what}"
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             return {}, f"its process ended during {what} ({how})"
         return {}, f"stopped: {what} took more than {limit:g} s"

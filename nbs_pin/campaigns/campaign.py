@@ -1,5 +1,6 @@
 """The plan of a campaign: what its trials have in common, what varies on a grid and what is drawn."""
 
+import inspect
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from nbs_pin.base.exceptions import ArgumentError, FileFormatError
 from nbs_pin.base.shown import Shown
 from nbs_pin.base.units import counted
 from nbs_pin.campaigns.variables import VARIABLES, Span, check_names, drawn_from, values_of
+from nbs_pin.robots.robot import load_robot
 
 MOST_TRIALS = 100_000
 _COUNTS = {"samples": count(1, MOST_TRIALS), "seed": SEED, "keep_runs": count(0, 10_000, of="runs")}
@@ -152,6 +154,7 @@ def _checked(where: str, table: Mapping[str, Any]) -> dict[str, Any]:
     tables = {name: mapping(f"{where}{name}", table.get(name, {})) for name in _TABLES}
     for name in ("grid", "random"):
         check_names(f"{where}{name}", tables[name], list(VARIABLES))
+    check_names(f"{where}arm", tables["arm"], list(inspect.signature(load_robot).parameters)[1:])
     grid = {name: values_of(f"{where}grid", name, given) for name, given in tables["grid"].items()}
     random = {name: drawn_from(f"{where}random", name, given) for name, given in tables["random"].items()}
     for name in VARIABLES:

@@ -19,6 +19,8 @@ JOURNAL = "results.jsonl"
 """Name of the file in the folder of results."""
 FORMAT = "nbs_pin results 1"
 """What its first line states, beside the plan."""
+_BEGINNING = b'{"format": "nbs_pin results 1"'
+_FOREIGN = "{}: the first line is not that of 'nbs_pin results 1'; give another folder."
 _FLUSHED = 1.0  # results of at most so long are lost with the power, none with the process [s]
 _MOST_TOLD = 3
 
@@ -64,13 +66,17 @@ class Journal:
         try:
             _lock(file, path)
             content = path.read_bytes()
-            lines = content[: content.rfind(b"\n") + 1].splitlines()
-            os.ftruncate(file, sum(len(line) + 1 for line in lines))
+            end = content.rfind(b"\n") + 1
             journal = cls(path, {}, file)
-            if lines:
-                _check_plan(path, _parsed(path, 1, lines[0]), _stored(plan))
-                journal.outcomes.update((x.key, x) for x in _outcomes(path, lines[1:]))
+            if end:
+                head, *lines = content[:end].split(b"\n")[:-1]
+                _check_plan(path, _parsed(path, 1, head), _stored(plan))
+                journal.outcomes.update((x.key, x) for x in _outcomes(path, lines))
+                os.ftruncate(file, end)
             else:
+                if not _BEGINNING.startswith(content[: len(_BEGINNING)]):
+                    raise FileFormatError(_FOREIGN.format(path))
+                os.ftruncate(file, 0)
                 journal._write({"format": FORMAT, "plan": plan})
             yield journal
             os.fsync(file)
@@ -98,6 +104,18 @@ class Journal:
             raise
 
 
+def forget(folder: str | Path) -> None:
+    """Empty the journal of the folder, if there is one; raises ArgumentError if another process has it open."""
+    path = Path(folder) / JOURNAL
+    if path.exists():
+        file = os.open(path, os.O_RDWR)
+        try:
+            _lock(file, path)
+            os.ftruncate(file, 0)
+        finally:
+            os.close(file)
+
+
 def _lock(file: int, path: Path) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -122,7 +140,7 @@ def _check_plan(path: Path, head: Mapping[str, Any], plan: Mapping[str, Any]) ->
     """Raise unless the file is of this plan."""
     before = head.get("plan")
     if head.get("format") != FORMAT or not isinstance(before, dict):
-        raise FileFormatError(f"{path}: the first line is not that of '{FORMAT}'; give another folder.")
+        raise FileFormatError(_FOREIGN.format(path))
     changed = list(_changes(before, plan))
     if changed:
         more = f" and {len(changed) - _MOST_TOLD} more" if len(changed) > _MOST_TOLD else ""

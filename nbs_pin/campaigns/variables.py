@@ -115,7 +115,7 @@ def drawn_from(where: str, name: str, given: Any) -> tuple[Any, ...] | Span:
     check_names(f"{where}.{name}", given, ("from", "to"))
     if not variable.is_number or len(given) < 2:
         wanted = "both from and to" if variable.is_number else "a list, as it is no number"
-        raise ArgumentError(f"{where}.{name} is drawn from {', '.join(given)}; give {wanted}.")
+        raise ArgumentError(f"{where}.{name} is {told(dict(given))}; give {wanted}.")
     least, most = (variable.check(f"{where}.{name}.{end}", given[end]) for end in ("from", "to"))
     if not least <= most:
         raise ArgumentError(f"{where}.{name} goes from {least:g} to {most:g}; give the smaller one first.")

@@ -90,7 +90,11 @@ def _tried(
     law, robot, start = certificate.controller, certificate.robot, certificate.start
     loop = law, robot, certificate.friction.gap.arm, certificate.admissible
     begin = None if start is None else (start.q, start.v)
-    tried = TriedMotions.of(*loop, reference, float(motion.t[-1]), period, begin)
+    readings = None if certificate.held is None else certificate.held.readings
+    if readings is not None and not readings.is_plain:
+        return ()  # late torques and encoders are not simulated
+    lookahead = None if readings is None else readings.lookahead
+    tried = TriedMotions.of(*loop, reference, float(motion.t[-1]), period, begin, lookahead)
     return () if tried is None else tried.conditions(robot, joints)
 
 

@@ -167,7 +167,7 @@ def velocity_margin(robot: Robot, motion: SampledMotion, start: JointArray | flo
 def least_room(robot: Robot, kind: str, needed: JointArray, what: str, because: str) -> Condition:
     """The necessary condition limit > needed of the joint whose limit is exceeded most, relative to it."""
     limit = robot.effort_limit if kind == "effort" else robot.velocity_limit
-    share = needed / limit
+    share = np.divide(needed, limit, out=np.zeros_like(limit), where=np.isfinite(limit))
     worst = int(np.argmax(share))
     unit = units("torque" if kind == "effort" else kind, robot.prismatic)[worst]
     checks = Assumption.EFFORT if kind == "effort" else Assumption.VELOCITY

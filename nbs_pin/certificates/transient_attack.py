@@ -23,6 +23,7 @@ from nbs_pin.base.units import counted, measured
 from nbs_pin.certificates.adaptive_bound import TransientBound
 from nbs_pin.certificates.ensemble import MOST_PERIODS, TIME_CONSTANTS, motions_of, slowest_rate
 from nbs_pin.certificates.transient_search import ROUNDING, Load, Reached, TransientSearch
+from nbs_pin.controllers.compiled_adaptive import checked_period
 from nbs_pin.motions.references import DesiredMotion
 
 _LEAST_RUNS, _FINER = 10, 4
@@ -56,7 +57,8 @@ class TransientAttack(Shown):
     history: Float[np.ndarray, " rounds"]
     """The largest share of |z1_i| in its bound after every round of the search."""
     finer: Reached | None
-    """The largest values of the run that exceeds a bound with a quarter of its period; None where none does."""
+    """The largest values of the run that exceeds a bound with a quarter of its period; None where none does, or
+    a torque is cut off in it."""
     interrupted: bool
     """Whether Ctrl-C ended the search early."""
 
@@ -85,10 +87,14 @@ class TransientAttack(Shown):
         beyond = f"V was {self.storage:.3g} J, beyond {self.bound.storage_within:.3g} J"
         if shares[k] > ROUNDING:
             beyond = f"{self.bound.joint_names[k]} was {error} off, beyond {most}"
-        held = self.finer is not None and not self.finer.exceeds(self.bound)
-        why = "the same run with a quarter of the period stays within it: the hold of the torque did it, not the proof"
-        other = "the same run with a quarter of the period exceeds it too: the arm is not as the bound assumes"
-        return f"BOUND EXCEEDED: {beyond}; {why if held else other}"
+        finer = "the same run with a quarter of the period"
+        if self.finer is None:
+            why = f"in {finer} a torque is cut off, so that it does not tell why"
+        elif self.finer.exceeds(self.bound):
+            why = f"{finer} exceeds it too: the hold of the torque alone does not explain it"
+        else:
+            why = f"{finer} stays within it: the hold of the torque did it, not the proof"
+        return f"BOUND EXCEEDED: {beyond}; {why}"
 
     def summary(self) -> dict[str, Any]:
         """What was found as JSON can store it."""
@@ -161,7 +167,7 @@ def transient_attack(
         >>> bool((nbs.transient_attack(bound, runs=10).joint_errors <= bound.joint_errors).all())
         True
     """
-    period = bound.law.period if period is None else period
+    period = bound.law.period if period is None else checked_period(period, bound.law.period)
     followed = motions_of(bound.law.law.dynamics, reference, seed)
     search = TransientSearch(bound, followed, _steps(bound, followed[0], duration, period), period)
     history, interrupted = _searched(search, runs, seed, progress)

@@ -26,6 +26,7 @@ from nbs_pin.kernels.trees import tree_torques
 from nbs_pin.motions.references import DesiredMotion
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.loop import Loop
+from nbs_pin.simulation.plant_steps import stable_step
 from nbs_pin.simulation.rollout import Batch, scene_of
 from nbs_pin.simulation.simulate import simulate
 
@@ -177,6 +178,7 @@ class TransientSearch:
         return simulate(
             DynamicsPlant(truth, friction=self.bound.friction), self.bound.law, self.motions[trial.motion],
             self.steps * self.period, self.period, q0=trial.q0, v0=trial.v0, disturbance=disturbance, check=False,
+            plant_step=self._loop(self.period).step,
         )  # fmt: skip
 
     def trial(self, x: Float[np.ndarray, " size"]) -> Trial:
@@ -219,13 +221,13 @@ class TransientSearch:
                 aims, scene._replace(truth=truth), scene.limit, law, tree, adapting.unknown, adapting.start.copy(),
                 work, motion,
             )  # fmt: skip
-            if (np.abs(motion.command) > scene.limit).any():
-                return None
             if not finite:
                 raise SimulationDiverged(
                     f"the closed loop diverged with {trial.load.told(self.bound.frame)}; take a shorter control "
                     f"period than {period:g} s."
                 )
+            if (np.abs(motion.command) > scene.limit).any():
+                return None
             q_ref, v_ref, _ = course.desired.swapaxes(0, 1)
             values = loaded_storage(self.inner, truth, motion.q, motion.v, q_ref, v_ref)
             errors = np.abs(self.inner.dynamics.difference(motion.q, q_ref)).max(axis=0)
@@ -246,8 +248,9 @@ class TransientSearch:
 
     def _loop(self, period: float) -> Loop:
         plant = DynamicsPlant(self.inner.dynamics, friction=self.bound.friction)
-        steps = round(self.steps * self.period / period)
-        return Loop.of(plant, self.inner.nv, steps * period, period, plant_step=None, effort_limit=None, lookahead=None)
+        steps, robot = round(self.steps * self.period / period), self.bound.law.robot
+        given = {"plant_step": stable_step(plant, robot, period), "effort_limit": None, "lookahead": None}
+        return Loop.of(plant, self.inner.nv, steps * period, period, **given)
 
     def _course(self, motion: DesiredMotion, period: float) -> Course:
         batch = Batch.of(self._loop(period), motion)

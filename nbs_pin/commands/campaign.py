@@ -12,7 +12,7 @@ from nbs_pin.base.progress import heartbeat
 from nbs_pin.base.summaries import RUN, SUMMARY, summary_in
 from nbs_pin.base.units import counted, percent
 from nbs_pin.campaigns.campaign import Campaign as Plan
-from nbs_pin.campaigns.journal import JOURNAL
+from nbs_pin.campaigns.journal import JOURNAL, forget
 from nbs_pin.campaigns.table import CampaignTable, check_parquet, figures_of_rows, in_words, run_campaign
 from nbs_pin.campaigns.trials import run_of
 from nbs_pin.cli.campaign import Campaign
@@ -35,7 +35,7 @@ def run(options: Campaign, console: Console, notes: Console) -> None:
     results = Results.of(options, options.file.stem, None, workers=None, cluster=None, campaign=plan.plan)
     begun = (results.folder / JOURNAL).exists()
     if options.force:
-        (results.folder / JOURNAL).unlink(missing_ok=True)
+        forget(results.folder)
     elif not begun:
         results = results.check(FILES, force=False, whose="another command")
     with results.made() as folder:

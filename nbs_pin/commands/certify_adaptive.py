@@ -58,11 +58,10 @@ def certify_adaptive(options: Certify, law: AdaptiveLaw, console: Console, notes
             motion, duration = _motion(options, law)
             bound = _bound(options, law, motion, duration)
         seen = None if watched is None else bound.check(watched)
-        found = None
+        found, interrupted = None, False
         if options.attack:
             motions = [motion, *motions_of(law.law.dynamics, None, options.seed)[1:]]
-            found = transient_attack(bound, reference=motions, period=options.period, seed=options.seed, progress=True)
-        interrupted = found is not None and found.interrupted
+            found, interrupted = _attacked(bound, motions, options)
         figures = _figures(options, bound, found, seen)
         verdict = verdict_of(figures, interrupted=interrupted)
         with results.replaced((PICTURE, WORST, MONITOR, WATCHED), figures, interrupted=interrupted) as draft:
@@ -125,6 +124,17 @@ def _draw(
 def _motion(options: Certify, law: AdaptiveLaw) -> tuple[DesiredMotion, float]:
     settings, period = {**options.units(), **options.tool.given()}, options.period or 0.001
     return motion_of(options.reference, law.robot, frequency=options.frequency, period=period, **settings)
+
+
+def _attacked(
+    bound: TransientBound, motions: list[DesiredMotion], options: Certify
+) -> tuple[TransientAttack | None, bool]:
+    """What the search found, and whether Ctrl-C ended it; the bound needs no search."""
+    try:
+        found = transient_attack(bound, reference=motions, period=options.period, seed=options.seed, progress=True)
+    except KeyboardInterrupt:
+        return None, True
+    return found, found.interrupted
 
 
 def _bound(options: Certify, law: AdaptiveLaw, motion: DesiredMotion, duration: float) -> TransientBound:

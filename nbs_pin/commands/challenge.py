@@ -19,7 +19,7 @@ from nbs_pin.benchmarks.challenge_tasks import ARMS, MOTIONS
 from nbs_pin.benchmarks.conditions import CONDITIONS
 from nbs_pin.benchmarks.contest import QUICK, Contest, entrants_of
 from nbs_pin.benchmarks.scores import Row, Standing, mean_errors, standings
-from nbs_pin.campaigns.journal import JOURNAL
+from nbs_pin.campaigns.journal import JOURNAL, forget
 from nbs_pin.cli.challenge import Challenge
 from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.results import Results, table, tell
@@ -35,10 +35,12 @@ def run(options: Challenge, console: Console, notes: Console) -> None:
     """Judge what the folder does not have yet, write and print; raises NbsPinError or OSError."""
     contest = _contest(options)
     results = Results.of(options, "challenge", None)
+    if options.force:
+        forget(results.folder)
+    elif not (results.folder / JOURNAL).exists():
+        results = results.check(FILES, force=False, whose="another command")
     began = time.perf_counter()
     with results.made() as folder:
-        if options.force:
-            (folder / JOURNAL).unlink(missing_ok=True)
         rows = contest.held(folder, workers=options.workers or cores(), progress=True)
         found = standings(rows)
         figures = {

@@ -17,7 +17,7 @@ from nbs_pin.kernels.cache_files import SealedCacheFile
 
 INTERPRETED = bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 """Whether kernels run as Python."""
-NOT_TAKEN = (TypeError, ValueError, numba.core.errors.NumbaError)
+NOT_TAKEN = (TypeError, ValueError, OverflowError, numba.core.errors.NumbaError)
 """What a kernel raises for arguments that are not of its types."""
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 

@@ -288,7 +288,7 @@ class Guarded:
         self._seen.append((sample, record, tau))
         if mode == at.STOPPED and self.report is None:
             self.report = self._reported(trace)
-        return tau
+        return tau.copy()
 
     def _taken(self, sample: Sample, aim: Reference, overrun: bool) -> tuple[int, np.ndarray, Reference]:
         """What the guard says of a sample, and its record; the sample is used as it is where the kernel takes it."""
@@ -324,8 +324,9 @@ class Guarded:
     def _command(self, record: np.ndarray, aim: Reference) -> Any:
         if len(aim.a) != len(self._unknown):  # positions and velocities are looked at by the guard
             return self._unknown
-        q, v = record[self._ahead_q], record[self._ahead_v]
-        command, self._memory = self.law.step(self._memory, q, v, aim, self.guard.period)
+        # From the record, which is the guard's own: the caller may write into its arrays while the law uses them.
+        q, v, *aims = (record[row] for row in (self._ahead_q, self._ahead_v, *self._rows[at.AIM_Q : at.AIM_A + 1]))
+        command, self._memory = self.law.step(self._memory, q, v, Reference(*aims), self.guard.period)
         return command
 
     def _holds(self, q: JointArray) -> bool:
@@ -351,7 +352,7 @@ def _floats(x: Any) -> np.ndarray:
     """A copy as an array of numbers; NaN for what is none, such as text or a list of lists of several lengths."""
     try:
         return np.array(x, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return np.array(np.nan)
 
 
