@@ -14,6 +14,7 @@ from nbs_pin.commands import track as tracking
 from nbs_pin.controllers.registry import LAWS as LAW_NAMES, build_law
 from nbs_pin.motions.by_name import motion_of
 from nbs_pin.simulation.registry import build_plant
+from nbs_pin.simulation.run_figures import figures
 
 STATE = {"q": [0.3, -0.2], "v": [0.1, 0.4], "q_ref": [0.0, 0.1], "v_ref": [0.2, 0.0], "a_ref": [0.0, 1.0]}
 
@@ -164,10 +165,10 @@ def test_the_papers_motion_is_within_reach_of_the_bundled_arms():
 def test_leaving_the_position_range_is_told():
     robot = nbs.load_robot("panda")
     run = tracking.track(robot, duration=0.01).run
-    assert tracking.figures(run, robot)["outside_position_range_rad"] == [0.0] * 7
+    assert figures(run, robot)["outside_position_range_rad"] == [0.0] * 7
     q = run.q.copy()
     q[3, 2], q[4, 5] = robot.upper[2] + 0.25, robot.lower[5] - 0.5
-    outside = tracking.figures(dataclasses.replace(run, q=q), robot)["outside_position_range_rad"]
+    outside = figures(dataclasses.replace(run, q=q), robot)["outside_position_range_rad"]
     np.testing.assert_allclose(outside, [0.0, 0.0, 0.25, 0.0, 0.0, 0.5, 0.0], atol=1e-12)
 
 
