@@ -59,6 +59,20 @@ def test_a_run_of_the_search_is_the_simulated_loop(name, adapts):
         np.testing.assert_array_equal(run.disturbance[:-1], trial.tau_d)
 
 
+def test_a_load_comes_on_top_of_one_that_the_arm_is_known_to_carry():
+    robot = nbs.load_robot("panda").with_payload("panda_hand", 1.0, (0.0, 0.0, 0.1))
+    law = nbs.AdaptiveLaw(nbs.NeuralBackstepping.for_robot(robot), ("load",), frame="panda_hand", load_mass=1.0)
+    search = search_for(nbs.transient_bound(law, 0.5, 0.05))
+    load, q = Load(0.5, np.array([0.01, 0.0, 0.03])), np.full(7, 0.3)
+    truth = loaded_model(law, "panda_hand", *load)
+    errors, still = search.bound.law.law, np.zeros((1, 7))
+    value = loaded_storage(errors, search.loaded(load), q[None], q[None], q[None], still)
+    z2 = errors.errors(q, q, q, still[0], still[0]).z2
+    assert value[0] == pytest.approx(0.5 * z2 @ truth.mass_matrix(q) @ z2, rel=1e-12)
+    weights = [sum(body.mass for body in arm.model.inertias) for arm in (robot, truth.robot)]
+    assert weights[1] - weights[0] == pytest.approx(0.5)
+
+
 def test_the_tree_with_a_load_is_that_of_the_loaded_arm():
     bound = bound_for("panda")
     search, q = search_for(bound), np.linspace(-1.0, 1.0, 7)

@@ -134,3 +134,14 @@ def test_plant_steps_are_limited_too():
     found = tried(law, robot, torque=0.0, period=0.02, duration=1e3)
     assert found.count == 1
     assert found.duration == pytest.approx(0.02 * (PLANT_STEPS // 20))
+
+
+def test_an_unknown_payload_comes_on_top_of_a_known_one():
+    robot = nbs.load_robot("ur5").with_payload("tool0", 3.0)
+    law = nbs.NeuralBackstepping.for_robot(robot)
+    payload = nbs.Payload(0.2, link="tool0")
+    given = {"reference": motion_of(robot), "period": 1e-3, "uncertainty": nbs.Uncertainty(payload=payload)}
+    found = nbs.certify(law, np.zeros(6), **given)
+    weights = [sum(body.mass for body in arm.model.inertias) for arm in (robot, payload.on(robot))]
+    assert weights[1] - weights[0] == pytest.approx(0.2)
+    assert found.label is Label.PROVED, found.void

@@ -79,23 +79,28 @@ def with_conditions(
         conditions += start_margin(robot, law, (start.q, start.v), start.begin)
     if reference is not None and motion is not None and period is not None:
         arm = robot if robot is None or payload is None else payload.on(robot)
-        conditions += _tried(replace(certificate, robot=arm), reference, motion, period, joints)
+        conditions += _tried(certificate, arm, reference, motion, period, joints)
     return replace(certificate, margins=margins, conditions=tuple(conditions))
 
 
 def _tried(
-    certificate: Certificate, reference: DesiredMotion, motion: SampledMotion, period: float, joints: JointArray
+    certificate: Certificate,
+    arm: Robot | None,
+    reference: DesiredMotion,
+    motion: SampledMotion,
+    period: float,
+    joints: JointArray,
 ) -> tuple[Condition, ...]:
-    """What motions of the loop as it runs say of the bounds and of the effort limits."""
-    law, robot, start = certificate.controller, certificate.robot, certificate.start
-    loop = law, robot, certificate.friction.gap.arm, certificate.admissible
+    """What motions of the loop with that arm say of the bounds and of the effort limits."""
+    start = certificate.start
+    loop = certificate.controller, arm, certificate.friction.gap.arm, certificate.admissible
     begin = None if start is None else (start.q, start.v)
     readings = None if certificate.held is None else certificate.held.readings
     if readings is not None and not readings.is_plain:
         return ()  # late torques and encoders are not simulated
     lookahead = None if readings is None else readings.lookahead
     tried = TriedMotions.of(*loop, reference, float(motion.t[-1]), period, begin, lookahead)
-    return () if tried is None else tried.conditions(robot, joints)
+    return () if tried is None else tried.conditions(arm, joints)
 
 
 def _exactness(certificate: Certificate) -> tuple[Condition, ...]:

@@ -19,6 +19,8 @@ from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
 from nbs_pin.motions.references import DesiredMotion
+from nbs_pin.robots.carrying import carrying
+from nbs_pin.robots.urdf_options import Payload as Load
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.simulate import simulate
 
@@ -57,12 +59,13 @@ def fixed_law(
 
 
 def loaded_model(law: AdaptiveLaw, frame: str, mass: float, centre: Float[np.ndarray, "3"]) -> DynamicsProvider:
-    """The law's model with a point mass [kg] there [m]."""
+    """The law's model with a point mass [kg] there [m], besides a load that it carries there."""
     model = law.law.dynamics
     if mass == 0.0:
         return model
     if type(model) is PinocchioDynamics:
-        return PinocchioDynamics(law.robot.with_payload(frame, mass, com=centre.tolist()))
+        x, y, z = centre.tolist()
+        return PinocchioDynamics(carrying(law.robot, [(frame, Load(mass, (x, y, z)))]))
     first = law.estimate()
     at = 10 * [body.is_load for body in first.unknowns.bodies].index(True)
     values, point = first.values.copy(), np.append(centre, 1.0)

@@ -136,7 +136,7 @@ class TransientSearch:
     def expected(self, motion: int, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " size"]:
         """The vector with that motion and the load that is farthest from the first estimate."""
         x, worst = x.copy(), self.bound.worst
-        x[0], x[1] = (motion + 0.5) / len(self.motions), worst.mass / self.bound.load_mass
+        x[0], x[1] = (motion + 0.5) / len(self.motions), worst.mass / (self.bound.load_mass * _REACH)
         if self.sizes["centre"]:
             x[2:5] = 0.5 + 0.5 * worst.centre / (self.bound.load_radius * _REACH)
         return x

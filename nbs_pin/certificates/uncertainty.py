@@ -8,8 +8,10 @@ from jaxtyping import Float, Int
 
 from nbs_pin.base.arguments import a, check_fields, checked, maybe, number, text
 from nbs_pin.dynamics.pseudo_inertia import inertial_parameters
+from nbs_pin.robots.carrying import carrying
 from nbs_pin.robots.places import place_of, tool_frame
 from nbs_pin.robots.robot import ARM, Robot
+from nbs_pin.robots.urdf_options import Payload as Load
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,8 @@ class Payload:
         )
 
     def on(self, robot: Robot) -> Robot:
-        """The arm with all of the mass at the origin of the link, in place of a load that it carries there."""
-        return robot.with_payload(tool_frame(robot) if self.link is None else self.link, self.mass)
+        """The arm with all of the mass at the origin of the link, besides a load that it carries there."""
+        return carrying(robot, [(tool_frame(robot) if self.link is None else self.link, Load(self.mass))])
 
 
 @dataclass(frozen=True)
