@@ -93,6 +93,11 @@ def with_other_bodies(robot: Robot, p: float, rng: np.random.Generator) -> Robot
         joint.name: Drive(joint.damping, joint.friction, armature)
         for joint, armature in zip(robot.joints, robot.armature.tolist(), strict=True)
     }
+    return rewritten(robot, model, drives)
+
+
+def rewritten(robot: Robot, model: pin.Model, drives: dict[str, Drive]) -> Robot:
+    """The arm with the bodies of that model and these drives, by way of a description with them."""
     with tempfile.TemporaryDirectory() as folder:
         other = load_robot(write_urdf(robot, Path(folder) / "arm.urdf", model, drives), gravity=robot.gravity_vector)
     return replace(other.with_effort_limit(robot.effort_limit), name=robot.name)

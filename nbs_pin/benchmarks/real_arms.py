@@ -1,9 +1,7 @@
 """Arms as they are beside their descriptions: rotors, friction, other bodies, loads and encoders; trials on them."""
 
-import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +11,7 @@ from jaxtyping import Float
 from nbs_pin.base.arrays import JointArray, Vectors
 from nbs_pin.base.exceptions import SimulationDiverged
 from nbs_pin.base.records import Reference, Run
+from nbs_pin.benchmarks.conditions import rewritten
 from nbs_pin.controllers.controller import Controller
 from nbs_pin.dynamics.friction import JointFriction
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
@@ -20,7 +19,6 @@ from nbs_pin.motions.references import Sinusoid
 from nbs_pin.robots.joint_drive import Drive
 from nbs_pin.robots.places import tool_frame
 from nbs_pin.robots.robot import Robot, load_robot
-from nbs_pin.robots.urdf_writer import write_urdf
 from nbs_pin.simulation import metrics
 from nbs_pin.simulation.dynamics_plant import DynamicsPlant
 from nbs_pin.simulation.mujoco_plant import MujocoPlant
@@ -78,9 +76,7 @@ class RealArm:
             bare, own = (x.inertias[k].toDynamicParameters() for x in (self.told.model, model))
             model.inertias[k] = pin.Inertia.FromDynamicParameters(own + (factor - 1.0) * bare)
         drives = {joint.name: Drive(0.0, 0.0, x) for joint, x in zip(robot.joints, self.rotors.tolist(), strict=True)}
-        with tempfile.TemporaryDirectory() as folder:
-            written = load_robot(write_urdf(robot, Path(folder) / "arm.urdf", model, drives))
-        return replace(written.with_effort_limit(robot.effort_limit), name=self.name)
+        return rewritten(robot, model, drives)
 
     def trials(self, count: int, seed: int, stream: int) -> list["Trial"]:
         """Trials with loads, friction, motions and starts of their own; streams have no draw in common."""
