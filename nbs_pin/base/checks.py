@@ -18,6 +18,7 @@ SMALLEST = 1e-100
 MOST_NUMBERS = 2**28
 """Largest number of entries of an array given as an argument (2 GiB)."""
 _SHORT = 8
+_FEW = 4096  # BLAS sums longer arrays with threads, which spin on every core for a while afterwards
 
 
 def told(value: Any) -> str:
@@ -127,7 +128,7 @@ def vector_of(name: str, value: Any, n: int, unit: str = "") -> np.ndarray:
 
 def is_usual(x: np.ndarray) -> bool:
     """Whether every number is finite and at most `LARGEST` in magnitude; the sum of squares is the faster test."""
-    return bool(np.vdot(x, x) <= LARGEST**2) or bool((np.abs(x) <= LARGEST).all())
+    return (x.size <= _FEW and bool(np.vdot(x, x) <= LARGEST**2)) or bool((np.abs(x) <= LARGEST).all())
 
 
 def per_joint(record: Any, *names: str) -> None:
@@ -177,7 +178,7 @@ def whole(total: float, part: float, total_name: str, part_name: str, most: floa
 
 def all_finite(x: np.ndarray) -> bool:
     """Whether all numbers are finite; the sum of squares is a five times faster test, unless it overflows."""
-    return math.isfinite(np.vdot(x, x)) or bool(np.isfinite(x).all())
+    return (x.size <= _FEW and math.isfinite(np.vdot(x, x))) or bool(np.isfinite(x).all())
 
 
 def _in(unit: str) -> str:

@@ -16,6 +16,7 @@ from nbs_pin.cli.exit_codes import STOPPED
 from nbs_pin.cli.faults import Faults
 from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.results import table
+from nbs_pin.runtime.guard import Fault
 
 
 def run(options: Faults, console: Console, notes: Console) -> int:
@@ -29,7 +30,11 @@ def run(options: Faults, console: Console, notes: Console) -> int:
     chosen = [k for k, name in enumerate(numbers) if not options.only or name in options.only]
     began = time.perf_counter()
     found = matrix(chosen, options.arms, options.seeds, progress=True)
-    shown = table("faults", "level", "wanted", *options.arms, "", first="fault")
+    shown = table("faults", "wanted", *options.arms, "", first="fault")
+    for column in shown.columns[1:]:  # what is wanted and codes are words
+        column.justify, column.no_wrap, column.overflow = "left", False, "fold"
+    for column in shown.columns[2:-1]:
+        column.min_width = max(len(code.name) for code in Fault)
     rows: list[dict[str, Any]] = []
     for k in chosen:
         case, cells = MATRIX[k], []
@@ -44,7 +49,7 @@ def run(options: Faults, console: Console, notes: Console) -> int:
                 | {"passed": [v.passed for v in verdicts], "values": [v.value for v in verdicts], "said": said}
             )
         passed = all(v.passed for arm in options.arms for v in found[k, arm])
-        shown.add_row(case.fault, case.level, case.wanted, *cells, "" if passed else "FAILS")
+        shown.add_row(f"{case.fault}, {case.level}", case.wanted, *cells, "" if passed else "FAILS")
     failed = sum(not all(row["passed"]) for row in rows)
     with replaced_together(options.out, [SUMMARY]) as draft:
         summary = {"versions": versions(), "seeds": options.seeds, "rows": plain(rows)}
