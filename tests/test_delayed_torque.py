@@ -299,6 +299,22 @@ def test_readings_that_are_late_and_coarse_are_proved_for_ur5_where_it_is_slow()
     assert "1 ms after its reading, on encoder readings" in certificate.held.line.because
 
 
+def test_rotors_allow_coarser_readings_of_an_arm_of_six_joints():
+    robot = nbs.load_robot("ur5e")
+    inertia = effective_inertia(robot, nbs.PinocchioDynamics(robot))
+    gains = Gains(2.2, 170.0 * inertia, 23.0 * inertia)
+    law = nbs.NeuralBackstepping.for_robot(robot, gains=gains, damping_ceiling=0.05)
+    for weights in law.potential.network.parameters():
+        weights.data *= 0.3
+    reference, box = nbs.Sinusoid.for_robot(robot, 0.2), np.full(6, 0.5)
+    given = {"delay": H, "encoders": nbs.Encoders.of_bits(16)}
+    certificate = nbs.certify(law, box, reference=reference, period=H, **given)
+    assert certificate.label is Label.PROVED
+    assert certificate.held.is_proved
+    found = worst_found(law, reference, "late differences", box)
+    assert found <= certificate.error <= 5.0 * found
+
+
 def test_a_certificate_file_states_delay_and_encoders(tmp_path):
     law, reference = law_of("two_link")
     given = {"delay": 0.5 * H, "encoders": nbs.Encoders.of_bits(16)}

@@ -15,6 +15,7 @@ from nbs_pin.certificates.body_regressor import BodyRegressor
 from nbs_pin.certificates.body_response import Response, instants
 from nbs_pin.certificates.constants import constants_of
 from nbs_pin.certificates.sampled_motion import SampledMotion
+from nbs_pin.controllers.gains import Gains, effective_inertia
 from nbs_pin.dynamics.pseudo_inertia import pseudo_inertia
 from nbs_pin.dynamics.rigid_tree import RigidTree
 
@@ -211,6 +212,26 @@ def test_simulated_arms_of_the_box_stay_within_the_bound(name, torque):
         assert (peaks.joint_errors[0] <= found.joint_errors).all()
         worst = max(worst, float(peaks.error[0]))
     assert worst <= found.error <= (3.0 if torque == 0.0 else 8.0) * worst
+
+
+def test_two_kilograms_that_nobody_tells_are_proved_for_an_arm_with_its_rotors():
+    bare = nbs.load_robot("panda")
+    robot, payload = bare.with_armature(nbs.load_robot("fr3").armature), nbs.Payload(2.0)
+    inertia = effective_inertia(robot, nbs.PinocchioDynamics(robot))
+    gains = Gains(6.0, 12000.0 * inertia, 1200.0 * inertia)
+    reference, given = nbs.Sinusoid.for_robot(robot), {"duration": 3.0, "uncertainty": nbs.Uncertainty(payload=payload)}
+    law = nbs.NeuralBackstepping.for_robot(robot, gains=gains, damping_ceiling=0.05)
+    found = nbs.certify(law, 0.0, reference=reference, **given)
+    assert str(found.label) == "PROVED"
+    worst = 0.0
+    for mass in (1.0, 2.0):
+        arm = nbs.PinocchioDynamics(nbs.Payload(mass).on(robot))
+        peaks = worst_of(law, np.zeros((1, 12000, 7)), reference, period=0.00025, plant_dynamics=arm)
+        assert (peaks.joint_errors[0] <= found.joint_errors).all()
+        worst = max(worst, float(peaks.error[0]))
+    assert worst <= found.error <= 5.0 * worst
+    with pytest.raises(nbs.CertificateRefused, match="panda states no rotor inertia, and with armature=… more"):
+        nbs.certify(nbs.NeuralBackstepping.for_robot(bare), 0.0, reference=reference, **given)
 
 
 def test_a_start_beside_the_reference_and_a_payload_stay_within_their_bounds():

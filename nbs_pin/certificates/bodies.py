@@ -13,6 +13,7 @@ from nbs_pin.certificates.body_motion import AlongReference
 from nbs_pin.certificates.body_rates import BodyRates
 from nbs_pin.certificates.body_regressor import BodyRegressor
 from nbs_pin.certificates.certificate import Start
+from nbs_pin.certificates.claims import if_without_rotors
 from nbs_pin.certificates.comparison_system import ComparisonSystem
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.friction_error import FrictionError
@@ -70,7 +71,7 @@ def bounds_for_all(
         refuse("within these shares M is not shown to be positive definite in every pose", "give smaller ones")
     along = AlongReference.of(regressor, law, reference, float(motion.t[-1]), constants)
     rates = BodyRates.of(bounds, constants, motion)
-    terms = Terms(law, constants, bounds, along, rates, friction)
+    terms = Terms(law, constants, bounds, along, rates, friction, if_without_rotors(robot))
     return body_error(terms, base, 0.0 if start is None else _first(law, regressor, start))
 
 

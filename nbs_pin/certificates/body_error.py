@@ -85,6 +85,8 @@ class Terms:
     along: AlongReference
     rates: BodyRates
     friction: FrictionError
+    rotors: str
+    """What to say of rotors where nothing is proved."""
 
     def at(self, storage: float) -> Local:
         """The terms while V' ≤ `storage` [J]."""
@@ -223,10 +225,8 @@ def body_error(terms: Terms, base: ComparisonSystem, start: float) -> BodyError:
     left = "they may take more than all the damping"
     if k.beta < 1.0:
         left = f"1 − β = {1.0 - k.beta:.3g}, α = {k.cross:.3g} and ω = {k.omega:.3g}"
-    refuse(
-        f"the errors of the bodies leave no bound: {left}",
-        "state smaller shares or a lighter payload, or take a larger D₀",
-    )
+    remedy = "state smaller shares or a lighter payload, or take a larger D₀"
+    refuse(f"the errors of the bodies leave no bound: {left}", remedy + terms.rotors)
 
 
 def _bounds(terms: Terms, comparison: ComparisonSystem, start: float, storage: float, t: Scalars) -> BodyError:

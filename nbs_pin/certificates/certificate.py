@@ -19,7 +19,7 @@ from nbs_pin.base.shown import Cells, Shown, joints_told
 from nbs_pin.base.units import measured, over_joints, several, units
 from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.body_error import BodyError
-from nbs_pin.certificates.claims import Assumed, Assumption, Condition, Role, assumed
+from nbs_pin.certificates.claims import Assumed, Assumption, Condition, Role, assumed, if_without_rotors
 from nbs_pin.certificates.comparison_system import ComparisonSystem, Level
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.error_bounds import radians
@@ -214,7 +214,8 @@ class Certificate(Shown):
             return ""
         longest = f"the longest period with a proof is {1e3 * self.held.longest:.3g} ms"
         why = self.held.why_not or (longest if self.held.longest else "no period tried has a proof")
-        return f"nothing is proved of torques held for {1e3 * self.held.readings.period:.4g} ms: {why}"
+        rotors = "" if self.held.why_not or self.robot is None else if_without_rotors(self.robot)
+        return f"nothing is proved of torques held for {1e3 * self.held.readings.period:.4g} ms: {why}{rotors}"
 
     @property
     def joint_names(self) -> tuple[str, ...]:

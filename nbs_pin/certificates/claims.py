@@ -7,6 +7,8 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 from nbs_pin.base.claims import Label
+from nbs_pin.base.doors import BLANK, option
+from nbs_pin.robots.robot import Robot
 
 
 class Assumption(StrEnum):
@@ -92,3 +94,10 @@ def assumed(assumption: Assumption, conditions: Iterable[Condition], text: str =
     else:
         checked = "checked in part" if own else "not checked"
     return Assumed(text or str(assumption), checked)
+
+
+def if_without_rotors(robot: Robot) -> str:
+    """What to add where nothing is proved for want of inertia, if the arm's description states no rotors."""
+    if robot.armature.any():
+        return ""
+    return f"; {robot.name} states no rotor inertia, and with {option('armature', BLANK)} more is proved"
