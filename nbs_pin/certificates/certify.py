@@ -147,7 +147,8 @@ def _held(
         motion = SampledMotion.of(lambda t: reference(t - readings.oldest), law.nv, motion.t[-1] + readings.oldest)
     gap = certificate.friction.gap
     # Of friction known to a share, the least is in D₀, and the most acts.
-    loop = law, certificate.robot, constants, certificate.comparison, 2.0 * gap.arm.viscous - gap.damping
+    friction = 2.0 * gap.arm.viscous - gap.damping, np.abs(gap.viscous)
+    loop = law, certificate.robot, constants, certificate.comparison, *friction
     begin = 0.0 if certificate.start is None else certificate.start.storage
     held = held_torque(*loop, motion, jerk, certificate.storage, begin, readings, other)
     if not held.is_proved:

@@ -13,7 +13,7 @@ from nbs_pin.certificates.comparison_system import ComparisonSystem
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.coriolis import MOST_JOINTS, CoriolisBounds
 from nbs_pin.certificates.effort_bound import Asked, torque_bound
-from nbs_pin.certificates.sampled_law import Curvature, SampledLaw
+from nbs_pin.certificates.sampled_law import Curvature, Fed, SampledLaw
 from nbs_pin.certificates.sampled_loop import kept_level
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
@@ -141,6 +141,7 @@ def held_torque(
     constants: Constants,
     comparison: ComparisonSystem,
     viscous: JointArray,
+    unfed: JointArray,
     motion: SampledMotion | None,
     jerk: JointArray | None,
     least: float,
@@ -150,8 +151,8 @@ def held_torque(
 ) -> HeldTorque:
     """The bounds for a period, or the longest period that has them.
 
-    viscous: friction of the joints, at most. jerk: bound of |ȧ_d|. least: V∞ in continuous time. begin: V(0) of the
-    start, 0 without one. other: what else of the loop the proof does not cover.
+    viscous, unfed: friction of the joints, and what of it is not fed forward, at most. jerk: bound of |ȧ_d|. least: V∞
+    in continuous time. begin: V(0) of the start, 0 without one. other: what else of the loop the proof does not cover.
     """
     why_not = other or _why_not(law, robot, motion, jerk)
     unknown, period = np.full(law.nv, np.inf), readings.period
@@ -161,13 +162,14 @@ def held_torque(
     arm = CoriolisBounds.of(robot, constants)
     bounds = arm.motion(motion, constants.floor, jerk)
     numbers = constants, arm, bounds, comparison.t, comparison.alpha, viscous
+    fed = Fed.of(law.friction, constants, comparison.power)
 
     def loop(h: float) -> SampledLaw:
         read = readings.at(h)
-        return SampledLaw(law, *numbers, h, read.lookahead, read.delay, read.steps)
+        return SampledLaw(law, *numbers, h, read.lookahead, read.delay, read.steps, fed, unfed)
 
     def room(level: float) -> JointArray:
-        if not math.isfinite(level):
+        if not math.isfinite(level) or law.friction is not None:
             return unknown
         asked = Asked(law, constants, *Curvature.with_diagonal(loop(period), level), level)
         return torque_bound(asked, arm, bounds, motion.half)
@@ -213,9 +215,7 @@ def _why_not(law: LyapunovLaw, robot: Robot | None, motion: SampledMotion | None
 
 
 def why_no_arm_bounds(law: LyapunovLaw, robot: Robot | None) -> str:
-    """Why the velocities and torques of a loop are not bounded in every pose of the arm; empty if they are."""
+    """Why the velocities of a loop are not bounded in every pose of the arm; empty if they are."""
     if robot is None or type(law.dynamics) not in (PinocchioDynamics, AnalyticDynamics):
         return "only for the exact model of an arm"
-    if law.nv > MOST_JOINTS:
-        return f"not tried for more than {MOST_JOINTS} joints"
-    return "friction that is fed forward is not part of the proof" if law.friction is not None else ""
+    return f"not tried for more than {MOST_JOINTS} joints" if law.nv > MOST_JOINTS else ""

@@ -201,6 +201,13 @@ def changed(b: Hold, time: float) -> float:
     return min(rest, b.loop.loss_of_speed * b.curve.change * (time * b.sups.rate + b.bent.speed + b.late.position))
 
 
+def slipped(b: Hold, time: float, rate: Any, acceleration: Any, one: Any) -> Any:
+    """|φ̂ − φ|, for a bound of |t − t̂| or its mean, with the suprema of ż1, ż2 and of what is constant."""
+    bent = b.loop.timing.bow * (acceleration + b.turning * rate)
+    moved = b.turning * (time * rate + bent + b.late.position * one)
+    return moved + time * b.loop.motion.acceleration * one
+
+
 def _forces(b: Hold) -> tuple[Float[np.ndarray, "3 9"], Float[np.ndarray, " 3"]]:
     """|Mż2|_*, |ż2| and |ż2|_M without the damping that is held: by the suprema, and constant."""
     k, curve, motion, times, noise = b.loop.constants, b.curve, b.loop.motion, b.loop.timing, b.loop.noise
@@ -217,6 +224,9 @@ def _forces(b: Hold) -> tuple[Float[np.ndarray, "3 9"], Float[np.ndarray, " 3"]]
     row = row + 2.0 * sum_1 * by_speed * (fall * L + b.turning * b.loop.lead * R)
     constant = b.loop.t + curve.steepest * b.late.position + late + noise.rate + b.loop.arm.gravity * sum_1
     constant += 2.0 * sum_1 * by_speed * (motion.speed + b.turning * b.late.position)
+    # friction that is fed forward at φ̂, against that of the arm at v
+    row = row + b.loop.fed.viscous * slipped(b, times.half, R, A, 0.0)
+    constant += b.loop.fed.jump + b.loop.fed.viscous * slipped(b, times.half, 0.0, 0.0, 1.0)
     rows, constants = np.outer(torque, row), torque * constant
     rows += np.array([here * S, snu * form * SM, b.stretch * form * SM])
     # C(q, v̂ − v)φ and C(q, v)(φ̂ − φ)

@@ -89,6 +89,8 @@ def _why_not(certificate: Certificate) -> str:
         return "the model differs from the arm; certify a law with the model of the arm"
     if certificate.held is not None and certificate.held.is_proved:
         return "its bounds with held torques are those of one reference; certify without a period"
+    if certificate.controller.friction is not None:
+        return "friction that is fed forward is not part of its bounds of torques"
     if not certificate.storage > 0.0:
         return "the certificate allows no disturbance; certify for one above 0"
     return ""

@@ -10,12 +10,47 @@ from jaxtyping import Float
 
 from nbs_pin.base.arrays import JointArray
 from nbs_pin.base.rounding import diagonal_below, largest_eigenvalue, least_eigenvalue
+from nbs_pin.certificates.admissible import Admissible
 from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.coriolis import CoriolisBounds, MotionBounds
 from nbs_pin.certificates.sampling import Noise, Timing
 from nbs_pin.controllers.lyapunov_law import LyapunovLaw
+from nbs_pin.dynamics.friction import JointFriction
 
 UP = 1.0 + 1e-9
+
+
+class Fed(NamedTuple):
+    """Friction f̂ = b̂φ + ĉ tanh(φ/ε) that the law feeds forward and holds."""
+
+    jump: float = 0.0
+    """|2ĉ|_* [√W]."""
+    viscous: float = 0.0
+    """λ_max(D₀^-½b̂D₀^-½)."""
+    slope: float = 0.0
+    """λ_max(D₀^-½(b̂ + ĉ/ε)D₀^-½)."""
+    power: float = 0.0
+    """P of docs/certificates.md §8 [W]."""
+
+    @classmethod
+    def of(cls, friction: JointFriction | None, constants: Constants, power: float) -> "Fed":
+        """That of the law, None for none; `power` is P."""
+        if friction is None:
+            return NOT_FED
+        jump = Admissible.of(2.0 * friction.coulomb, len(friction.coulomb)).energy(constants.metric)
+        root = root_of_inverse(constants.floor)
+        steepest = friction.viscous + friction.coulomb / friction.transition
+        viscous, slope = (UP * largest_eigenvalue(root @ np.diag(x) @ root) for x in (friction.viscous, steepest))
+        return cls(math.sqrt(jump) * UP, viscous, slope, power * UP)
+
+
+NOT_FED = Fed()
+
+
+def root_of_inverse(floor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """D₀^-½."""
+    values, vectors = np.linalg.eigh(floor)
+    return np.asarray((vectors / np.sqrt(values)) @ vectors.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +75,10 @@ class SampledLaw:
     """From the reading to the beginning of the hold that it acts in [s]."""
     step: JointArray | None = None
     """Encoder steps, with velocities that are differences over a period [rad]; None for exact states."""
+    fed: Fed = NOT_FED
+    """What the law feeds forward of friction."""
+    unfed: JointArray | None = None
+    """|b − b̂|, the viscous friction that it does not, None for `friction` [N·m·s/rad]."""
 
     @cached_property
     def timing(self) -> Timing:
@@ -71,13 +110,17 @@ class SampledLaw:
     @cached_property
     def root(self) -> Float[np.ndarray, "n n"]:
         """D₀^-½."""
-        values, vectors = np.linalg.eigh(self.constants.floor)
-        return np.asarray((vectors / np.sqrt(values)) @ vectors.T)
+        return root_of_inverse(self.constants.floor)
 
     @cached_property
     def viscous(self) -> float:
         """Largest share of viscous friction in D₀."""
         return largest_eigenvalue(self.root @ np.diag(self.friction) @ self.root)
+
+    @cached_property
+    def unfed_viscous(self) -> float:
+        """The same for what is not fed forward."""
+        return self.viscous if self.unfed is None else largest_eigenvalue(self.root @ np.diag(self.unfed) @ self.root)
 
     @cached_property
     def loss_of_speed(self) -> float:

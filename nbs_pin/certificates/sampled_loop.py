@@ -33,6 +33,7 @@ from nbs_pin.certificates.hold import (
     noisy,
     predicted,
     rows_in_g,
+    slipped,
 )
 from nbs_pin.certificates.sampled_law import UP, SampledLaw
 
@@ -141,7 +142,7 @@ def _excess(
     changing = isk * bend_m + isk * swing * b.turn * phi_m + 2.0 * swing * by_speed_m * v_dot
     changing = changing + 2.0 * b.speed_1 * by_speed * (motion.speed * ONE + rate)
     changing = changing + arm.gravity * (motion.speed_1 * ONE + arm.sum * rate) + swing * b.turn * force
-    changing = changing + b.loop.viscous * (acceleration + b.turning * rate)
+    changing = changing + b.loop.viscous * acceleration + b.loop.unfed_viscous * b.turning * rate
     drift, drift_m = k.nu * h * h / 12.0 * changing, snu * h * h / 12.0 * changing
     ripple, ripple_m = 0.5 * h * acceleration, 0.5 * h * acceleration_m
     q = _Form()
@@ -161,6 +162,7 @@ def _excess(
     _add_held(b, sup, q, turned, v_dot, seen)
     spread = h / math.sqrt(12.0) * (k.nu * (sup.gradient + (here + b.loop.viscous) * Y) + k.omega * Y)
     spread = spread + h * b.loop.timing.unevenness * k.nu * Y
+    _add_fed(b, sup, spread, q)
     ends = _Form()
     ends.add(h * h / 12.0 * curve.steepest, rate, rate)
     ends.add(h * h / 12.0, sup.gradient, acceleration + b.turning * rate)
@@ -170,6 +172,19 @@ def _excess(
     _add_past(b, sup, drift, q, ends)
     past = b.loop.past
     return past**2 * q.matrix, past * spread, past**2 * ends.matrix
+
+
+def _add_fed(b: Hold, sup: Suprema, spread: Float[np.ndarray, " 5"], q: _Form) -> None:
+    """Adds ȳᵀ⟨f̂(φ̂) − f̂(φ)⟩, the power of f̂(φ) − f(v), and what both move z2 by beside ȳ."""
+    fed, times = b.loop.fed, b.loop.timing
+    mean, most = (slipped(b, time, sup.rate, sup.acceleration, ONE) for time in (times.mean, times.half))
+    # ĉ tanh changes by its slope times the way, and by no more than 2ĉ.
+    steep = fed.slope * slipped(b, times.mean, b.sups.rate, b.sups.acceleration, 1.0)
+    flat = fed.viscous * slipped(b, times.mean, b.sups.rate, b.sups.acceleration, 1.0) + fed.jump
+    q.add(1.0, Y, fed.slope * mean if steep < flat else fed.viscous * mean + fed.jump * ONE)
+    q.add(0.5 * b.loop.h * fed.jump, sup.acceleration, ONE)
+    q.add(1.0, spread, fed.viscous * most + fed.jump * ONE)
+    q.add(fed.power, ONE, ONE)
 
 
 def _add_past(b: Hold, sup: Suprema, drift: Float[np.ndarray, " 5"], q: _Form, ends: _Form) -> None:
