@@ -184,14 +184,17 @@ def test_results_of_another_run_are_kept_unless_forced(two_link, capsys):
 # Refusals: exit code 2 and one sentence.
 
 REFUSED = {
-    "": f"Expected one of {{{', '.join(cli.COMMANDS)}}}",
+    "": f"no command was given; give one of {', '.join(cli.COMMANDS)}, or see nbs-pin --help.",
+    "--hlep": "no command is called '--hlep'; did you mean --help?",
     "trak panda": "no command 'trak'; did you mean track?",
     "track": "ROBOT",
     "track pand": "did you mean panda?",
     "track no/arm.urdf": "no file 'no/arm.urdf'",
     "track panda x": "takes no argument 'x'",
     "track panda --durtion 3": "did you mean --duration?",
-    "track panda --duration": "Missing value for argument '--duration'",
+    "track panda --duration": "--duration was given no value; see nbs-pin track --help.",
+    "track panda --reference cirle:0.1 --frame panda_hand": "did you mean circle?",
+    "track panda --armature joint1=0.2": "did you mean panda_joint1?",
     "track panda --plant gazebo": "--plant is 'gazebo'; give mujoco, pinocchio.",
     "track panda --duration 1.0005": "expected a whole number",
     "track panda --duration 90000 --period 1e-5": "GB",

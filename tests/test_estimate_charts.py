@@ -167,7 +167,7 @@ def test_a_centre_may_be_off_by_what_mass_and_moment_may_be_off_together():
 def test_track_tells_the_load_and_another_law_takes_the_picture_away(tmp_path):
     folder, line = tmp_path / "out", ("track", "two_link", "--duration", "5", "--payload", "0.3@1")
     printed = printed_by(*line, "--controller", "adaptive", "--out", folder)
-    assert "the law believes in a load of 0.3 kg at tip" in printed.replace("\n", " ")
+    assert "the law estimates a load of 0.3 kg at tip" in printed.replace("\n", " ")
     assert str(folder / "estimates.png") in printed.replace("\n", "")
     files = {"run.npz", "tracking.png", "estimates.png", "replay.html", "summary.json"}
     assert contents(folder).keys() == files

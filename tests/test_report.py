@@ -237,7 +237,7 @@ def test_errors_that_only_end_near_zero_have_not_converged(time, level):
     assert verdict_of(figures).level == level
     assert ("converged: from" in verdict_of(figures).said) == (level == GOOD)
     said = verdict_of({"laws": {"nbs": figures}}).said
-    assert said.startswith("of the laws, nbs is off the least" if level == GOOD else "none of nbs converged")
+    assert said.startswith("of the laws, nbs has the smallest error" if level == GOOD else "none of nbs converged")
     both = verdict_of(figures, interrupted=True)
     assert both.said == "interrupted before its end"
     assert both.level == (BAD if level == BAD else WARNING)

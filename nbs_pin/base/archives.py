@@ -51,9 +51,11 @@ def read_archive(path: str | Path, file_format: str) -> dict[str, bytes]:
     content = Path(path).read_bytes()
     entries = _unzipped(path, content, file_format)
     manifest = parse_json(path, MANIFEST, entries.pop(MANIFEST, b"{}"))
+    if "format" not in manifest:
+        raise FileFormatError(f"{path}: no '{file_format}' file; give one that this package wrote.")
     if manifest.get("format") != file_format:
         raise FileFormatError(
-            f"{path}: the format is {manifest.get('format')!r}, expected '{file_format}'; write it with this version."
+            f"{path}: the format is {manifest['format']!r}, expected '{file_format}'; write it with this version."
         )
     listed, found = manifest.get("entries"), {name: _digest(entry) for name, entry in entries.items()}
     stated = listed if isinstance(listed, dict) else {}

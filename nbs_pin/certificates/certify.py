@@ -22,7 +22,7 @@ from nbs_pin.certificates.constants import Constants, constants_of
 from nbs_pin.certificates.encoders import Encoders
 from nbs_pin.certificates.error_bounds import errors, radians
 from nbs_pin.certificates.friction_error import FrictionError, FrictionGap, friction_error
-from nbs_pin.certificates.held_torque import Readings, held_torque, unknown_before
+from nbs_pin.certificates.held_torque import Readings, held_torque, unknown_before, unproved
 from nbs_pin.certificates.model_error import ModelError, model_error
 from nbs_pin.certificates.model_structure import is_exact
 from nbs_pin.certificates.sampled_motion import SampledMotion
@@ -116,7 +116,8 @@ def certify(
     comparison = _comparison(constants, admissible, error, rest)
     if bodies is not None and reference is not None and motion is not None:
         found = bounds_for_all(law, bodies, constants, comparison, rest, reference, motion, start)
-        certificate = _for_all(found, law, admissible, constants, rest, arm, start)
+        read = None if period is None else Readings.of(period, lookahead, delay, None)
+        certificate = _for_all(found, law, admissible, constants, rest, arm, start, read)
         return with_conditions(certificate, reference, motion, period, bodies.payload)
     least = level(comparison)
     if not math.isfinite(least.storage):
@@ -213,9 +214,12 @@ def _for_all(
     friction: FrictionError,
     robot: Robot | None,
     start: Start | None,
+    read: Readings | None,
 ) -> Certificate:
     """The certificate of a loop with uncertain bodies."""
+    why_not = "bodies that are not known are not part of the proof"
     return Certificate(
+        held=None if read is None else unproved(read, law.nv, why_not),
         controller=law,
         admissible=admissible,
         constants=constants,

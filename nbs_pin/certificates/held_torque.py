@@ -156,9 +156,8 @@ def held_torque(
     """
     why_not = other or _why_not(law, robot, motion, jerk)
     unknown, period = np.full(law.nv, np.inf), readings.period
-    nothing = HeldTorque(readings, *_NOTHING, unknown, 0.0, why_not)
     if why_not or robot is None or motion is None or jerk is None:
-        return nothing
+        return unproved(readings, law.nv, why_not)
     arm = CoriolisBounds.of(robot, constants)
     bounds = arm.motion(motion, constants.floor, jerk)
     numbers = constants, arm, bounds, comparison.t, comparison.alpha, viscous
@@ -188,6 +187,11 @@ def held_torque(
         middle = math.sqrt(low * high)
         low, high = (middle, high) if math.isfinite(kept_level(loop(middle), begin).potential) else (low, middle)
     return HeldTorque(readings, *_NOTHING, room(begin) if readings.is_plain else unknown, low, "")
+
+
+def unproved(readings: Readings, nv: int, why_not: str) -> HeldTorque:
+    """Nothing is proved of held torques, for this reason."""
+    return HeldTorque(readings, *_NOTHING, np.full(nv, np.inf), 0.0, why_not)
 
 
 def unknown_before(reference: DesiredMotion, nv: int, jerk: JointArray, span: float) -> str:

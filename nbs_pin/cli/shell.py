@@ -174,7 +174,7 @@ def parse(arguments: list[str]) -> Any:
     except SystemExit as stop:
         if stop.code in (0, None):
             return None
-        raise OptionError(f"{_first_paragraph(complaint.getvalue())}; see nbs-pin --help.") from None
+        raise OptionError(_complained(arguments, _first_paragraph(complaint.getvalue()))) from None
     if unknown:
         groups = [command, *(group for group in vars(command).values() if is_dataclass(group))]
         known = [f"--{name.replace('_', '-')}" for group in groups for name in vars(group)]
@@ -193,11 +193,22 @@ def _near(word: str, words: Iterable[str]) -> str:
     return f"did you mean {near[0]}? " if near else ""
 
 
+def _complained(arguments: list[str], said: str) -> str:
+    """What tyro complains of, in a sentence that names the page of help to read."""
+    if not arguments or arguments[0] not in COMMANDS:
+        given = f"no command is called '{arguments[0]}'" if arguments else "no command was given"
+        hint = _near(arguments[0], ("--help", "--version")) if arguments else ""
+        return f"{given}; {hint}give one of {', '.join(COMMANDS)}, or see nbs-pin --help."
+    bare = re.fullmatch(r"Missing value for argument '(.*?)'\. Expected .* values", said)
+    return f"{f'{bare[1]} was given no value' if bare else said}; see nbs-pin {arguments[0]} --help."
+
+
 def _first_paragraph(box: str) -> str:
-    """The text in tyro's error box before its first rule, as one line."""
+    """The text in tyro's error box before its first rule, as one line; where it draws no box, its title is left out."""
     inside = [line.strip("│ ") for line in box.splitlines() if not line.startswith(("╭", "╰"))]
-    rules = [k for k, line in enumerate(inside) if line.startswith("─")]
-    return _one_line(" ".join(inside[: rules[0] if rules else None])).rstrip(".")
+    parts = re.split(r"\n(?:─+|-{3,})\n", "\n".join(inside))
+    titled = len(parts) > 1 and not box.lstrip().startswith("╭")
+    return _one_line(parts[1 if titled else 0]).rstrip(".")
 
 
 def _one_line(text: str) -> str:

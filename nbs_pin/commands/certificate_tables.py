@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from nbs_pin.base.units import SLIDING, column, percent, units
+from nbs_pin.certificates.claims import Role
 from nbs_pin.commands.results import tell, titled
 from nbs_pin.reports.verdicts import verdict_of
 
@@ -83,7 +84,9 @@ def _conditions(conditions: list[dict[str, Any]]) -> Table:
     """The conditions, each with its reason below it."""
     table = _table("conditions", "", "left", "right", "holds", "known")
     for line in conditions:
-        holds = "yes" if line["holds"] else Text("NO", style="bold red")
+        # What nothing rests on may fail: then it is only not shown.
+        fails = "not shown" if line["role"] == Role.COMPARISON else Text("NO", style="bold red")
+        holds = "yes" if line["holds"] else fails
         name = Text.assemble(line["name"], ("\n" + line["because"], "dim"))
         table.add_row(name, _number(line["left"]), _with_unit(line["right"], line["unit"]), holds, line["label"])
     return table

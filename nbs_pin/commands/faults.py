@@ -55,6 +55,9 @@ def run(options: Faults, console: Console, notes: Console) -> int:
         summary = {"versions": versions(), "seeds": options.seeds, "rows": plain(rows)}
         (draft / SUMMARY).write_text(summary_text(summary), encoding="utf-8")
     console.print(shown)
+    console.print(
+        "numbers are errors [rad]; before the name of a fault, the error until the stop or the time to it [s]"
+    )
     wall = time.perf_counter() - began
     console.print(
         f"{len(rows) - failed} of {counted(len(rows), 'row')} passed, {counted(options.seeds, 'trial')} each, "

@@ -50,7 +50,8 @@ def motion_of(
 
         if is_tool_file(file):
             return _led(load_tool_path(file, time_unit=time_unit), robot, period, led)
-    if tool:
+    near = [] if is_file else difflib.get_close_matches(kind, (*NAMED, *DRAWN), n=1)
+    if tool and (kind in NAMED or is_file or not near):
         name, value = next(iter(tool.items()))
         raise ArgumentError(
             f"{option(name, value)} is for a path of the tool, and the reference is '{text}'; give "
@@ -61,7 +62,6 @@ def motion_of(
     if text == "paper":
         return paper_reference(robot.nv), DEFAULT_DURATION
     if not is_file:
-        near = difflib.get_close_matches(kind, (*NAMED, *DRAWN), n=1)
         hint = f"did you mean {near[0]}? " if near else ""
         raise ArgumentError(
             f"no reference '{text}'; {hint}give sinusoid, paper, circle:RADIUS, line:DX,DY,DZ, or a .csv or .npz file."

@@ -27,7 +27,7 @@ def load_learned(figures: Mapping[str, Any]) -> tuple[str, ...]:
     if abs(mass) < LIGHT:
         return (f"the law believes that {link} carries no load",)
     at = ", ".join(f"{1e3 * x:z.0f}" for x in centre)
-    told = f"the law believes in a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm"
+    told = f"the law estimates a load of {float(mass):.3g} kg at {link}, with its centre at ({at}) mm"
     off = load_deviation(figures["estimates"], figures.get("estimates_deviation", {}))
     if off is not None:
         apart = ", ".join(f"{1e3 * x:.2g}" for x in off[1])

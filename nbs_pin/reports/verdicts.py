@@ -150,7 +150,7 @@ def _laws(figures: Mapping[str, Any]) -> Verdict:
         return Verdict(BAD, f"none of {', '.join(found)} converged in the first {percent(_IN_TIME)} of the time", loads)
     told = {name: " and ".join(measured(error, unit) for error, unit, _ in of) for name, of in off.items()}
     least, *others = sorted(off, key=lambda name: off[name])
-    said = f"of the laws, {least} is off the least, {told[least]} RMS in the last 30 % at its worst joint"
+    said = f"of the laws, {least} has the smallest error, {told[least]} RMS in the last 30 % at its worst joint"
     more = (f"not converged in the first {percent(_IN_TIME)} of the time: {', '.join(lost)}",) if lost else ()
     said = "; ".join([said, *(f"{name} {told[name]}" for name in others)])
     return Verdict(WARNING if lost else GOOD, said, (*more, *loads))
@@ -207,7 +207,7 @@ def _certificate(figures: Mapping[str, Any]) -> Verdict:
     useless = figures.get("useless") or []
     more += [f"of no use: {text}" for text in useless]
     known = f": the bounds are void, as these conditions fail: {'; '.join(found['void'])}" if found["void"] else ""
-    more.append(f"{found['label']}{known or ', under the assumptions that are not checked'}")
+    more.append(f"{found['label']}{known or ', under the listed assumptions'}")
     return Verdict(WARNING if level == GOOD and useless else level, said, tuple(more))
 
 

@@ -4,6 +4,7 @@ Pinocchio and MuJoCo each accept descriptions that silently give a wrong model (
 two parents). These checks run before either reads the file and raise RobotError with file, line and remedy.
 """
 
+import difflib
 import math
 import re
 import warnings
@@ -65,7 +66,9 @@ def check_tree(robot: Node, options: UrdfOptions) -> list[Joint]:
             name for name in getattr(options, argument) if name not in nodes and (argument == "lock" or name != ALL)
         ]
         if unknown:
-            raise robot.refuse(f"no joint '{unknown[0]}' for {argument}", f"the joints are {', '.join(nodes)}")
+            near = difflib.get_close_matches(unknown[0], nodes, n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            raise robot.refuse(f"no joint '{unknown[0]}' for {argument}", f"{hint}the joints are {', '.join(nodes)}")
     if len(links) > MAX_LINKS:
         raise robot.refuse(f"too large: {len(links)} links (limit {MAX_LINKS})", "give a smaller arm")
     mimics = _mimics(nodes, options)

@@ -72,6 +72,10 @@ def read_document(path: Path) -> dict[str, Any]:
         document: dict[str, Any] = json.loads(
             content, object_pairs_hook=_unique, parse_float=_finite, parse_constant=_finite, parse_int=_whole
         )
+        if isinstance(document, dict) and "format" not in document:
+            raise FileFormatError(
+                f"{path}: no certificate; give certificate.json, as nbs-pin certify --json writes it."
+            )
         fault = jsonschema.exceptions.best_match(_schema().iter_errors(document))
         if fault is not None:
             raise fault
