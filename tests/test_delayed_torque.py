@@ -14,7 +14,7 @@ from nbs_pin.base.records import Reference
 from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.coriolis import CoriolisBounds
 from nbs_pin.certificates.hold import hold_of, rows_in_g
-from nbs_pin.certificates.sampled_law import SampledLaw
+from nbs_pin.certificates.sampled_law import Fed, SampledLaw
 from nbs_pin.certificates.sampled_loop import _ENLARGED, _excess, kept_level
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.certificates.sampling import Timing
@@ -32,25 +32,27 @@ READINGS = {
 
 
 @cache
-def law_of(name):
+def law_of(name, feed=None):
     """Gains that suit readings of 16 bits at 1 kHz: little damping per inertia."""
     robot = nbs.load_robot(name)
     inertia = effective_inertia(robot, nbs.PinocchioDynamics(robot))
-    law = nbs.NeuralBackstepping.for_robot(robot, gains=Gains(4.0, 160.0 * inertia, 20.0 * inertia), seed=3)
+    gains = Gains(4.0, 160.0 * inertia, 20.0 * inertia)
+    law = nbs.NeuralBackstepping.for_robot(robot, gains=gains, seed=3, friction=feed)
     return law, nbs.Sinusoid.for_robot(robot, 1.0)
 
 
-def loop_of(name, readings, bits=16, torque=5.0):
+def loop_of(name, readings, bits=16, torque=5.0, feed=None):
     share, differenced = READINGS[readings]
-    law, reference = law_of(name)
-    certificate = nbs.certify(law, np.full(law.nv, torque), reference=reference)
+    law, reference = law_of(name, feed)
+    certificate = nbs.certify(law, np.full(law.nv, torque), reference=reference, friction=feed)
     constants, n = certificate.constants, law.nv
     arm = CoriolisBounds.of(law.dynamics.robot, constants)
     motion = arm.motion(SampledMotion.of(reference, n, 10.0), constants.floor, reference.largest_jerk)
     numbers = certificate.comparison.t, certificate.comparison.alpha, certificate.friction.gap.arm.viscous
     steps = np.full(n, 2.0 * math.pi * 2.0**-bits) if differenced else None
-    lead = (0.5 + share) * H
-    return SampledLaw(law, constants, arm, motion, *numbers, H, lead, share * H, steps), certificate, reference
+    read, fed = (H, (0.5 + share) * H, share * H, steps), Fed.of(feed, constants, certificate.comparison.power)
+    unfed = np.abs(certificate.friction.gap.viscous)
+    return SampledLaw(law, constants, arm, motion, *numbers, *read, fed, unfed), certificate, reference
 
 
 def weights(timing, j, age):
@@ -64,10 +66,10 @@ def weights(timing, j, age):
 class Motion:
     """A motion of many joints' worth of holds from the reference, under torques that jump within the holds."""
 
-    def __init__(self, loop, reference, torque, rng, holds):
+    def __init__(self, loop, reference, torque, rng, holds, rubbing=None):
         self.loop, self.reference, self.begin = loop, reference, float(rng.uniform(0.0, 5.0))
         self.dt, n = loop.h / SUBSTEPS, loop.law.nv
-        self.shift, self.friction = rng.uniform(0.0, 1.0, n), loop.friction
+        self.shift, self.rubbing = rng.uniform(0.0, 1.0, n), rubbing or nbs.JointFriction(loop.friction, np.zeros(n))
         self.past = 3 * SUBSTEPS
         before = reference(self.begin + self.dt * np.arange(-self.past, 1))
         self.q, self.v = [*before.q], [*before.v]
@@ -112,7 +114,7 @@ class Motion:
             self.v.append(state[1])
 
     def step(self, q, v, tau):
-        rate = lambda q, v: self.loop.law.dynamics.forward_dynamics(q, v, tau - self.friction * v)  # noqa: E731
+        rate = lambda q, v: self.loop.law.dynamics.forward_dynamics(q, v, tau - self.rubbing.torque(v))  # noqa: E731
         h = self.dt
         a = rate(q, v)
         b = rate(q + 0.5 * h * v, v + 0.5 * h * a)
@@ -207,6 +209,31 @@ def test_storage_with_its_history_changes_within_its_bound_in_every_hold(reading
             assert 0.5 * (before + after) - mean <= largest @ ends @ largest + 1e-9
             assert after <= level
     assert nearest > 0.02
+
+
+@pytest.mark.parametrize("readings", READINGS)
+def test_friction_that_late_and_coarse_readings_feed_forward_stays_within_its_terms(readings):
+    """The same inequality, for an arm that rubs as the law expects, with little else to disturb it."""
+    friction = nbs.JointFriction([0.3, 0.1], [1.0, 0.3])
+    loop, certificate, reference = loop_of("two_link", readings, torque=1.0, feed=friction)
+    level = kept_level(loop, certificate.storage).level
+    assert certificate.storage < level < math.inf
+    hold = next(x for x in (hold_of(loop, level, more * level) for more in _ENLARGED) if x is not None)
+    rows, centre = rows_in_g(hold), hold.curve.centre
+    excess, spread, _ = _excess(hold, rows)
+    motion = Motion(loop, reference, 1.0, np.random.default_rng(0), 80, friction)
+    largest, nearest = np.eye(5)[4], 0.0
+    for k in range(80):
+        g, before, after = motion.g(k), motion.storage(k, centre), motion.storage(k + 1, centre)
+        largest[:4] = np.maximum(largest[:4], g)
+        filled = motion.suprema(k) / (np.array(rows) @ largest)
+        assert (filled <= 1.0 + 1e-3).all()
+        nearest = max(nearest, filled.max())
+        push = np.mean(motion.push[k * SUBSTEPS : (k + 1) * SUBSTEPS], axis=0)
+        rest = (after - before) / loop.h + g @ g - motion.y(k) @ push
+        assert rest <= loop.t * (spread @ largest) + largest @ excess @ largest
+        assert after <= level
+    assert nearest > 0.5
 
 
 def played(law, reference, readings, disturbances, shifts, duration=1.0):

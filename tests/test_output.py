@@ -55,7 +55,7 @@ def test_what_is_promised_is_one_sentence_in_degrees(tmp_path):
     assert "continuous time" in slow[0]
     assert slow[1].startswith("nothing is proved of torques held for 5 ms: the longest period with a proof is ")
     longest = float(slow[1].split("proof is ")[1].split()[0]) * 1e-3
-    assert slow[1].endswith("ms; two_link states no rotor inertia, and --armature … would allow more")
+    assert slow[1].endswith("ms; two_link states no rotor inertia: if its motors have any, --armature … may allow more")
     fast = nbs.certify(
         nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link"), period=0.005),
         [5.0, 5.0],

@@ -214,7 +214,7 @@ class Certificate(Shown):
             return ""
         longest = f"the longest period with a proof is {1e3 * self.held.longest:.3g} ms"
         why = self.held.why_not or (longest if self.held.longest else "no period tried has a proof")
-        rotors = "" if self.held.why_not or self.robot is None else if_without_rotors(self.robot)
+        rotors = if_without_rotors(self.robot) if self.held.longest and self.robot is not None else ""
         return f"nothing is proved of torques held for {1e3 * self.held.readings.period:.4g} ms: {why}{rotors}"
 
     @property

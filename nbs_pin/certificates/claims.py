@@ -100,4 +100,4 @@ def if_without_rotors(robot: Robot) -> str:
     """What to add where nothing is proved for want of inertia, if the arm's description states no rotors."""
     if robot.armature.any():
         return ""
-    return f"; {robot.name} states no rotor inertia, and {option('armature', BLANK)} would allow more"
+    return f"; {robot.name} states no rotor inertia: if its motors have any, {option('armature', BLANK)} may allow more"

@@ -12,7 +12,7 @@ from nbs_pin.certificates.certificate import CERTIFICATE, Certificate
 from nbs_pin.certificates.coriolis import CoriolisBounds, MotionBounds
 from nbs_pin.certificates.effort_bound import Asked, speed_bound, torque_bound
 from nbs_pin.certificates.held_torque import why_no_arm_bounds
-from nbs_pin.certificates.sampled_law import Curvature, SampledLaw
+from nbs_pin.certificates.sampled_law import Curvature, Fed, SampledLaw
 from nbs_pin.motions.limits import Margins
 from nbs_pin.robots.robot import Robot
 
@@ -89,7 +89,7 @@ def _why_not(certificate: Certificate) -> str:
         return "the model differs from the arm; certify a law with the model of the arm"
     if certificate.held is not None and certificate.held.is_proved:
         return "its bounds with held torques are those of one reference; certify without a period"
-    if certificate.controller.friction is not None:
+    if any(Fed.of(certificate.controller.friction, certificate.constants, 0.0)):
         return "friction that is fed forward is not part of its bounds of torques"
     if not certificate.storage > 0.0:
         return "the certificate allows no disturbance; certify for one above 0"
