@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -12,8 +13,8 @@ T = TypeVar("T")
 _PATIENCE = 2.0
 _REFRESH = 0.1
 _BEAT = 4.0
-_now: list[str] = []
-"""How far the last loop got that is not drawn."""
+_now: list[Callable[[], str]] = []
+"""Tells how far the last loop got that is not drawn."""
 
 
 def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = True) -> Iterator[T]:
@@ -25,8 +26,7 @@ def tracked(items: Sequence[T], label: str | Callable[[], str], show: bool = Tru
         begun = time.perf_counter()
         for done, item in enumerate(items):
             if show:
-                left = (time.perf_counter() - begun) * (len(items) - done) / done if done else 0.0
-                _now[:] = [f"{_text(label)}, {done} of {len(items)}{f', about {left:.0f} s left' if done else ''}"]
+                _now[:] = [partial(_far, label, done, len(items), begun)]
             yield item
         return
     from rich.console import Console
@@ -62,7 +62,7 @@ def heartbeat(what: str) -> Iterator[None]:
 
     def tell() -> None:
         while not ended.wait(_BEAT):
-            far = f": {_now[0]}" if _now else ""
+            far = f": {_now[0]()}" if _now else ""
             sys.stderr.write(f"{what}, {time.perf_counter() - start:.0f} s{far}\n")
             sys.stderr.flush()
 
@@ -86,6 +86,12 @@ def waiting(label: str, show: bool = True) -> Iterator[None]:
 
     with Console(stderr=True).status(label):
         yield
+
+
+def _far(label: str | Callable[[], str], done: int, count: int, begun: float) -> str:
+    """How far a loop is at this moment; an item that takes long makes what is left longer."""
+    left = (time.perf_counter() - begun) * (count - done) / max(done, 1)
+    return f"{_text(label)}, {done} of {count}{f', about {left:.0f} s left' if done else ''}"
 
 
 def _text(label: str | Callable[[], str]) -> str:

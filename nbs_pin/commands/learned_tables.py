@@ -22,7 +22,11 @@ _HEADINGS = {
 }
 _KNOWN = 0.1
 """Standard deviation of the mass of all bodies, as a share of it, up to which the data determine it."""
-_ENDED = {"held out": "no further progress on held-out data", "iterations": "all iterations done"}
+_ENDED = {
+    "held out": "no further progress on held-out data",
+    "iterations": "all iterations done",
+    "starts": "all starts tried",
+}
 
 
 def print_learned(console: Console, title: str, figures: dict[str, Any], *, verbose: bool, interrupted: bool) -> None:
