@@ -410,7 +410,9 @@ def test_other_files_are_refused(tmp_path, kind):
     else:
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED if kind == "bomb" else zipfile.ZIP_STORED) as archive:
             archive.writestr("controller.json", bytes(10**7) if kind == "bomb" else "{}")
-    with pytest.raises(FileFormatError, match=r"other.nbs: (no .nbs_pin checkpoint 1. file|the format|not an intact|has \d+ bytes)"):
+    with pytest.raises(
+        FileFormatError, match=r"other.nbs: (no .nbs_pin checkpoint 1. file|the format|not an intact|has \d+ bytes)"
+    ):
         nbs.load(path)
     assert not marker.exists()
 
