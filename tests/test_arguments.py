@@ -13,7 +13,7 @@ from hypothesis import given, strategies as st
 
 import nbs_pin as nbs
 from nbs_pin.base.arguments import checked, count, number
-from nbs_pin.base.checks import LARGEST, floats, integral, real
+from nbs_pin.base.checks import LARGEST, all_finite, floats, integral, is_usual, real
 from nbs_pin.dynamics.registry import make_network
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
@@ -204,3 +204,16 @@ def test_hostile_arguments_meet_a_sentence_at_every_door(tmp_path, monkeypatch):
     found = [attempt(0, call, quick=True) for call in range(1000)]
     assert not [outcome for outcome in found if outcome.kind in FAULTS]
     assert len({outcome.door for outcome in found}) > 150
+
+
+@pytest.mark.parametrize("size", [3, 4096, 4097, 100_000])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 10.0 * LARGEST])
+def test_one_bad_number_is_found_in_short_and_in_long_arrays(size, bad):
+    x = np.linspace(-1.0, 1.0, size)
+    assert is_usual(x)
+    assert all_finite(x)
+    x[size // 2] = bad
+    assert not is_usual(x)
+    assert all_finite(x) == bool(np.isfinite(bad))
+    x[size // 2] = 0.9 * LARGEST
+    assert is_usual(x)

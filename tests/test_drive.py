@@ -399,6 +399,7 @@ def test_nbs_pin_faults_prints_a_row_for_each_fault(tmp_path, capsys, monkeypatc
     monkeypatch.setattr(faults, "on_all_cores", lambda function, tasks, *_: (function(*task) for task in tasks))
     text = printed_by("faults", "--arms", "two_link", "--seeds", "1", "--only", "F22", "--out", tmp_path)
     assert text.count("TIME at once") == 3
+    assert text.count("F22 time") == 3  # at 80 columns
     assert "3 of 3 rows passed" in text
     assert "F99" in refusal(cli.main(["faults", "--only", "F99", "--out", str(tmp_path)]), capsys)
     assert "libfranka:HOST" in refusal(cli.main(["run", "panda", "--arm", "libfranka"]), capsys)

@@ -688,6 +688,15 @@ def test_a_file_that_is_none_is_refused_in_one_sentence(text, tmp_path):
     assert str(caught.value).endswith("; write the file again.")
 
 
+def test_another_file_of_a_command_is_told_from_a_certificate(tmp_path):
+    path = tmp_path / "summary.json"
+    path.write_text('{"command": "certify"}')
+    with pytest.raises(FileFormatError) as caught:
+        verify(path)
+    expected = "not a certificate; give certificate.json, as nbs-pin certify --json writes it."
+    assert str(caught.value) == f"{path}: {expected}"
+
+
 def test_keys_types_and_sizes_are_checked(rubbing, tmp_path):
     def message(document):
         with pytest.raises(FileFormatError) as caught:

@@ -53,7 +53,7 @@ def read_archive(path: str | Path, file_format: str) -> dict[str, bytes]:
     manifest = parse_json(path, MANIFEST, entries.pop(MANIFEST, b"{}"))
     if "format" not in manifest:
         raise FileFormatError(f"{path}: no '{file_format}' file; give one that this package wrote.")
-    if manifest.get("format") != file_format:
+    if manifest["format"] != file_format:
         raise FileFormatError(
             f"{path}: the format is {manifest['format']!r}, expected '{file_format}'; write it with this version."
         )

@@ -68,20 +68,21 @@ def check_arm(path: Path, stated: dict[str, Any] | None, robot: Arm) -> None:
 def read_document(path: Path) -> dict[str, Any]:
     """The content of the file; raises FileFormatError unless it fits the schema and its own number of joints."""
     content = file_content(path)
+    foreign = False
     try:
         document: dict[str, Any] = json.loads(
             content, object_pairs_hook=_unique, parse_float=_finite, parse_constant=_finite, parse_int=_whole
         )
-        if isinstance(document, dict) and "format" not in document:
-            raise FileFormatError(
-                f"{path}: no certificate; give certificate.json, as nbs-pin certify --json writes it."
-            )
+        foreign = isinstance(document, dict) and "format" not in document
         fault = jsonschema.exceptions.best_match(_schema().iter_errors(document))
         if fault is not None:
             raise fault
         _check_sizes(document)
         _check_premises(document)
     except jsonschema.ValidationError as error:
+        if foreign:
+            remedy = "give certificate.json, as nbs-pin certify --json writes it"
+            raise FileFormatError(f"{path}: not a certificate; {remedy}.") from error
         rule = f"it does not satisfy {error.validator} {error.validator_value}"
         words = error.message if len(error.message) < 160 else f"{rule:.160}"
         raise FileFormatError(f"{path}: {error.json_path}: {words}; write the file again.") from error
