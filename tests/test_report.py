@@ -17,8 +17,9 @@ from nbs_pin.benchmarks.bench import Row
 from nbs_pin.certificates.tip_bound import tip_bound
 from nbs_pin.cli.shell import parse
 from nbs_pin.commands.reproduce import PARTS
+from nbs_pin.controllers.registry import LAWS, build_law
 from nbs_pin.reports import plotting
-from nbs_pin.reports.captions import settings_in_words
+from nbs_pin.reports.captions import law_in_words, settings_in_words
 from nbs_pin.reports.markdown import Section
 from nbs_pin.reports.pages import written
 from nbs_pin.reports.report import report
@@ -362,6 +363,15 @@ def test_a_run_that_is_not_drawn_keeps_its_picture(folders, tmp_path):
     assert 'alt="tracking.png"' not in report([gone], tmp_path / "a.html").read_text()
     nbs.Run(**{**vars(run), "robot": "no/such.urdf"}).save(gone / "run.npz")
     assert 'alt="tracking.png"' in report([gone], tmp_path / "a.html").read_text()
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_compiled_law_has_the_name_of_the_law(name):
+    robot = nbs.load_robot("two_link")
+    law = build_law(name, robot, period=0.001)
+    run = vars(nbs.simulate(nbs.MujocoPlant(robot), law, nbs.Sinusoid.for_robot(robot), 0.01, 0.001))
+    names = {law_in_words(nbs.Run(**run | {"info": {"controller": repr(x)}})) for x in (law, law.compile())}
+    assert len(names) == 1
 
 
 def test_settings_that_were_not_given_are_no_phrase():

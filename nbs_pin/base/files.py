@@ -19,11 +19,12 @@ _SETTLED = 1.0  # a folder younger than this may not be locked yet [s]
 
 
 @contextmanager
-def whole_file(path: str | Path) -> Iterator[BinaryIO]:
+def whole_file(path: str | Path, *, flushed: bool = True) -> Iterator[BinaryIO]:
     """A file to write to that replaces `path` atomically at the end. Missing folders are created.
 
-    The bytes go to a temporary file beside `path`, which is flushed to disk and then renamed; after an error it is
-    deleted. Temporary files of `path` that are older than `ABANDONED`, left by writers that were killed, are removed.
+    The bytes go to a temporary file beside `path`, which is flushed to disk, unless they may be lost in a power cut
+    (`flushed` false), and then renamed; after an error it is deleted. Temporary files of `path` that are older than
+    `ABANDONED`, left by writers that were killed, are removed.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -32,8 +33,9 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     try:
         with _naming(draft, path), draft.open("xb") as file:
             yield file
-            file.flush()
-            os.fsync(file.fileno())
+            if flushed:
+                file.flush()
+                os.fsync(file.fileno())
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)

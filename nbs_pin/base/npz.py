@@ -20,9 +20,9 @@ HARMLESS = 2**26
 _KINDS = {"f": "real numbers", "b": "booleans", "U": "text", "i": "integers"}
 
 
-def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write the arrays to `path` atomically: an interruption leaves either the old file or the new one."""
-    with whole_file(path) as file:
+def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray], *, flushed: bool = True) -> None:
+    """Write the arrays atomically, as `whole_file` does: an interruption leaves either the old file or the new one."""
+    with whole_file(path, flushed=flushed) as file:
         np.savez(file, allow_pickle=False, **arrays)
 
 

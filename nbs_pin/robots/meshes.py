@@ -3,8 +3,10 @@
 The dynamics never need meshes; a file that cannot be drawn raises `MeshError`, and the caller decides what to do.
 """
 
+import hashlib
 import logging
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from lxml import etree
 from nbs_pin.base.doors import BLANK, option
 from nbs_pin.base.exceptions import RobotError
 from nbs_pin.robots.catalogue import example_robot_share
+from nbs_pin.robots.mesh_cache import cached
 from nbs_pin.robots.packages import MISSING, Packages, is_file
 from nbs_pin.robots.urdf_source import shorten
 from nbs_pin.robots.visual_checks import LARGEST
@@ -102,15 +105,45 @@ def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
     Raises MeshError if the file is too large, unreadable or empty, or if a vertex is not finite.
     """
     try:
-        _check_file(path)
-        return _read(path, scale)
+        content = _content(path)
+        arrays = cached(_digest(path, content, scale), lambda: _arrays(_read(path, content, scale)))
+        return _parts(arrays)
     except MeshError:
         raise
     except Exception as error:  # mesh parsers may raise any exception, at once or when the mesh is used
         raise MeshError(f"mesh {path} cannot be read ({type(error).__name__}: {error}): export it again.") from error
 
 
-def _read(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
+def _digest(path: Path, content: bytes, scale: Float[np.ndarray, "3"]) -> str:
+    """What the parts of a mesh file depend on: its content, the materials it may read, scale, and what reads it."""
+    beside = sorted(path.parent.glob("*.[mM][tT][lL]")) if path.suffix.lower() == ".obj" else ()
+    states = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in beside if file.is_file()]
+    reader = repr((trimesh.__version__, path.suffix.lower(), scale.tolist(), states)).encode()
+    digest = hashlib.sha256()
+    for part in (Path(__file__).read_bytes(), reader, content):
+        digest.update(len(part).to_bytes(8))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _arrays(parts: tuple[Part, ...]) -> dict[str, np.ndarray]:
+    colors = {"colored": np.array([part.color is not None for part in parts])}
+    colors["colors"] = np.array([part.color or (0.0,) * 4 for part in parts])
+    shapes = {f"vertices {k}": part.vertices for k, part in enumerate(parts)}
+    return colors | shapes | {f"faces {k}": part.faces for k, part in enumerate(parts)}
+
+
+def _parts(arrays: Mapping[str, np.ndarray]) -> tuple[Part, ...]:
+    """The inverse of `_arrays`."""
+    colors = [
+        tuple(color) if colored else None
+        for color, colored in zip(arrays["colors"].tolist(), arrays["colored"], strict=True)
+    ]
+    return tuple(Part(arrays[f"vertices {k}"], arrays[f"faces {k}"], color) for k, color in enumerate(colors))
+
+
+def _read(path: Path, content: bytes, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
+    _check_parts(path, content)
     scene = trimesh.load_scene(path, resolver=_Beside(str(path)), process=False)  # `shaded` merges vertices
     _check_scene(path, scene)
     meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
@@ -125,15 +158,19 @@ def _read(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
     return tuple(shaded(trimesh.util.concatenate(group), color, scale) for color, group in pieces.items())
 
 
-def _check_file(path: Path) -> None:
-    """Raises MeshError for a file that is too large or has too many parts."""
+def _content(path: Path) -> bytes:
+    """The bytes of a mesh file; raises MeshError if they are too many or cannot be read."""
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise MeshError(f"mesh {path} has {size} bytes, at most {MAX_BYTES} are drawn: simplify it.")
-        content = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise MeshError(f"mesh {path} cannot be read ({error.strerror}): check its permissions.") from error
+
+
+def _check_parts(path: Path, content: bytes) -> None:
+    """Raises MeshError for a file of too many parts."""
     groups = sum(1 for _ in re.finditer(_GROUPS[path.suffix.lower()], content))
     if path.suffix.lower() == ".dae" and groups <= MAX_GROUPS:
         groups = _placed(content)
