@@ -117,7 +117,7 @@ def _words(name: str) -> str:
     compiled = re.match(r"CompiledController\((.+?),", name)
     if compiled:
         name = _COMPILED.get(compiled[1], name)
-    name = name.partition("(")[0]
+    name = name.partition("(")[0].removeprefix("Compiled")
     if not re.fullmatch(r"\w+", name):
         return name
     return _NAMES.get(name) or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()
