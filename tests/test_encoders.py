@@ -69,6 +69,21 @@ def test_the_mean_is_that_of_a_hat_and_delays_shift_it(half):
     steps = np.abs(np.diff(history[at.LAGS - 1 :, at.TORQUE], axis=0))
     assert more[at.SPREAD] == pytest.approx(steps.max(axis=0))
     assert more[at.FROZEN].all() == (half == 1)  # a single reading is equal to itself
+    speed = history[at.LAGS :, at.SPEED]
+    assert more[at.VARIED] == pytest.approx((speed[half:].sum(axis=0) - speed[: half - 1].sum(axis=0)) / half)
+
+
+def test_errors_are_over_their_bounds_where_the_readings_cannot_account_for_it():
+    rng, errors, bounds = np.random.default_rng(0), np.empty(4), np.empty(4)
+    counts = set()
+    for _ in range(100):
+        z1, start, reach = rng.normal(size=3), 2.0 * rng.uniform(size=4), 0.1 * rng.uniform(size=4)
+        found = verdicts.judge_errors(z1, reach, start, 0.7, errors, bounds)
+        assert errors == pytest.approx([np.linalg.norm(z1), *np.abs(z1)])
+        assert bounds == pytest.approx(0.7 * start)
+        assert found == np.count_nonzero(errors - reach > bounds)
+        counts.add(found)
+    assert counts == {0, 1, 2, 3, 4}
 
 
 @pytest.mark.parametrize("name", ["two_link", "panda"])

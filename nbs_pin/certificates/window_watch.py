@@ -39,6 +39,8 @@ class WindowMemory(NamedTuple):
     """Bound of V that is proved for held torques from there [J]; inf if none is."""
     basis: str
     """What else a verdict has to say of the bounds from there."""
+    first: float
+    """Bound of V at the first instant [J]."""
     bounds: Float[np.ndarray, " errors"]
     """Bounds of ‖z1‖ and each |z1_i| at the first instant [rad]."""
     samples: Float[np.ndarray, "last 7 n"]
@@ -80,7 +82,7 @@ class WindowWatch:
 
     def begin(self, t: float, sample: Float[np.ndarray, "7 n"]) -> tuple[Glance, WindowMemory]:
         """What the first instant shows, and the memory after it."""
-        memory = WindowMemory(t, t, 0.0, math.inf, "", np.zeros(0), sample[None])
+        memory = WindowMemory(t, t, 0.0, math.inf, "", 0.0, np.zeros(0), sample[None])
         memory = self._promising(memory, sample, math.inf)
         return self._first(memory), memory
 
@@ -96,16 +98,19 @@ class WindowWatch:
             return self._first(memory), memory
         z1 = np.empty(len(self.resolution))
         bits = verdicts.instant(memory.samples[-1], sample, z1, period, self.limits.rows)
-        failed = tuple(name for bit, name in BITS.items() if bits & bit)
+        failed = tuple(name for bit, name in BITS.items() if bits & bit) if bits else ()
         memory, told = self._in_time(memory, period), None
-        memory = memory._replace(t=t, samples=np.concatenate([memory.samples[-2:], sample[None]]))
-        if len(memory.samples) == 3:
-            memory = memory._replace(**self._with(memory, self.model.observe(memory.samples, memory.period)))
-            if memory.filled == len(memory.history):
-                told = self._window(memory)
-                memory = memory._replace(ratio=max(memory.ratio, told.ratio), compared=t)
+        samples = np.concatenate([memory.samples[-2:], sample[None]])
+        changes: dict[str, Any] = {"t": t, "samples": samples}
+        if len(samples) == 3:
+            history, filled = self._with(memory, self.model.observe(samples, memory.period))
+            changes |= {"history": history, "filled": filled}
+            if filled == len(history):
+                told = self._window(memory, history)
+                changes |= {"ratio": max(memory.ratio, told.ratio), "compared": t}
+        memory = memory._replace(**changes)
         glance = self._glance(memory, z1, told, failed)
-        if any(name not in memory.broken for name in glance.failed):
+        if not set(memory.broken).issuperset(glance.failed):
             broken = tuple(name for name in Assumption if name in memory.broken or name in glance.failed)
             memory = memory._replace(broken=broken)
         return glance, memory
@@ -128,7 +133,8 @@ class WindowWatch:
         initial = max(float(phi + more), 0.0) + (math.sqrt(kinetic) + math.sqrt(slack)) ** 2
         size, joints = self.certificate.from_start(initial)
         proved, basis = self.certificate.held_storage(initial), in_which_time(self.certificate, initial)
-        return memory._replace(initial=initial, proved=proved, basis=basis, bounds=np.array([size, *joints]))
+        first, bounds = bound(self.certificate, initial, proved, 0.0), np.array([size, *joints])
+        return memory._replace(initial=initial, proved=proved, basis=basis, first=first, bounds=bounds)
 
     def _in_time(self, memory: WindowMemory, period: float) -> WindowMemory:
         """The memory with a window for this period [s]; it begins anew where instants are not evenly spaced."""
@@ -143,33 +149,34 @@ class WindowWatch:
         return memory._replace(samples=memory.samples[-1:], period=period, half=half, history=history, filled=0)
 
     @staticmethod
-    def _with(memory: WindowMemory, signals: Float[np.ndarray, "8 n"]) -> dict[str, Any]:
+    def _with(memory: WindowMemory, signals: Float[np.ndarray, "8 n"]) -> tuple[Float[np.ndarray, "rows 8 n"], int]:
+        """The history after an instant of those signals, and how much of it is filled."""
         history = np.empty_like(memory.history)
         history[:-1], history[-1] = memory.history[1:], signals
-        return {"history": history, "filled": min(memory.filled + 1, len(history))}
+        return history, min(memory.filled + 1, len(history))
 
-    def _window(self, memory: WindowMemory) -> "_Told":
-        """What the window up to the last instant says."""
-        history, half, h, n = memory.history, memory.half, memory.period, len(self.resolution)
+    def _window(self, memory: WindowMemory, history: Float[np.ndarray, "rows 8 n"]) -> "_Told":
+        """What the window at the end of a history says."""
+        half, h, n = memory.half, memory.period, len(self.resolution)
         mean, more, found = np.empty((at.SIGNALS, n)), np.empty((at.MORE, n)), np.empty(verdicts.WINDOW)
         at.average(history, half, mean, more)
         q = history[at.LAGS + half - 1, at.READING]
-        (phi, phi_slack, kinetic, slack), share = self.model.centre(mean, q, self.resolution, half * h)
+        centre, share = self.model.centre(mean, q, self.resolution, half * h)
+        phi, phi_slack, kinetic, slack = centre.tolist()
         verdicts.judge_window(mean, history, more, share, h, half, q, *self.limits, found)
-        speed = float(np.abs(mean[at.SPEED]).sum())
-        least = max(math.sqrt(kinetic) - math.sqrt(slack), 0.0) ** 2 / (1.0 + 2.0 * half * h * speed)
+        moved = 2.0 * half * h * float(found[verdicts.MOVES])
+        least = max(math.sqrt(kinetic) - math.sqrt(slack), 0.0) ** 2 / (1.0 + moved)
         failed = UNEXPLAINED if found[verdicts.EXCEEDS] else ()
         if found[verdicts.DELAY] or found[verdicts.LATE]:
             failed = (*failed, Assumption.TIME)
         if found[verdicts.RUBS]:
             failed = (*failed, Assumption.FRICTION)
-        moved = mean[at.SPEED] - mean[at.Z2]
-        suspects = self._suspects(mean, more, found, 2.0 * half * h * moved) if failed else ()
-        storage = float(phi + kinetic)
-        return _Told(storage, max(float(phi - phi_slack), 0.0) + least, float(found[verdicts.RATIO]), failed, suspects)
+        suspects = self._suspects(mean, more, found, 2.0 * half * h) if failed else ()
+        return _Told(phi + kinetic, max(phi - phi_slack, 0.0) + least, float(found[verdicts.RATIO]), failed, suspects)
 
-    def _suspects(self, mean: np.ndarray, more: np.ndarray, found: np.ndarray, moved: JointArray) -> tuple[str, ...]:
-        """Simple faults each of which would explain the mean torque; moved: what v_r asks for in the window [rad]."""
+    def _suspects(self, mean: np.ndarray, more: np.ndarray, found: np.ndarray, length: float) -> tuple[str, ...]:
+        """Simple faults each of which would explain the mean torque over a window of that length [s]."""
+        moved = length * (mean[at.SPEED] - mean[at.Z2])  # what v_r asks for
         rest, room = more[at.SPREAD], self.limits.rows[verdicts.BOX]
         room = np.minimum(room, self.limits.numbers[verdicts.RADIUS]) + more[at.VARIED]
         still = more[at.FROZEN].astype(bool) & (np.abs(moved) > 4.0 * self.resolution)
@@ -191,11 +198,11 @@ class WindowWatch:
         self, memory: WindowMemory, z1: JointArray, told: "_Told | None", failed: tuple[Assumption, ...]
     ) -> Glance:
         certificate, t, start = self.certificate, memory.t - memory.began, (memory.initial, memory.proved)
-        first = bound(certificate, *start, 0.0)
-        fallen = math.sqrt(bound(certificate, *start, t) / first) if first > 0.0 else 1.0
-        errors, bounds = np.array([math.sqrt(z1 @ z1), *np.abs(z1)]), fallen * memory.bounds
-        over = (errors - self._reach > bounds * (1.0 + ROUNDING)).nonzero()[0].tolist()
-        excesses = [self._labels[k + 1] for k in over]
+        fallen = math.sqrt(bound(certificate, *start, t) / memory.first) if memory.first > 0.0 else 1.0
+        errors, bounds, excesses = np.empty(len(z1) + 1), np.empty(len(z1) + 1), []
+        if verdicts.judge_errors(z1, self._reach, memory.bounds, fallen, errors, bounds):
+            over = errors - self._reach > bounds * (1.0 + ROUNDING)
+            excesses = [self._labels[k + 1] for k in over.nonzero()[0].tolist()]
         promise = bound(certificate, *start, t - (0.0 if told is None else 2.0 * memory.half * memory.period))
         if told is not None and not told.least <= promise * (1.0 + ROUNDING):
             excesses.insert(0, "V")

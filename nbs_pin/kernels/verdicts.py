@@ -39,9 +39,9 @@ RADIUS, OF_Q, OF_V, CONSTANT, TRANSITION, NUMBERS = range(6)
 friction fed forward [rad/s], and how many."""
 EFFORT, WRAP, REFERENCE, STOPS = 1, 2, 4, 8
 """Bits of `instant`."""
-EXCEEDS, DELAY, LATE, RUBS, RATIO, WINDOW = range(6)
+EXCEEDS, DELAY, LATE, RUBS, RATIO, MOVES, WINDOW = range(7)
 """Numbers of `judge_window`: 1 for an unexplained torque, the delay that explains it [periods], 1 for commands that are
-not the law's, 1 if it opposes the motion, the largest ratio of torque to bound, and how many."""
+not the law's, 1 if it opposes the motion, the largest ratio of torque to bound, Σ|v| [rad/s], and how many."""
 OF_RATE, OF_ACCELERATION, ROUNDING = 1e-3, 0.02, 1e-9
 OF_TORQUE = 1e-3
 """Shares that `certificates/sampled_motion.py` and `certificates/assumptions.py` allow."""
@@ -52,6 +52,7 @@ _VEC, _MAT, _CUBE = float64[::1], float64[:, ::1], float64[:, :, ::1]
 def compile_verdicts() -> None:
     """Compile the entry points for float64, so that no first call waits for the compiler."""
     compile_for(instant, int64(_MAT, _MAT, _VEC, float64, _MAT))
+    compile_for(judge_errors, int64(_VEC, _VEC, _VEC, float64, _VEC, _VEC))
     compile_for(judge_window, void(_MAT, _CUBE, _MAT, _VEC, float64, int64, _VEC, _MAT, _VEC, _VEC))
 
 
@@ -114,6 +115,30 @@ def outside(torque: Vec, tolerance: Vec, limits: Mat, radius: float, rest: Vec) 
     return math.sqrt(far)
 
 
+@exact_kernel
+def judge_errors(z1: Vec, reach: Vec, start: Vec, fallen: float, errors: Vec, bounds: Vec) -> int:
+    """How many of ‖z1‖ and |z1_i| are above their bounds.
+
+    Args:
+        z1: (n,).
+        reach: what the readings leave uncertain of each error [rad], (n + 1,).
+        start: the bounds at the first instant [rad], (n + 1,).
+        fallen: share of them that is left.
+        errors: written, (n + 1,).
+        bounds: written, (n + 1,).
+    """
+    square, found = 0.0, 0
+    for i in range(len(z1)):
+        square += z1[i] * z1[i]
+        errors[i + 1] = abs(z1[i])
+    errors[0] = math.sqrt(square)
+    for k in range(len(errors)):
+        bounds[k] = fallen * start[k]
+        if errors[k] - reach[k] > bounds[k] * (1.0 + ROUNDING):
+            found += 1
+    return found
+
+
 @kernel
 def judge_window(
     mean: Mat,
@@ -143,10 +168,10 @@ def judge_window(
     """
     n, width = len(q), half * period
     radius, transition = numbers[RADIUS], numbers[TRANSITION]
-    size_q, size_v, gap, torque, asked = 0.0, 0.0, 0.0, 0.0, 0.0
+    size_q, size_v, gap, torque, asked, moves = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         v = mean[SPEED, i]
-        size_q, size_v = size_q + q[i] * q[i], size_v + v * v
+        size_q, size_v, moves = size_q + q[i] * q[i], size_v + v * v, moves + abs(v)
         slack = limits[RESOLUTION, i] / width + abs(more[VARIED, i])
         unknown = limits[GAP_VISCOUS, i] * (abs(v) + slack) + limits[GAP_COULOMB, i]
         gap += unknown * unknown
@@ -165,7 +190,7 @@ def judge_window(
         bound = limits[BOX, i] if radius == math.inf else radius
         reached = abs(mean[U, i]) + tolerance[i] + 2.0 * loudest + abs(mean[LAG, i])
         ratio = max(ratio, reached / bound if bound > 0.0 else math.inf)
-    out[RATIO], out[EXCEEDS], out[DELAY], out[RUBS], out[LATE] = ratio, 0.0, 0.0, 0.0, 0.0
+    out[MOVES], out[RATIO], out[EXCEEDS], out[DELAY], out[RUBS], out[LATE] = moves, ratio, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         other[i] = OF_TORQUE * math.sqrt(asked)
     if outside(mean[LAG], other, limits, radius, rest) > 0.0:

@@ -128,24 +128,22 @@ def average(history: Mat, half: int, mean: Mat, more: Mat) -> None:
         mean: written, (8, n).
         more: written, (`MORE`, n).
     """
-    n, size = history.shape[2], float(half * half)
-    flat = mean.reshape(SIGNALS * n)
+    n, rows = history.shape[2], 2 * half - 1
+    flat, numbers = mean.reshape(SIGNALS * n), history.reshape(len(history), SIGNALS * n)
     flat[:] = 0.0
-    for i in range(n):
-        more[VARIED, i], more[SPREAD, i], more[FROZEN, i] = 0.0, 0.0, 1.0
-    first, before = history[LAGS], history[LAGS - 1]
-    for j in range(2 * half - 1):
-        row = history[LAGS + j]
-        weight, numbers = float(half - abs(j - half + 1)) / size, row.reshape(SIGNALS * n)
+    for j in range(rows):
+        weight = float(half - abs(j - half + 1)) / float(half * half)
         for i in range(SIGNALS * n):
-            flat[i] += weight * numbers[i]
-        side = 0.0 if j == half - 1 else (1.0 / half if j >= half else -1.0 / half)
-        for i in range(n):
-            more[VARIED, i] += side * row[SPEED, i]
-            more[SPREAD, i] = max(more[SPREAD, i], abs(row[TORQUE, i] - before[TORQUE, i]))
-            if row[READING, i] != first[READING, i]:
-                more[FROZEN, i] = 0.0
-        before = row
+            flat[i] += weight * numbers[LAGS + j, i]
+    for i in range(n):
+        varied, spread, frozen = 0.0, 0.0, 1.0
+        for j in range(half - 1):
+            varied += history[LAGS + half + j, SPEED, i] - history[LAGS + j, SPEED, i]
+        for j in range(LAGS, LAGS + rows):
+            spread = max(spread, abs(history[j, TORQUE, i] - history[j - 1, TORQUE, i]))
+            if history[j, READING, i] != history[LAGS, READING, i]:
+                frozen = 0.0
+        more[VARIED, i], more[SPREAD, i], more[FROZEN, i] = varied / half, spread, frozen
 
 
 @kernel
