@@ -18,7 +18,8 @@ from nbs_pin.dynamics.lagrangian import LagrangianDynamics
 from nbs_pin.dynamics.pinocchio import PinocchioDynamics
 from nbs_pin.dynamics.provider import DynamicsProvider
 from nbs_pin.dynamics.pseudo_inertia import coordinates
-from nbs_pin.identification.chain_fit import TreeGeometry, fit_chain
+from nbs_pin.identification import chain_fit
+from nbs_pin.identification.chain_fit import fit_chain
 from nbs_pin.identification.collect import collect
 from nbs_pin.identification.datasets import Dataset
 from nbs_pin.identification.drive_choice import Wanted
@@ -30,7 +31,7 @@ from nbs_pin.identification.levenberg_marquardt import Normal, levenberg_marquar
 from nbs_pin.identification.measurement import Noise
 from nbs_pin.identification.physical_tree import FREE, PARALLEL, RIGHT, PhysicalTree
 from nbs_pin.identification.regressor import RobotGeometry
-from nbs_pin.identification.tree_search import Measurements, TreeEstimate
+from nbs_pin.identification.tree_search import Measurements, TreeEstimate, TreeGeometry
 from nbs_pin.identification.unidentifiable import unidentifiable
 from nbs_pin.kernels.layout import Packed
 from nbs_pin.kernels.tree_layout import BODY, tree_workspace
@@ -671,3 +672,26 @@ def test_ctrl_c_goes_on_with_the_best_tree_so_far(monkeypatch):
     descended[:] = [()] * 8
     with pytest.raises(KeyboardInterrupt):  # nothing yet to go on with
         fit_chain(data)
+
+
+@pytest.mark.parametrize("whole", [0, 1, 2])
+def test_ctrl_c_after_the_search_keeps_the_best_bodies_so_far(whole, monkeypatch):
+    data, tried, plain = dataset(scrambled(*TREES[2]), 100, noise=0.5), [], chain_fit._tried
+
+    def interrupted(*arguments, **options):
+        if len(tried) == whole:
+            raise KeyboardInterrupt
+        tried.append(plain(*arguments, **options)._replace(reached=False))
+        return tried[-1]
+
+    monkeypatch.setattr(chain_fit, "_tried", interrupted)
+    monkeypatch.setattr(chain_fit, "_settled", lambda costs: len(costs) >= 8)
+    if whole == 0:
+        with pytest.raises(KeyboardInterrupt):
+            fit_chain(data)
+        return
+    found = fit_chain(data)
+    assert found.stopped == "interrupted"
+    best = min(tried, key=lambda one: one.cost)
+    assert found.bodies is best.bodies.report
+    assert len(tried) == whole

@@ -395,17 +395,24 @@ def states_of(law, certificate, level, now):
     return q, z2 + law.errors(q, 0.0 * q, *now).v_r
 
 
-@pytest.mark.parametrize(("name", "torque"), [("two_link", 5.0), ("ur5", 1.0)])
-def test_no_state_of_the_bounds_asks_for_more_torque_than_is_proved(name, torque):
+@pytest.mark.parametrize(
+    ("name", "torque", "sticky"),
+    [("two_link", 5.0, 0.0), ("ur5", 2.0, 0.0), ("panda", 0.25, 0.0), ("two_link", 2.0, 1.0), ("ur5", 1.0, 0.3)],
+)
+def test_no_state_of_the_bounds_asks_for_more_torque_than_is_proved(name, torque, sticky):
     robot = nbs.load_robot(name)
-    law, reference = nbs.NeuralBackstepping.for_robot(robot, seed=1), nbs.Sinusoid.for_robot(robot)
+    friction = nbs.JointFriction(np.full(robot.nv, 0.4 * sticky), np.full(robot.nv, sticky), transition=0.1)
+    law = nbs.NeuralBackstepping.for_robot(robot, seed=1, friction=friction if sticky else None)
+    reference = nbs.Sinusoid.for_robot(robot)
     certificate = nbs.certify(law, np.full(robot.nv, torque), reference=reference, period=2.5e-4)
     assert dict(certificate.assumptions)[Assumption.EFFORT] == "checked"
     now = Reference(*reference(np.random.default_rng(0).uniform(0.0, 10.0, 2000)))
-    q, v = states_of(law, certificate, certificate.held.level, now)
+    level = certificate.held.level if certificate.held.is_proved else certificate.storage
+    q, v = states_of(law, certificate, level, now)
     asked = np.abs(law.torque(q, v, *now))
-    wanted = np.abs(law.dynamics.reference_torque(now.q, now.v, now.v, now.a))
-    assert (asked - wanted <= certificate.held.room).all()
+    wanted = law.dynamics.reference_torque(now.q, now.v, now.v, now.a)
+    wanted = wanted + law.friction.torque(now.v) if sticky else wanted
+    assert (asked - np.abs(wanted) <= certificate.held.room).all()
     assert (asked <= robot.effort_limit).all()
 
 
@@ -454,11 +461,12 @@ class _Stating:
         return self.motion(t)
 
 
-@pytest.mark.parametrize("name", ["two_link", "ur5"])
-def test_no_state_of_the_bounds_is_further_from_a_reference_than_the_margins(name):
+@pytest.mark.parametrize(("name", "sticky"), [("two_link", 0.0), ("ur5", 0.0), ("ur5", 2.0)])
+def test_no_state_of_the_bounds_is_further_from_a_reference_than_the_margins(name, sticky):
     """For any reference within the stated speeds, whatever its pose."""
     robot = nbs.load_robot(name)
-    law = nbs.NeuralBackstepping.for_robot(robot, seed=1)
+    friction = nbs.JointFriction(np.full(robot.nv, sticky), np.full(robot.nv, sticky), transition=0.1)
+    law = nbs.NeuralBackstepping.for_robot(robot, seed=1, friction=friction if sticky else None)
     certificate = nbs.certify(law, np.full(robot.nv, 1.0))
     margins = nbs.certified_margins(certificate, acceleration=2.0, velocity=1.0)
     rng = np.random.default_rng(1)

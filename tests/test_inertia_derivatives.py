@@ -1,11 +1,14 @@
 """±∂M/∂q_i ⪯ γ_iM and ⪯ γ_iW in every pose, and bounds of the rates by the kinetic energy."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from nbs_pin import load_robot
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
+from nbs_pin.inertia.bounds import body_shares, largest_diagonal
+from nbs_pin.inertia.christoffel import christoffel_bounds, gravity_bounds
 from nbs_pin.inertia.derivatives import inertia_derivatives, rate_bound
 from tests.test_inertia_bounds import masses, random_model
 
@@ -35,6 +38,34 @@ def test_no_pose_of_a_random_tree_changes_its_inertia_faster(seed):
         slope = slopes(model, poses, i)
         assert over(slope, masses(model, poses)).max() <= relative[i] + 1e-6
         assert over(slope, weight).max() <= by_weight[i] + 1e-6
+
+
+@pytest.mark.parametrize("joints", ["rrr", "rrrrr", "prr", "ppr", "rrrr"])
+def test_no_pose_of_a_random_tree_has_larger_christoffel_symbols_or_slopes_of_gravity(joints):
+    rng = np.random.default_rng(len(joints))
+    model = random_model(rng, joints, branched=joints == "rrrr", rotors=True)
+    n, data, tree = model.nv, model.createData(), RigidTree.of(pack_model(model))
+    poses = rng.uniform(-np.pi, np.pi, (200, n))
+    shares = body_shares(tree)
+    assert (masses(model, poses).diagonal(axis1=1, axis2=2) <= largest_diagonal(tree, shares)).all()
+    bound, heaving = christoffel_bounds(tree, shares), gravity_bounds(tree, shares, 9.81)
+    change = np.array([slopes(model, poses, k) for k in range(n)])  # k, pose, i, j
+    found = 0.5 * (np.einsum("kpij->pijk", change) + np.einsum("jpik->pijk", change) - np.einsum("ipjk->pijk", change))
+    assert np.abs(found).max() > 0.01
+    assert (np.abs(found) <= bound + 1e-6).all()
+    steps = STEP * np.eye(n)
+    for q in poses:
+        ahead, behind = ([pin.computeGeneralizedGravity(model, data, x).copy() for x in q + s * steps] for s in (1, -1))
+        slope = (np.array(ahead) - behind).T / (2.0 * STEP)
+        assert (np.abs(slope) <= heaving + 1e-5).all()
+
+
+def test_christoffel_symbols_of_two_rods_are_within_a_factor_of_two():
+    """|Γ_122| = m l₁ l₂ at a right angle, and the bound is that of the stretched arm, m (l₁ + l₂) l₂."""
+    robot = load_robot("two_link")
+    bound = christoffel_bounds(robot, body_shares(robot))[0, 1, 1]
+    assert slopes(robot.model, np.array([[0.3, 0.5 * np.pi]]), 1)[0, 0, 1] == pytest.approx(-1.0)
+    assert 2.0 <= bound <= 2.01
 
 
 def test_the_bound_of_two_links_is_attained():

@@ -335,6 +335,22 @@ def test_one_law_and_several_leave_nothing_of_each_other(tmp_path):
     assert nbs.Run.load(tmp_path / "run.npz").info["settings"]["controller"] == "nbs"
 
 
+def test_another_command_leaves_nothing_of_the_one_before(tmp_path):
+    folder, mine = tmp_path / "results", tmp_path / "mine.txt"
+    printed_by("track", "two_link", "--duration", "0.05", "--out", folder)
+    mine.touch()
+    (folder / "notes.txt").touch()
+    kept = summary(folder)
+    kept["files"] += ["../mine.txt", "..", 3, "notes"]  # a summary that somebody wrote
+    (folder / "notes").mkdir()
+    (folder / SUMMARY).write_text(json.dumps(kept))
+    printed_by("certify", "two_link", "--disturbance", "1", "--force", "--out", folder)
+    found = {file.name for file in folder.iterdir()}
+    assert found == {"certificate.png", "run.npz", "summary.json", "notes.txt", "notes"}
+    assert mine.exists()
+    assert {"certificate.png", "run.npz"} <= set(summary(folder)["files"])
+
+
 def test_a_page_of_other_folders_is_not_replaced_silently(folders, capsys, monkeypatch):
     where = folders[0].parent
     monkeypatch.chdir(where)

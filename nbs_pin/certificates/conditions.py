@@ -72,7 +72,7 @@ def with_conditions(
         frictions = (law.friction, certificate.friction.gap.arm)
         conditions += effort_margin(robot, law.dynamics, certificate.admissible, motion, frictions)
         if certificate.held is not None:
-            conditions += unsaturated(robot, law.dynamics, motion, certificate.held.room)
+            conditions += unsaturated(robot, law, motion, certificate.held.room)
         conditions += velocity_margin(robot, motion, 0.0 if start is None else start.v)
         conditions += position_margin(robot, joints, motion)
     if start is not None and robot is not None:

@@ -19,7 +19,8 @@ from nbs_pin.certificates.constants import Constants
 from nbs_pin.certificates.sampled_motion import SampledMotion
 from nbs_pin.dynamics.pinocchio_tree import pack_model
 from nbs_pin.dynamics.rigid_tree import RigidTree
-from nbs_pin.inertia.bounds import largest_diagonal, largest_inertia_bound, least_inertia_bound
+from nbs_pin.inertia.bounds import body_shares, largest_diagonal, largest_inertia_bound, least_inertia_bound
+from nbs_pin.inertia.christoffel import christoffel_bounds, gravity_bounds
 from nbs_pin.inertia.derivatives import inertia_derivatives, link_derivatives, link_rates, rate_bound, single_rates
 from nbs_pin.robots.robot import Robot
 
@@ -30,8 +31,10 @@ _SHAPE = 1e-6
 
 
 class MotionBounds(NamedTuple):
-    """Greatest values of a reference: sums over the joints, and norms."""
+    """Greatest values of a reference: of each joint, sums over the joints, and norms."""
 
+    fastest: JointArray
+    """|v_d,i| [rad/s]."""
     turn: float
     """Σ γ_i|v_d,i| [1/s]."""
     turn_d: float
@@ -95,8 +98,10 @@ class CoriolisBounds:
     """max M_ii [kg·m²]."""
     single: JointArray
     """|v_i| ≤ single_i·|v|_M."""
-    weight: JointArray
-    """Bound of |G_i| and of |∂G_i/∂q_j| [N·m]."""
+    christoffel: Float[np.ndarray, "n n n"]
+    """Bound of |Γ_ijk|; entry i of C(q, a)b is Σ Γ_ijk a_j b_k [kg·m²]."""
+    heaving: Float[np.ndarray, "n n"]
+    """Bound of |∂G_i/∂q_j| [N·m/rad]."""
     gravity: float
     """|G(q + u) − G(q)|_* ≤ gravity·Σ|u_i|."""
     loss_m: float
@@ -130,7 +135,7 @@ class CoriolisBounds:
         turning = np.abs(motion.v @ self.links.T).max(axis=0) + motion.half * between
         speeds[:2] = (min(s, float(w @ turning)) for s, w in zip(speeds, self._by_links, strict=False))
         largest[0] += motion.half * largest[1]
-        return MotionBounds(*speeds, *largest)
+        return MotionBounds(fastest, *speeds, *largest)
 
 
 class _Key:
@@ -156,11 +161,12 @@ class _Arm(NamedTuple):
     single: JointArray
     turn: float
     sum_m: float
-    diagonal: JointArray
     links: Float[np.ndarray, "n n"]
     link_relative: JointArray
     by_links: JointArray
     """`single` for the rates of links."""
+    shares: Float[np.ndarray, "n n"]
+    """`body_shares`."""
 
 
 @lru_cache(maxsize=32)
@@ -171,7 +177,7 @@ def _arm(key: _Key) -> _Arm:
     link_relative = link_derivatives(tree, relative)
     turn, sum_m = (rate_bound(tree, weights, single) for weights in (relative, np.ones(n)))
     turn = min(turn, rate_bound(tree, link_relative, by_links, links))
-    return _Arm(relative, single, turn, sum_m, largest_diagonal(tree), links, link_relative, by_links)
+    return _Arm(relative, single, turn, sum_m, links, link_relative, by_links, body_shares(tree))
 
 
 @lru_cache(maxsize=32)
@@ -202,7 +208,7 @@ def _by_floor(key: _Key, floor: Float[np.ndarray, "n n"]) -> tuple[JointArray, J
 def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> CoriolisBounds:
     floor, rate = np.frombuffer(floor_bytes).reshape(n, n), np.frombuffer(rate_bytes)
     tree, inverse = RigidTree.of(key.robot), np.abs(np.linalg.inv(floor))
-    relative, single, turn, sum_m, diagonal, links, link_relative, by_links = _arm(key)
+    relative, single, turn, sum_m, links, link_relative, by_links, shares = _arm(key)
     heaviest = largest_inertia_bound(tree, floor).value
     own = (relative, link_relative)
     by_floor, link_floor = (np.minimum(x, y * heaviest) for x, y in zip(_by_floor(key, floor), own, strict=True))
@@ -214,7 +220,7 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
     def pulled(weights: JointArray) -> float:
         return math.sqrt(weights**2 @ rate)
 
-    weight = np.linalg.norm(key.robot.model.gravity.linear) * np.sqrt(_carried(tree) * diagonal)
+    heaving = gravity_bounds(tree, shares, float(np.linalg.norm(key.robot.model.gravity.linear)))
     slowness = np.diag(1.0 / rate)
     return CoriolisBounds(
         relative=relative,
@@ -231,15 +237,11 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
         links=links,
         link_relative=link_relative,
         link_floor=link_floor,
-        diagonal=diagonal,
+        diagonal=largest_diagonal(tree, shares),
         single=single,
-        weight=weight,
-        gravity=largest(weight),
+        christoffel=christoffel_bounds(tree, shares),
+        heaving=heaving,
+        gravity=max(largest(column) for column in heaving.T),
         loss_m=math.sqrt(largest_inertia_bound(tree, slowness).value),
         loss_inverse=1.0 / math.sqrt(max(least_inertia_bound(tree, slowness).value, 1e-300)),
     )
-
-
-def _carried(tree: RigidTree) -> JointArray:
-    """Mass that each joint carries [kg]."""
-    return np.array([sum(tree.mass[k] for k in range(tree.nv) if i in tree.path(k)) for i in range(tree.nv)])

@@ -168,7 +168,7 @@ def held_torque(
         return SampledLaw(law, *numbers, h, read.lookahead, read.delay, read.steps, fed, unfed)
 
     def room(level: float) -> JointArray:
-        if not math.isfinite(level) or any(fed):
+        if not math.isfinite(level):
             return unknown
         asked = Asked(law, constants, *Curvature.with_diagonal(loop(period), level), level)
         return torque_bound(asked, arm, bounds, motion.half)

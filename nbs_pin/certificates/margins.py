@@ -112,9 +112,7 @@ def effort_margin(
     return (least_room(robot, "effort", needed + bound, "torque of reference and disturbance", because),)
 
 
-def unsaturated(
-    robot: Robot, dynamics: DynamicsProvider, motion: SampledMotion, room: JointArray
-) -> tuple[Condition, ...]:
+def unsaturated(robot: Robot, law: LyapunovLaw, motion: SampledMotion, room: JointArray) -> tuple[Condition, ...]:
     """Whether every effort limit exceeds the torque of the reference and how far the law's torque may be from it [N·m].
 
     If so, no torque is ever cut off, which proves the assumption; if not, it stays one, and the condition is a
@@ -122,7 +120,9 @@ def unsaturated(
     """
     if not (np.isfinite(robot.effort_limit).any() and np.isfinite(room).all()):
         return ()
-    torque = inverse_dynamics(dynamics, *motion.rows)
+    torque = inverse_dynamics(law.dynamics, *motion.rows)
+    if law.friction is not None:
+        torque = torque + law.friction.torque(motion.v)
     because = f"reference over {motion.t[-1]:g} s, and every state of the bounds: docs/certificates.md §15"
     found = least_room(robot, "effort", np.abs(torque).max(axis=0) + room, "largest torque of the law", because)
     return (replace(found, role=Role.SUFFICIENT if found.holds else Role.COMPARISON),)

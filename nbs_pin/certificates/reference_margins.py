@@ -12,7 +12,7 @@ from nbs_pin.certificates.certificate import CERTIFICATE, Certificate
 from nbs_pin.certificates.coriolis import CoriolisBounds, MotionBounds
 from nbs_pin.certificates.effort_bound import Asked, speed_bound, torque_bound
 from nbs_pin.certificates.held_torque import why_no_arm_bounds
-from nbs_pin.certificates.sampled_law import Curvature, Fed, SampledLaw
+from nbs_pin.certificates.sampled_law import Curvature, SampledLaw
 from nbs_pin.motions.limits import Margins
 from nbs_pin.robots.robot import Robot
 
@@ -26,13 +26,14 @@ def certified_margins(certificate: Certificate, acceleration: Any, velocity: Any
     """The distance from its limits that a reference must keep, so that the arm stays within them.
 
     Position margins bound |z1_i|, velocity margins |v_i − v_d,i|, and effort margins the difference of each torque of
-    the law from that of the reference, M(q_d)a_d + C(q_d, v_d)v_d + G(q_d): on {V ≤ V̄} with V̄ = max(V(0), V∞), from
-    a start on the reference or the one certified, for every admissible disturbance (docs/certificates.md §15). They
-    are known like the certificate's bounds (`Certificate.label`), in continuous time: a torque that is held for a
-    period, evaluated ahead of its reading, is not covered by the velocity and effort margins.
+    the law, friction that it feeds forward included, from M(q_d)a_d + C(q_d, v_d)v_d + G(q_d): on {V ≤ V̄} with
+    V̄ = max(V(0), V∞), from a start on the reference or the one certified, for every admissible disturbance
+    (docs/certificates.md §15). They are known like the certificate's bounds (`Certificate.label`), in continuous time:
+    a torque that is held for a period, evaluated ahead of its reading, is not covered by the velocity and effort
+    margins.
 
     Args:
-        certificate: Of the law, for the exact model of an arm, without friction that is fed forward.
+        certificate: Of the law, for the exact model of an arm.
         acceleration: Largest |a_d| of the reference, one number or one per joint [rad/s²].
         velocity: Largest |v_d| [rad/s]; None takes the velocity limits of the arm.
 
@@ -56,17 +57,7 @@ def certified_margins(certificate: Certificate, acceleration: Any, velocity: Any
     why_not = why_no_arm_bounds(law, robot) or _why_not(certificate)
     if why_not or robot is None:
         raise ArgumentError(f"certified_margins bounds no motion of the arm: {why_not}.")
-    fastest = _one_each(robot, "velocity", robot.velocity_limit if velocity is None else velocity)
-    if not np.isfinite(fastest).all():
-        joint = robot.joint_names[int(np.argmin(np.isfinite(fastest)))]
-        raise ArgumentError(f"joint '{joint}' of {robot.name} has no velocity limit; give velocity=… too.")
-    friction = certificate.friction
-    if friction.gap.viscous.any() and (fastest > friction.speed).any():
-        joint = robot.joint_names[int(np.argmax(fastest > friction.speed))]
-        raise ArgumentError(
-            f"the certificate counts the viscous friction of joint '{joint}' for a slower reference than the velocity "
-            "given; certify without a reference, or give a lower velocity."
-        )
+    fastest = _fastest(certificate, robot, velocity)
     arm = CoriolisBounds.of(robot, constants)
     motion = _within(arm, constants.floor, fastest, _one_each(robot, "acceleration", acceleration))
     level = max(certificate.storage, 0.0 if certificate.start is None else certificate.start.storage)
@@ -75,6 +66,8 @@ def certified_margins(certificate: Certificate, acceleration: Any, velocity: Any
     asked = Asked(law, constants, *Curvature.with_diagonal(loop, level), level)
     position = certificate.joint_errors if certificate.overshoot is None else certificate.overshoot[1]
     effort, speed = torque_bound(asked, arm, motion, half=0.0), speed_bound(asked, arm)
+    if law.friction is not None:
+        effort = effort + law.friction.viscous * fastest + law.friction.coulomb
     if not np.isfinite([position, speed, effort]).all():
         raise ArgumentError(
             f"nothing bounds the velocities or torques of {robot.name} in every pose; lock joints that slide behind "
@@ -89,11 +82,25 @@ def _why_not(certificate: Certificate) -> str:
         return "the model differs from the arm; certify a law with the model of the arm"
     if certificate.held is not None and certificate.held.is_proved:
         return "its bounds with held torques are those of one reference; certify without a period"
-    if any(Fed.of(certificate.controller.friction, certificate.constants, 0.0)):
-        return "friction that is fed forward is not part of its bounds of torques"
     if not certificate.storage > 0.0:
         return "the certificate allows no disturbance; certify for one above 0"
     return ""
+
+
+def _fastest(certificate: Certificate, robot: Robot, velocity: JointArray | None) -> JointArray:
+    """Largest |v_d| of the references [rad/s]; raises ArgumentError without one, or if bounds are of slower ones."""
+    fastest = _one_each(robot, "velocity", robot.velocity_limit if velocity is None else velocity)
+    if not np.isfinite(fastest).all():
+        joint = robot.joint_names[int(np.argmin(np.isfinite(fastest)))]
+        raise ArgumentError(f"joint '{joint}' of {robot.name} has no velocity limit; give velocity=… too.")
+    friction = certificate.friction
+    if friction.gap.viscous.any() and (fastest > friction.speed).any():
+        joint = robot.joint_names[int(np.argmax(fastest > friction.speed))]
+        raise ArgumentError(
+            f"the certificate counts the viscous friction of joint '{joint}' for a slower reference than the velocity "
+            "given; certify without a reference, or give a lower velocity."
+        )
+    return fastest
 
 
 def _one_each(robot: Robot, what: str, values: JointArray) -> JointArray:
@@ -109,4 +116,4 @@ def _within(arm: CoriolisBounds, floor: np.ndarray, v: JointArray, a: JointArray
     turning = np.abs(arm.links) @ v
     turn, turn_d = min(arm.relative @ v, arm.link_relative @ turning), min(arm.by_floor @ v, arm.link_floor @ turning)
     speed, acceleration = (math.sqrt(x @ np.abs(floor) @ x) for x in (v, a))
-    return MotionBounds(float(turn), float(turn_d), float(v.sum()), speed, acceleration, 0.0)
+    return MotionBounds(v, float(turn), float(turn_d), float(v.sum()), speed, acceleration, 0.0)

@@ -123,14 +123,21 @@ class Results:
         """A folder for the new results that are data, which take the place of all those in `names` when the block ends.
 
         summary.json is added with the facts, the figures and further entries. Whenever the process ends, the files of
-        those names in the folder belong to one run. Pictures are drawn afterwards, within `drawing`.
+        those names in the folder, and those that a summary.json before named, belong to one run. Pictures are drawn
+        afterwards, within `drawing`.
         """
-        drawn = [str(svg_beside(name)) for name in names if name.endswith(".png")]
-        with replaced_together(self.folder, [SUMMARY, REPORT, *names, *drawn]) as draft:
+        files = [*names, *(str(svg_beside(name)) for name in names if name.endswith(".png"))]
+        with replaced_together(self.folder, [SUMMARY, REPORT, *files, *self._files_before(files)]) as draft:
             yield draft
             typed = {"command": typed_command()} if typed_command() else {}
-            summary = summary_text(self.facts | typed | more | {"figures": figures})
+            summary = summary_text(self.facts | typed | more | {"files": files, "figures": figures})
             (draft / SUMMARY).write_text(summary, encoding="utf-8")
+
+    def _files_before(self, files: Sequence[str]) -> list[str]:
+        """What else the summary.json in the folder names as results, of another command perhaps."""
+        named = summary_in(self.folder).get("files")
+        plain = [x for x in named if isinstance(x, str) and x == Path(x).name] if isinstance(named, list) else []
+        return [x for x in plain if x not in (SUMMARY, REPORT, *files) and (self.folder / x).is_file()]
 
     def show(self, console: Console, names: Sequence[str], *following: str | Path) -> None:
         """Print the paths of the results that exist, one per line, and the arguments of a command to go on with.

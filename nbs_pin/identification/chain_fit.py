@@ -9,10 +9,11 @@
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ from nbs_pin.identification.explain import Bodies, IdentificationReport, contrad
 from nbs_pin.identification.levenberg_marquardt import Descent, levenberg_marquardt
 from nbs_pin.identification.physical_tree import PhysicalTree
 from nbs_pin.identification.regressor import Geometry
-from nbs_pin.identification.tree_search import Measurements, TreeEstimate
+from nbs_pin.identification.tree_search import Measurements, TreeEstimate, TreeGeometry
 from nbs_pin.kernels.threads import cores
 
 _FEW, _MOST = 400, 4_000
@@ -116,7 +117,8 @@ def fit_chain(
         epsilon: ε of the network [kg·m²].
         right_angles: Make axes of neighbouring joints parallel or perpendicular where the data do not contradict it, as
             in most arms. This reduces the error that noise causes when the geometry is unknown.
-        progress: Show a progress bar. Ctrl-C ends the search and continues with the best tree so far, if there is one.
+        progress: Show a progress bar. Ctrl-C ends the search and continues with the best tree so far, if there is one;
+            after the search it ends the tries of further trees.
 
     Raises:
         ArgumentError: If the data have no torque, which arms of every scale explain, or as for `identify`.
@@ -137,11 +139,9 @@ def fit_chain(
     # BLAS threads inside the threads of the search would only compete; the limit applies to the whole process.
     with _ONE_AT_A_TIME, threadpool_limits(1, "blas"):
         wanted, scaled, descents, interrupted = _searched(data, wanted, coupled, layout, starts, rng, progress)
-        tries: list[_Try] = []
-        for descent in sorted(descents, key=_cost)[:_TRIES]:
-            tries.append(_tried(descent, data, scaled, coupled, wanted, regularisation, right_angles))
-            if tries[-1].reached:
-                break
+        given: dict[str, Any] = {"data": data, "scaled": scaled, "coupled": coupled, "wanted": wanted}
+        trying = partial(_tried, **given, strength=regularisation, right_angles=right_angles)
+        tries, stopped = _tries(sorted(descents, key=_cost)[:_TRIES], trying, progress)
     best = min(tries, key=lambda found: found.cost)
     _write(best.physical, network)
     costs = np.array([_cost(descent) for descent in descents])
@@ -152,7 +152,7 @@ def fit_chain(
         history=np.array(best.descent.history),
         evaluations=sum(len(descent.history) for descent in descents),
         costs=costs,
-        stopped="interrupted" if interrupted else "converged" if converged else "starts",
+        stopped="interrupted" if interrupted or stopped else "converged" if converged else "starts",
         bodies=best.bodies.report,
         seconds=time.perf_counter() - began,
     )
@@ -167,6 +167,23 @@ class _Try(NamedTuple):
     physical: PhysicalTree
     reached: bool
     """Whether they explain the data about as well as arbitrary symmetric bodies."""
+
+
+def _tries(
+    descents: Sequence[Descent[TreeEstimate]], trying: Callable[[Descent[TreeEstimate]], _Try], progress: bool
+) -> tuple[list[_Try], bool]:
+    """The bodies of one tree after the other until some explain the data, and whether Ctrl-C ended that after some."""
+    tries: list[_Try] = []
+    for descent in tracked(descents, "bodies of the best trees", progress):
+        try:
+            tries.append(trying(descent))
+        except KeyboardInterrupt:
+            if not tries:
+                raise
+            return tries, True
+        if tries[-1].reached:
+            break
+    return tries, False
 
 
 def _tried(
@@ -186,29 +203,6 @@ def _tried(
     physical = _physical(polished.at, bodies, chosen, strength, right_angles)
     cost = physical.whole().cost(chosen)
     return _Try(cost, descent, bodies, physical, cost <= _REACHED * polished.at.cost(scaled) + _EXACT)
-
-
-@dataclass(frozen=True, eq=False)
-class TreeGeometry:
-    """The placements of a tree estimate, as a `regressor.Geometry`."""
-
-    guess: TreeEstimate
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Joint numbers, as the data have no names."""
-        return [f"joint {i + 1}" for i in range(len(self.guess.positions))]
-
-    @property
-    def places(self) -> tuple[Sequence[int], Float[np.ndarray, "n 3"]]:
-        """Parents and positions [m]."""
-        return self.guess.layout[1::2].tolist(), self.guess.positions
-
-    def regressor(
-        self, q: Float[np.ndarray, "rows n"], v: Float[np.ndarray, "rows n"], a: Float[np.ndarray, "rows n"]
-    ) -> Float[np.ndarray, "rows n unknowns"]:
-        """Derivatives of the torque with respect to the bodies."""
-        return self.guess.regressor(q, v, a)
 
 
 def _needed(geometry: Geometry, bodies: Bodies, data: Dataset) -> Float[np.ndarray, "samples n"]:

@@ -1,6 +1,8 @@
 """A rigid tree during the search for its geometry: its torque, the derivatives, and steps of its parameters."""
 
-from collections.abc import Callable
+import functools
+import os
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -170,6 +172,29 @@ class TreeEstimate:
         return chart
 
 
+@dataclass(frozen=True, eq=False)
+class TreeGeometry:
+    """The placements of a tree estimate, as a `regressor.Geometry`."""
+
+    guess: TreeEstimate
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Joint numbers, as the data have no names."""
+        return [f"joint {i + 1}" for i in range(len(self.guess.positions))]
+
+    @property
+    def places(self) -> tuple[Sequence[int], Float[np.ndarray, "n 3"]]:
+        """Parents and positions [m]."""
+        return self.guess.layout[1::2].tolist(), self.guess.positions
+
+    def regressor(
+        self, q: Float[np.ndarray, "rows n"], v: Float[np.ndarray, "rows n"], a: Float[np.ndarray, "rows n"]
+    ) -> Float[np.ndarray, "rows n unknowns"]:
+        """Derivatives of the torque with respect to the bodies."""
+        return self.guess.regressor(q, v, a)
+
+
 def _moments(bodies: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 10"]:
     """m, h, E (xx, xy, xz, yy, yz, zz) of pseudo-inertias, as the kernels take them."""
     rows, columns = (3, 0, 1, 2, 0, 0, 0, 1, 1, 2), (3, 3, 3, 3, 0, 1, 2, 1, 2, 2)
@@ -183,7 +208,13 @@ _MOMENTS = _moments(BASIS).T
 def _by_chunks(function: Callable[[slice], R], rows: int) -> list[R]:
     """The results of `function` for slices of at most 512 rows, in order, computed on all cores."""
     slices = [slice(k, min(k + _CHUNK, rows)) for k in range(0, rows, _CHUNK)]
-    if len(slices) == 1:
-        return [function(slices[0])]
-    with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(function, slices))
+    return [function(slices[0])] if len(slices) == 1 else list(_pool().map(function, slices))
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    """The threads of `_by_chunks`, which a descent calls thousands of times."""
+    return ThreadPoolExecutor(cores())
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -81,7 +81,7 @@ def least_inertia_bound(arm: Arm, weight: Float[np.ndarray, "n n"] | None = None
 def trace_bound(arm: Arm, weight: Float[np.ndarray, "n n"]) -> float:
     """Upper bound of max_q trace(W⁻¹M(q)); a W that is not diagonal is replaced by a diagonal matrix ⪯ W."""
     tree = RigidTree.of(arm)
-    return up(float(np.sum(_body_traces(tree, 1.0 / diagonal_below(weight)))))
+    return up(_trace(tree, 1.0 / diagonal_below(weight)))
 
 
 def trigonometric_bound(arm: Arm, weight: Float[np.ndarray, "n n"], poses: int = POSES) -> float:
@@ -129,7 +129,7 @@ def determinant_bound(arm: Arm) -> float:
     tree = RigidTree.of(arm)
     n = tree.nv
     greatest = largest_diagonal(tree)
-    trace = min(float(np.sum(_body_traces(tree, np.ones(n)))), float(greatest.sum()))
+    trace = min(_trace(tree, np.ones(n)), float(greatest.sum()))
     if not np.isfinite(trace):
         return 0.0
     about = tree.inertia[:, 2, 2] + tree.mass * (tree.centre[:, :2] ** 2).sum(1)
@@ -141,23 +141,38 @@ def determinant_bound(arm: Arm) -> float:
     return down(float(np.exp(max(plain, scaled))))
 
 
-def largest_diagonal(arm: Arm) -> JointArray:
-    """Upper bounds of max_q M_ii(q) [kg·m², kg] for each joint, by lever arms; inf as in `largest_inertia_bound`."""
+def largest_diagonal(arm: Arm, shares: Float[np.ndarray, "n n"] | None = None) -> JointArray:
+    """Upper bounds of max_q M_ii(q) [kg·m², kg] for each joint; inf as in `largest_inertia_bound`.
+
+    shares: `body_shares` of the arm, if they are known.
+    """
     tree = RigidTree.of(arm)
-    return np.array([up(float(np.sum(_body_traces(tree, row)))) for row in np.eye(tree.nv)])
+    shares = body_shares(tree) if shares is None else shares
+    return np.asarray(up(1.0) * (shares.sum(axis=1) + tree.armature))
+
+
+def body_shares(arm: Arm) -> Float[np.ndarray, "n n"]:
+    """Upper bounds, by lever arms, of what body k adds to M_ii in any pose: row i, column k [kg·m², kg]."""
+    tree = RigidTree.of(arm)
+    return np.array([_body_traces(tree, row) for row in np.eye(tree.nv)])
+
+
+def _trace(tree: RigidTree, weights: JointArray) -> float:
+    """Upper bound of Σ_i w_i M_ii over all poses, rotors included."""
+    return float(_body_traces(tree, weights).sum() + weights @ tree.armature)
 
 
 def _body_traces(tree: RigidTree, weights: JointArray) -> JointArray:
-    """Upper bounds of each body's share of Σ_i w_i M_ii over all poses: mass at its lever arms, inertia and rotor."""
+    """Upper bounds of each body's share of Σ_i w_i M_ii over all poses: mass at its lever arms, and inertia."""
     if len(tree.endless) or not tree.physical:
         return np.full(tree.nv, np.inf)
     levers = lever_arms(tree, weights)
     turning = np.where(tree.prismatic, 0.0, weights)
-    total = weights * tree.armature
+    total = np.zeros(tree.nv)
     for k in range(tree.nv):
         largest = max(largest_eigenvalue(tree.inertia[k]), 0.0)
         own = turning[k] * tree.inertia[k, 2, 2]
-        total[k] += tree.mass[k] * levers[k](tree.centre[k]) + own + largest * turning[tree.path(k)[1:]].sum()
+        total[k] = tree.mass[k] * levers[k](tree.centre[k]) + own + largest * turning[tree.path(k)[1:]].sum()
     return total
 
 

@@ -1,0 +1,52 @@
+"""Bounds, entry by entry, of how M and G change with the pose, by lever arms (docs/certificates.md §15).
+
+For a point p of the arm, Γ_ijk = ½(∂_kM_ij + ∂_jM_ik − ∂_iM_jk) = ∫ ∂_ip·∂_j∂_kp dm and ∂_jG_i = −∫ g·∂_i∂_jp dm. With
+j between the base and k, ∂_j∂_kp is ∂_kp turned by joint j: at most as long, and 0 for a joint j that slides. Only the
+bodies behind all of the joints count, and over each body ∫|∂_ip|² dm is its share of M_ii.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nbs_pin.base.rounding import up
+from nbs_pin.dynamics.rigid_tree import Arm, RigidTree
+
+
+def christoffel_bounds(arm: Arm, shares: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n n"]:
+    """Upper bounds of |Γ_ijk| in every pose; entry i of C(q, a)b is Σ Γ_ijk a_j b_k.
+
+    shares: `body_shares` of the arm.
+    """
+    tree = RigidTree.of(arm)
+    behind = _behind(tree)
+    found = np.zeros((tree.nv,) * 3)
+    for j, k in np.ndindex(tree.nv, tree.nv):
+        turned = _turned(tree, j, k)
+        if turned is not None:
+            bodies = behind & behind[j] & behind[k]
+            found[:, j, k] = np.sqrt(np.where(bodies, shares * shares[turned], 0.0)).sum(axis=1)
+    return np.asarray(up(1.0) * found)
+
+
+def gravity_bounds(arm: Arm, shares: Float[np.ndarray, "n n"], gravity: float) -> Float[np.ndarray, "n n"]:
+    """Upper bounds of |∂G_i/∂q_j| in every pose, for the acceleration of gravity [m/s²]; shares as above."""
+    tree = RigidTree.of(arm)
+    behind = _behind(tree)
+    found = np.zeros((tree.nv,) * 2)
+    for i, j in np.ndindex(tree.nv, tree.nv):
+        turned = _turned(tree, i, j)
+        if turned is not None:
+            bodies = behind[i] & behind[j]
+            found[i, j] = gravity * np.sqrt(tree.mass[bodies] * shares[turned, bodies]).sum()
+    return np.asarray(up(1.0) * found)
+
+
+def _behind(tree: RigidTree) -> Bool[np.ndarray, "n n"]:
+    """Whether joint i moves body k: row i, column k."""
+    return np.array([[i in tree.path(k) for k in range(tree.nv)] for i in range(tree.nv)])
+
+
+def _turned(tree: RigidTree, j: int, k: int) -> int | None:
+    """The joint whose ∂p the other one turns; None where ∂_j∂_kp is 0."""
+    near, far = (j, k) if j in tree.path(k) else (k, j)
+    return None if near not in tree.path(far) or tree.prismatic[near] else far
