@@ -3,6 +3,7 @@
 import functools
 import inspect
 import itertools
+import json
 import signal
 import socket
 import sys
@@ -393,6 +394,22 @@ def test_nbs_pin_run_writes_what_happened(tmp_path, monkeypatch):
     assert "guard: OK" in text
     assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "tracking.png", "replay.html", "summary.json"}
     assert len(nbs.Run.load(tmp_path / "run.npz").t) == 300
+
+
+@pytest.mark.parametrize("tried", [1, 2, 3])
+def test_ctrl_c_keeps_the_whole_rows_of_the_fault_matrix(tried, tmp_path, capsys, monkeypatch):
+    def interrupted(function, tasks, *_):
+        yield from (function(*task) for task in tasks[:tried])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(faults, "on_all_cores", interrupted)
+    arguments = ["faults", "--arms", "two_link", "--seeds", "2", "--only", "F22", "--out", str(tmp_path)]
+    assert cli.main(arguments) == 130
+    said = capsys.readouterr().out
+    assert ("interrupted after 1 of 3 faults" in said) == (tried >= 2)
+    kept = json.loads((tmp_path / "summary.json").read_text()) if tried >= 2 else None
+    assert kept is None or (kept["interrupted"] and [len(row["passed"]) for row in kept["rows"]] == [2])
+    assert (tmp_path / "summary.json").exists() == (tried >= 2)
 
 
 def test_nbs_pin_faults_prints_a_row_for_each_fault(tmp_path, capsys, monkeypatch):

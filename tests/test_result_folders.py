@@ -37,6 +37,12 @@ with replaced_together(folder, ["summary", "data", "more", "picture"]) as draft:
 """
 
 
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="no folder in which nothing can be created")
+def test_a_folder_that_takes_no_files_is_named_itself():
+    with pytest.raises(OSError, match=r"'/proc'$"), replaced_together(Path("/proc"), ["data"]):
+        pass
+
+
 def test_no_moment_of_a_kill_leaves_files_of_two_runs(tmp_path):
     """Killed before its k-th access to the disk, for every k; `data` never lacks."""
     seen = set()

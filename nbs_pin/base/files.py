@@ -59,7 +59,7 @@ def replaced_together(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     _remove_abandoned_folders(folder)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=_WRITING) as drafts, _locked(Path(drafts)) as draft:
+    with _drafts(folder) as drafts, _locked(Path(drafts)) as draft:
         with _naming(draft, folder):
             yield draft
         new = [name for name in (*names[1:], names[0]) if (draft / name).exists()]
@@ -71,6 +71,15 @@ def replaced_together(folder: Path, names: Sequence[str]) -> Iterator[Path]:
         except KeyboardInterrupt:
             _move(draft, folder, names, new)  # either all of the new files or none
             raise
+
+
+def _drafts(folder: Path) -> tempfile.TemporaryDirectory[str]:
+    """A new folder inside; an OSError names the folder itself, such as one that is read-only."""
+    try:
+        return tempfile.TemporaryDirectory(dir=folder, prefix=_WRITING)
+    except OSError as error:
+        error.filename = str(folder)
+        raise
 
 
 @contextmanager

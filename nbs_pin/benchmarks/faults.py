@@ -22,10 +22,20 @@ def judge(at: int, arm: str, seed: int) -> Verdict:
 
 def matrix(
     chosen: Sequence[int], arms: Sequence[str], seeds: int, *, progress: bool = False
-) -> dict[tuple[int, str], list[Verdict]]:
-    """The trials of the chosen rows, by row and arm."""
-    tasks = [(at, arm, seed) for arm in arms for at in chosen for seed in range(seeds)]
+) -> tuple[dict[tuple[int, str], list[Verdict]], bool]:
+    """The trials of the chosen rows, by row and arm, and whether Ctrl-C ended them: then whole rows alone are given.
+
+    Raises KeyboardInterrupt if that came before the first row was whole.
+    """
+    tasks = [(at, arm, seed) for at in chosen for arm in arms for seed in range(seeds)]
+    verdicts: list[Verdict] = []
+    try:
+        verdicts.extend(on_all_cores(judge, tasks, "faults", progress))
+    except KeyboardInterrupt:
+        if len(verdicts) < len(arms) * seeds:
+            raise
+    whole = len(verdicts) - len(verdicts) % (len(arms) * seeds)
     found: dict[tuple[int, str], list[Verdict]] = {}
-    for (at, arm, _), verdict in zip(tasks, on_all_cores(judge, tasks, "faults", progress), strict=True):
+    for (at, arm, _), verdict in zip(tasks[:whole], verdicts[:whole], strict=True):
         found.setdefault((at, arm), []).append(verdict)
-    return found
+    return found, whole < len(tasks)

@@ -20,7 +20,10 @@ from nbs_pin.runtime.guard import Fault
 
 
 def run(options: Faults, console: Console, notes: Console) -> int:
-    """Run the matrix, write and print; 4 if a row fails. Raises NbsPinError or OSError."""
+    """Run the matrix, write and print; 4 if a row fails.
+
+    Raises NbsPinError, OSError, and KeyboardInterrupt after an early end, of which the whole rows are kept.
+    """
     numbers = [case.fault.split()[0] for case in MATRIX]
     unknown = [name for name in options.only if name not in numbers]
     if unknown:
@@ -29,7 +32,8 @@ def run(options: Faults, console: Console, notes: Console) -> int:
         )
     chosen = [k for k, name in enumerate(numbers) if not options.only or name in options.only]
     began = time.perf_counter()
-    found = matrix(chosen, options.arms, options.seeds, progress=True)
+    found, interrupted = matrix(chosen, options.arms, options.seeds, progress=True)
+    asked, chosen = len(chosen), [k for k in chosen if (k, options.arms[0]) in found]
     shown = table("faults", "wanted", *options.arms, "", first="fault")
     for column in shown.columns[1:]:  # what is wanted and codes are words
         column.justify, column.no_wrap, column.overflow = "left", False, "fold"
@@ -52,7 +56,7 @@ def run(options: Faults, console: Console, notes: Console) -> int:
         shown.add_row(f"{case.fault}, {case.level}", case.wanted, *cells, "" if passed else "FAILS")
     failed = sum(not all(row["passed"]) for row in rows)
     with replaced_together(options.out, [SUMMARY]) as draft:
-        summary = {"versions": versions(), "seeds": options.seeds, "rows": plain(rows)}
+        summary = {"versions": versions(), "seeds": options.seeds, "interrupted": interrupted, "rows": plain(rows)}
         (draft / SUMMARY).write_text(summary_text(summary), encoding="utf-8")
     console.print(shown)
     console.print(
@@ -64,4 +68,7 @@ def run(options: Faults, console: Console, notes: Console) -> int:
         f"in {wall:.0f} s"
     )
     console.print(str(options.out / SUMMARY), highlight=False, markup=False, soft_wrap=True)
+    if interrupted:
+        console.print(f"interrupted after {len(chosen)} of {counted(asked, 'fault')}", style="yellow")
+        raise KeyboardInterrupt
     return STOPPED if failed else 0
