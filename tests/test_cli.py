@@ -350,6 +350,8 @@ def test_replay_draws_what_track_drew(two_link, tmp_path, monkeypatch, capsys):
     assert opened == [page.as_uri()]
     assert capsys.readouterr().out == f"{page}\n"
     assert "--force" in refusal(cli.main(["replay", str(two_link), "--out", str(page)]), capsys)
+    for command in ("replay", "report"):
+        assert "ends in .html" in refusal(cli.main([command, str(two_link), "--out", str(page.parent / "a")]), capsys)
     assert cli.main(["replay", str(two_link), "--out", str(page), "--force"]) == 0
 
 

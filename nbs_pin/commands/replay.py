@@ -7,8 +7,8 @@ from rich.console import Console
 from nbs_pin.base.exports import KINDS
 from nbs_pin.base.records import Run
 from nbs_pin.cli.replay import Replay
-from nbs_pin.cli.values import OptionError
 from nbs_pin.commands.inputs import arm_that_ran, run_file
+from nbs_pin.commands.results import page_file
 from nbs_pin.reports.replay import replay
 from nbs_pin.reports.run_import import import_run
 
@@ -16,11 +16,7 @@ from nbs_pin.reports.run_import import import_run
 def run(options: Replay, console: Console, notes: Console) -> None:
     """Write the page and print its path; raises NbsPinError or OSError."""
     source = run_file(options.run_file)
-    page = options.out or source.with_name("replay.html")
-    if page.is_dir():
-        raise OptionError(f"--out '{page}' is a folder; give a file such as '{page / 'replay.html'}'.")
-    if options.out and page.exists() and not options.force:
-        raise OptionError(f"'{page}' exists; give another --out, or --force to replace it.")
+    page = page_file(options.out, source.with_name("replay.html"), force=options.force)
     with notes.status(f"drawing {page}"):
         robot = arm_that_ran(options)
         exported = source.suffix.lower().removeprefix(".") in KINDS

@@ -7,6 +7,7 @@ from rich.console import Console
 from nbs_pin.base.summaries import REPORT
 from nbs_pin.cli.report import Report
 from nbs_pin.cli.values import OptionError
+from nbs_pin.commands.results import page_file
 from nbs_pin.reports.report import report
 
 
@@ -15,11 +16,8 @@ def run(options: Report, console: Console, notes: Console) -> None:
     if not options.folders:
         raise OptionError("no folder was given; give those of results, such as out/track-panda.")
     first = options.folders[0]
-    page = options.out or (first if len(options.folders) == 1 else first.parent) / REPORT
-    if page.is_dir():
-        raise OptionError(f"--out '{page}' is a folder; give a file such as '{page / REPORT}'.")
-    if (options.out or len(options.folders) > 1) and page.exists() and not options.force:
-        raise OptionError(f"'{page}' exists; give another --out, or --force to replace it.")
+    usual = (first if len(options.folders) == 1 else first.parent) / REPORT
+    page = page_file(options.out, usual, force=options.force, is_own=len(options.folders) == 1)
     with notes.status(f"drawing {page}"):
         report(options.folders, page)
     console.print(str(page), soft_wrap=True, highlight=False, markup=False)

@@ -157,6 +157,21 @@ class Results:
             console.print(next_step(*following), soft_wrap=True, highlight=False, markup=False)
 
 
+def page_file(out: Path | None, usual: Path, *, force: bool, is_own: bool = True) -> Path:
+    """The page to write, `usual` without --out; is_own: whether the usual one may be replaced.
+
+    Raises OptionError for a folder, a name that browsers do not take for a page, and a file without --force.
+    """
+    page = out or usual
+    if page.is_dir():
+        raise OptionError(f"--out '{page}' is a folder; give a file such as '{page / usual.name}'.")
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise OptionError(f"--out '{page}' is no name of a page; give one that ends in .html.")
+    if not (out is None and is_own) and page.exists() and not force:
+        raise OptionError(f"'{page}' exists; give another --out, or --force to replace it.")
+    return page
+
+
 def next_step(*arguments: str | Path) -> str:
     """The line that names the next command, as it can be typed."""
     return f"next: nbs-pin {shlex.join(map(str, arguments))}"
