@@ -9,11 +9,13 @@ import sys
 import time
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 from nbs_pin.base.exceptions import ArgumentError, FileFormatError, SimulationDiverged
 from nbs_pin.campaigns.journal import JOURNAL, Journal, Outcome, forget
 from nbs_pin.campaigns.runner import run_jobs
+from nbs_pin.simulation.processes import in_processes
 
 PLAN = {"seed": 0, "arm": {"name": "panda", "load": 2.0}}
 CHILD = """
@@ -241,3 +243,15 @@ def test_an_outcome_is_in_the_file_when_add_returns(tmp_path):
         first = dict(journal.outcomes)
     with Journal.opened(tmp_path, PLAN) as journal:
         assert journal.outcomes == first
+
+
+def test_a_process_may_grow_by_what_a_later_task_needs():
+    """loky would replace it with a warning, which its own thread does not survive where warnings are errors."""
+
+    def grown(_):
+        kept = vars(sys).setdefault("kept", [])  # of the process
+        kept.append(np.ones(50_000_000 if len(kept) == 1 else 1))  # 400 MB by the second task
+        time.sleep(1.1)
+        return os.getpid()
+
+    assert len(set(in_processes(grown, [(k,) for k in range(6)], 2))) == 2

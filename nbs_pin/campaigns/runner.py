@@ -17,6 +17,7 @@ from nbs_pin.base.progress import tracked
 from nbs_pin.base.units import counted
 from nbs_pin.base.versions import versions
 from nbs_pin.campaigns.journal import Journal, Outcome
+from nbs_pin.simulation.processes import in_processes
 
 Work: TypeAlias = Callable[[Any], Mapping[str, Any]]
 """What is done with the argument of a job."""
@@ -88,10 +89,11 @@ def _timed(work: Work, key: str, argument: Any) -> Outcome:
 def _here(
     timed: Callable[[str, Any], Outcome], jobs: Mapping[str, Any], workers: int, apart: bool
 ) -> Generator[Outcome]:
-    """Outcomes as they come, from threads or processes."""
-    # Processes keep to one thread each; threads share what this process has.
-    settings: dict[str, Any] = {"backend": "loky", "inner_max_num_threads": 1} if apart else {"backend": "threading"}
-    with joblib.parallel_config(**settings):
+    """Outcomes as they come, from threads, which share what this process has, or processes."""
+    if apart:
+        yield from in_processes(timed, jobs.items(), min(workers, len(jobs)), ordered=False)
+        return
+    with joblib.parallel_config(backend="threading"):
         pool = joblib.Parallel(n_jobs=min(workers, len(jobs)), return_as="generator_unordered")
         yield from pool(joblib.delayed(timed)(key, argument) for key, argument in jobs.items())
 

@@ -23,6 +23,7 @@ from nbs_pin.motions.references import MOTION, DesiredMotion
 from nbs_pin.simulation.guards import check_loop
 from nbs_pin.simulation.loop import Loop
 from nbs_pin.simulation.plant import PLANT, Plant
+from nbs_pin.simulation.processes import in_processes
 
 _MEMORY = "/dev/shm"
 MOST_STREAMED = 10**12
@@ -110,8 +111,6 @@ def simulate(
 
 def _shared(loop: "_Closed", reference: DesiredMotion, start: tuple[np.ndarray, np.ndarray], workers: int) -> Run:
     """The run of all starts, simulated in slices by several processes and joined along the first batch axis."""
-    import joblib  # takes a while, and one process does without
-
     q0, v0 = start
     if q0.ndim < 2:
         raise ArgumentError(f"workers share starts, but q0 has shape {q0.shape}; give q0 of shape (starts, ..., nv).")
@@ -122,12 +121,10 @@ def _shared(loop: "_Closed", reference: DesiredMotion, start: tuple[np.ndarray, 
         # Every process writes its starts into this file; its pages stay mapped while the run refers to them.
         file = str(Path(folder) / "run.npy")
         rows = np.lib.format.open_memmap(file, mode="w+", dtype=float, shape=shape)
-        jobs = [
-            joblib.delayed(_share)(file, (first, end), _of_starts(loop, first, end, len(q0)), reference, q0, v0)
-            for first, end in shares
+        tasks = [
+            (file, (first, end), _of_starts(loop, first, end, len(q0)), reference, q0, v0) for first, end in shares
         ]
-        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-            shared = joblib.Parallel(n_jobs=workers)(jobs)
+        shared = list(in_processes(_share, tasks, workers))
     first, seen = shared[0][0], [estimates for _, estimates in shared if estimates is not None]
     stored = {name: getattr(first, name) for name in ("q_ref", "v_ref", "a_ref")}
     references: dict[str, np.ndarray] = {
