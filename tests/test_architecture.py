@@ -1,6 +1,7 @@
 """The house of docs/architecture.md, held to the code: arrows run one way, engines stay in their rooms."""
 
 import ast
+import functools
 import builtins
 import dis
 import re
@@ -76,6 +77,7 @@ def module_name(path: Path) -> str:
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
 
 
+@functools.cache
 def imports(path: Path) -> set[str]:
     """Every module a file imports, wherever in the file."""
     found = set()
