@@ -1,9 +1,9 @@
 """The house of docs/architecture.md, held to the code: arrows run one way, engines stay in their rooms."""
 
 import ast
-import functools
 import builtins
 import dis
+import functools
 import re
 import subprocess
 import sys
