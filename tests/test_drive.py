@@ -410,6 +410,11 @@ def test_ctrl_c_keeps_the_whole_rows_of_the_fault_matrix(tried, tmp_path, capsys
     kept = json.loads((tmp_path / "summary.json").read_text()) if tried >= 2 else None
     assert kept is None or (kept["interrupted"] and [len(row["passed"]) for row in kept["rows"]] == [2])
     assert (tmp_path / "summary.json").exists() == (tried >= 2)
+    complete = {"interrupted": False}
+    (tmp_path / "summary.json").write_text(json.dumps(complete))
+    assert cli.main(arguments) == 130
+    assert json.loads((tmp_path / "summary.json").read_text()) == complete
+    assert ("before is kept" in capsys.readouterr().out) == (tried >= 2)
 
 
 def test_nbs_pin_faults_prints_a_row_for_each_fault(tmp_path, capsys, monkeypatch):

@@ -48,7 +48,7 @@ def test_no_pose_of_a_random_tree_has_larger_christoffel_symbols_or_slopes_of_gr
     poses = rng.uniform(-np.pi, np.pi, (200, n))
     shares = body_shares(tree)
     assert (masses(model, poses).diagonal(axis1=1, axis2=2) <= largest_diagonal(tree, shares)).all()
-    bound, heaving = christoffel_bounds(tree, shares), gravity_bounds(tree, shares, 9.81)
+    bound, steepest = christoffel_bounds(tree, shares), gravity_bounds(tree, shares, 9.81)
     change = np.array([slopes(model, poses, k) for k in range(n)])  # k, pose, i, j
     found = 0.5 * (np.einsum("kpij->pijk", change) + np.einsum("jpik->pijk", change) - np.einsum("ipjk->pijk", change))
     assert np.abs(found).max() > 0.01
@@ -57,7 +57,7 @@ def test_no_pose_of_a_random_tree_has_larger_christoffel_symbols_or_slopes_of_gr
     for q in poses:
         ahead, behind = ([pin.computeGeneralizedGravity(model, data, x).copy() for x in q + s * steps] for s in (1, -1))
         slope = (np.array(ahead) - behind).T / (2.0 * STEP)
-        assert (np.abs(slope) <= heaving + 1e-5).all()
+        assert (np.abs(slope) <= steepest + 1e-5).all()
 
 
 def test_christoffel_symbols_of_two_rods_are_within_a_factor_of_two():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from nbs_pin.base.npz import read_npz, write_npz
 from nbs_pin.robots import mesh_cache, meshes
 from nbs_pin.robots.meshes import MeshError, read_mesh
 
@@ -71,6 +72,51 @@ def test_without_a_cache_directory_meshes_are_read_all_the_same(folder, monkeypa
     (folder / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "file"))
     same(read_mesh(folder / "a.obj", ONE), parts)
+
+
+def test_without_a_home_directory_meshes_are_read_all_the_same(folder, monkeypatch):
+    parts = read_mesh(folder / "a.obj", ONE)
+
+    def homeless(*_):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(mesh_cache.platformdirs, "user_cache_path", homeless)
+    same(read_mesh(folder / "a.obj", ONE), parts)
+
+
+def test_materials_count_by_what_they_say(folder):
+    """Not by name, size and time, which packages that are built reproducibly share."""
+    (folder / "other").mkdir()
+    for where, text in ((folder, RED), (folder / "other", RED.replace("1 0 0", "0 0 1"))):
+        (where / "a.obj").write_text(SQUARE.format(materials="a.mtl", x=1))
+        (where / "a.mtl").write_text(text)
+        mesh_cache.os.utime(where / "a.mtl", (1.0, 1.0))
+    assert (1.0, 0.0, 0.0, 1.0) in {part.color for part in read_mesh(folder / "a.obj", ONE)}
+    assert (0.0, 0.0, 1.0, 1.0) in {part.color for part in read_mesh(folder / "other" / "a.obj", ONE)}
+
+
+def test_a_file_that_changes_while_it_is_read_is_not_kept_as_another(folder, monkeypatch):
+    read = meshes._read
+
+    def changing(path, *given):
+        path.write_text(SQUARE.format(materials="a.mtl", x=9))
+        return read(path, *given)
+
+    monkeypatch.setattr(meshes, "_read", changing)
+    assert max(part.vertices.max() for part in read_mesh(folder / "a.obj", ONE)) == 1.0
+
+
+@pytest.mark.parametrize("change", [
+    lambda arrays: {"one": np.zeros(3)},
+    lambda arrays: arrays | {"faces 0": arrays["faces 0"] + 1000},
+    lambda arrays: arrays | {"vertices 0": arrays["vertices 0"][:, :2]},
+])  # fmt: skip
+def test_an_intact_file_of_no_mesh_is_made_again(folder, change):
+    parts = read_mesh(folder / "a.obj", ONE)
+    (file,) = files(folder)
+    write_npz(file, change(read_npz(file)))
+    same(read_mesh(folder / "a.obj", ONE), parts)
+    same(meshes._parts(read_npz(file)), parts)
 
 
 def test_a_mesh_that_cannot_be_drawn_is_refused_each_time(folder):

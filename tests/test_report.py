@@ -351,6 +351,22 @@ def test_another_command_leaves_nothing_of_the_one_before(tmp_path):
     assert {"certificate.png", "run.npz"} <= set(summary(folder)["files"])
 
 
+def test_no_command_removes_what_it_reads(tmp_path):
+    folder = tmp_path / "results"
+    printed_by("collect", "two_link", "--samples", "60", "--out", folder)
+    learning = ("--model", "identified", "--robot", "two_link")
+    printed_by("learn", folder / "data.npz", *learning, "--out", folder, "--force")
+    assert {"data.npz", "model.nbs"} <= contents(folder).keys()
+    law = nbs.NeuralBackstepping.for_robot(nbs.load_robot("two_link"))
+    nbs.save(law, folder / "controller.nbs")  # a name that certify writes with --wanted
+    printed_by("certify", folder / "controller.nbs", "--disturbance", "1", "--out", folder, "--force")
+    assert {"controller.nbs", "certificate.png"} <= contents(folder).keys()
+    assert "model.nbs" not in contents(folder)
+    tracked = ("--controller", folder / "controller.nbs", "--duration", "0.05")
+    printed_by("track", "two_link", *tracked, "--out", folder, "--force")
+    assert {"controller.nbs", "replay.html"} <= contents(folder).keys()
+
+
 def test_a_page_of_other_folders_is_not_replaced_silently(folders, capsys, monkeypatch):
     where = folders[0].parent
     monkeypatch.chdir(where)

@@ -23,9 +23,9 @@ def judge(at: int, arm: str, seed: int) -> Verdict:
 def matrix(
     chosen: Sequence[int], arms: Sequence[str], seeds: int, *, progress: bool = False
 ) -> tuple[dict[tuple[int, str], list[Verdict]], bool]:
-    """The trials of the chosen rows, by row and arm, and whether Ctrl-C ended them: then whole rows alone are given.
+    """The trials of the chosen rows, by row and arm, and whether Ctrl-C ended them.
 
-    Raises KeyboardInterrupt if that came before the first row was whole.
+    Then only complete rows are returned. Raises KeyboardInterrupt if that came before the first row was complete.
     """
     tasks = [(at, arm, seed) for at in chosen for arm in arms for seed in range(seeds)]
     verdicts: list[Verdict] = []

@@ -100,7 +100,7 @@ class CoriolisBounds:
     """|v_i| ≤ single_i·|v|_M."""
     christoffel: Float[np.ndarray, "n n n"]
     """Bound of |Γ_ijk|; entry i of C(q, a)b is Σ Γ_ijk a_j b_k [kg·m²]."""
-    heaving: Float[np.ndarray, "n n"]
+    gravity_slope: Float[np.ndarray, "n n"]
     """Bound of |∂G_i/∂q_j| [N·m/rad]."""
     gravity: float
     """|G(q + u) − G(q)|_* ≤ gravity·Σ|u_i|."""
@@ -220,7 +220,7 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
     def pulled(weights: JointArray) -> float:
         return math.sqrt(weights**2 @ rate)
 
-    heaving = gravity_bounds(tree, shares, float(np.linalg.norm(key.robot.model.gravity.linear)))
+    gravity_slope = gravity_bounds(tree, shares, float(np.linalg.norm(key.robot.model.gravity.linear)))
     slowness = np.diag(1.0 / rate)
     return CoriolisBounds(
         relative=relative,
@@ -240,8 +240,8 @@ def _bounds(key: _Key, floor_bytes: bytes, rate_bytes: bytes, n: int) -> Corioli
         diagonal=largest_diagonal(tree, shares),
         single=single,
         christoffel=christoffel_bounds(tree, shares),
-        heaving=heaving,
-        gravity=max(largest(column) for column in heaving.T),
+        gravity_slope=gravity_slope,
+        gravity=float(np.max([largest(column) for column in gravity_slope.T])),
         loss_m=math.sqrt(largest_inertia_bound(tree, slowness).value),
         loss_inverse=1.0 / math.sqrt(max(least_inertia_bound(tree, slowness).value, 1e-300)),
     )

@@ -105,7 +105,7 @@ class _Rows:
     def pose(self) -> JointArray:
         """M a_d + C(q, v_d)v_d + G over z1 with z1ᵀSz1 ≤ Φ, before √Φ."""
         arm, softness = self.arm, np.abs(above_inverse(self.asked.constants.stiffness))
-        weight = np.sqrt(np.einsum("ij,jk,ik->i", arm.heaving, softness, arm.heaving))
+        weight = np.sqrt(np.einsum("ij,jk,ik->i", arm.gravity_slope, softness, arm.gravity_slope))
         inertia = math.sqrt(arm.by_floor @ softness @ arm.by_floor) * self.own * self.motion.acceleration
         return np.asarray(weight + inertia + math.sqrt(softness.sum()) * self._turning)
 
@@ -114,7 +114,7 @@ class _Rows:
         arm, motion = self.arm, self.motion
         faster = arm.sizes(self.isk * motion.acceleration, motion.acceleration)
         change = motion.turn_d * self.own * motion.acceleration + motion.speed_1 * self._turning
-        change += arm.heaving @ motion.fastest + self.row * self.isk * motion.jerk
+        change += arm.gravity_slope @ motion.fastest + self.row * self.isk * motion.jerk
         change += 2.0 * self._bilinear(faster, self._wanted)
         gained = half * motion.acceleration * np.sqrt(np.diag(self._inverse))
         return np.asarray(half * change + self.viscous * gained + self.slipped(gained))

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from nbs_pin.base.files import replaced_together
 from nbs_pin.base.plain import plain
-from nbs_pin.base.summaries import SUMMARY, summary_text
+from nbs_pin.base.summaries import SUMMARY, summary_in, summary_text
 from nbs_pin.base.units import counted
 from nbs_pin.base.versions import versions
 from nbs_pin.benchmarks.faults import MATRIX, matrix
@@ -55,9 +55,12 @@ def run(options: Faults, console: Console, notes: Console) -> int:
         passed = all(v.passed for arm in options.arms for v in found[k, arm])
         shown.add_row(f"{case.fault}, {case.level}", case.wanted, *cells, "" if passed else "FAILS")
     failed = sum(not all(row["passed"]) for row in rows)
-    with replaced_together(options.out, [SUMMARY]) as draft:
-        summary = {"versions": versions(), "seeds": options.seeds, "interrupted": interrupted, "rows": plain(rows)}
-        (draft / SUMMARY).write_text(summary_text(summary), encoding="utf-8")
+    facts = {"versions": versions(), "arms": options.arms, "only": options.only, "seeds": options.seeds}
+    kept = interrupted and summary_in(options.out).get("interrupted") is False
+    if not kept:
+        with replaced_together(options.out, [SUMMARY]) as draft:
+            summary = facts | {"interrupted": interrupted, "rows": plain(rows)}
+            (draft / SUMMARY).write_text(summary_text(summary), encoding="utf-8")
     console.print(shown)
     console.print(
         "numbers are errors [rad]; before the name of a fault, the error until the stop or the time to it [s]"
@@ -69,6 +72,7 @@ def run(options: Faults, console: Console, notes: Console) -> int:
     )
     console.print(str(options.out / SUMMARY), highlight=False, markup=False, soft_wrap=True)
     if interrupted:
-        console.print(f"interrupted after {len(chosen)} of {counted(asked, 'fault')}", style="yellow")
+        old = ", and the summary of whole rows before is kept" if kept else ""
+        console.print(f"interrupted after {len(chosen)} of {counted(asked, 'fault')}{old}", style="yellow")
         raise KeyboardInterrupt
     return STOPPED if failed else 0

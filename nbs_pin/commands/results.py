@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import hashlib
 import inspect
+import os
 import re
 import shlex
 import warnings
@@ -41,6 +42,10 @@ class Results:
     """Whether the folder was not given, so that another may be taken."""
     report: bool = False
     """Whether `show` is to write the page of `nbs_pin.reports.report` too."""
+    inputs: frozenset[Path] = frozenset()
+    """The files that the command reads, which no result but one of the same name replaces."""
+    forced: bool = False
+    """Whether results of other commands may be replaced."""
 
     @classmethod
     def of(cls, options: Any, name: str, robot: Robot | None, /, **resolved: Any) -> "Results":
@@ -56,7 +61,8 @@ class Results:
         folder = options.out or Path("out") / f"{command}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
         sha256 = {} if robot is None else {"robot_sha256": robot.sha256}
         facts = {"settings": settings_of(options, **resolved), "versions": versions(), **sha256}
-        return cls(folder, facts, options.out is None, isinstance(options, Reported) and options.report)
+        report = isinstance(options, Reported) and options.report
+        return cls(folder, facts, options.out is None, report, frozenset(_files_in(dataclasses.asdict(options))))
 
     def check(
         self,
@@ -89,7 +95,7 @@ class Results:
             present = [name for name in names if (folder / name).exists()]
             summary = summary_in(folder)
             if not present or force or {key: summary.get(key) for key in same} == same:
-                return replace(self, folder=folder)
+                return replace(self, folder=folder, forced=force)
             # Results without a readable summary are another run's, or those of one that was stopped.
             stopped = unfinished in present and {key: summary.get(key, self.facts[key]) for key in self.facts}
             if not self.is_default or stopped == self.facts:
@@ -123,19 +129,22 @@ class Results:
         """A folder for the new results that are data, which take the place of all those in `names` when the block ends.
 
         summary.json is added with the facts, the figures and further entries. Whenever the process ends, the files of
-        those names in the folder, and those that a summary.json before named, belong to one run. Pictures are drawn
-        afterwards, within `drawing`.
+        those names in the folder, and with --force those that a summary.json before named, belong to one run, but for
+        files that the command reads. Pictures are drawn afterwards, within `drawing`.
         """
         files = [*names, *(str(svg_beside(name)) for name in names if name.endswith(".png"))]
-        with replaced_together(self.folder, [SUMMARY, REPORT, *files, *self._files_before(files)]) as draft:
+        old = [SUMMARY, REPORT, *files, *self._files_before(files)]
+        old = [name for name in old if (self.folder / name).resolve() not in self.inputs]
+        with replaced_together(self.folder, old) as draft:
             yield draft
             typed = {"command": typed_command()} if typed_command() else {}
             summary = summary_text(self.facts | typed | more | {"files": files, "figures": figures})
             (draft / SUMMARY).write_text(summary, encoding="utf-8")
+            old += [name for name in files if name not in old and (draft / name).exists()]
 
     def _files_before(self, files: Sequence[str]) -> list[str]:
         """What else the summary.json in the folder names as results, of another command perhaps."""
-        named = summary_in(self.folder).get("files")
+        named = summary_in(self.folder).get("files") if self.forced else None
         plain = [x for x in named if isinstance(x, str) and x == Path(x).name] if isinstance(named, list) else []
         return [x for x in plain if x not in (SUMMARY, REPORT, *files) and (self.folder / x).is_file()]
 
@@ -201,6 +210,18 @@ def drawing(path: Path) -> Iterator[Path]:
     except Exception as error:  # drawing libraries may raise any exception
         message = f"'{path}' was not drawn ({type(error).__name__}: {error!s:.500}); the other results are whole."
         warnings.warn(message, stacklevel=3)
+
+
+def _files_in(values: Any) -> Iterator[Path]:
+    """The files that values name, at any depth."""
+    if isinstance(values, Mapping):
+        values = values.values()
+    if isinstance(values, str | Path):
+        if os.path.isfile(values):  # which takes names of any length
+            yield Path(values).resolve()
+    elif isinstance(values, Iterable):
+        for value in values:
+            yield from _files_in(value)
 
 
 def settings_of(options: Any, **resolved: Any) -> dict[str, Any]:

@@ -12,8 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -139,9 +138,11 @@ def fit_chain(
     # BLAS threads inside the threads of the search would only compete; the limit applies to the whole process.
     with _ONE_AT_A_TIME, threadpool_limits(1, "blas"):
         wanted, scaled, descents, interrupted = _searched(data, wanted, coupled, layout, starts, rng, progress)
-        given: dict[str, Any] = {"data": data, "scaled": scaled, "coupled": coupled, "wanted": wanted}
-        trying = partial(_tried, **given, strength=regularisation, right_angles=right_angles)
-        tries, stopped = _tries(sorted(descents, key=_cost)[:_TRIES], trying, progress)
+        tries, stopped = _tries(
+            sorted(descents, key=_cost)[:_TRIES],
+            lambda one: _tried(one, data, scaled, coupled, wanted, regularisation, right_angles),
+            progress,
+        )
     best = min(tries, key=lambda found: found.cost)
     _write(best.physical, network)
     costs = np.array([_cost(descent) for descent in descents])
@@ -172,7 +173,7 @@ class _Try(NamedTuple):
 def _tries(
     descents: Sequence[Descent[TreeEstimate]], trying: Callable[[Descent[TreeEstimate]], _Try], progress: bool
 ) -> tuple[list[_Try], bool]:
-    """The bodies of one tree after the other until some explain the data, and whether Ctrl-C ended that after some."""
+    """The bodies of one tree after the other until some explain the data, and whether Ctrl-C stopped it early."""
     tries: list[_Try] = []
     for descent in tracked(descents, "bodies of the best trees", progress):
         try:

@@ -24,7 +24,7 @@ def christoffel_bounds(arm: Arm, shares: Float[np.ndarray, "n n"]) -> Float[np.n
         turned = _turned(tree, j, k)
         if turned is not None:
             bodies = behind & behind[j] & behind[k]
-            found[:, j, k] = np.sqrt(np.where(bodies, shares * shares[turned], 0.0)).sum(axis=1)
+            found[:, j, k] = np.where(bodies, _mean(shares, shares[turned]), 0.0).sum(axis=1)
     return np.asarray(up(1.0) * found)
 
 
@@ -37,8 +37,14 @@ def gravity_bounds(arm: Arm, shares: Float[np.ndarray, "n n"], gravity: float) -
         turned = _turned(tree, i, j)
         if turned is not None:
             bodies = behind[i] & behind[j]
-            found[i, j] = gravity * np.sqrt(tree.mass[bodies] * shares[turned, bodies]).sum()
+            found[i, j] = _mean(gravity * tree.mass[bodies], gravity * shares[turned, bodies]).sum()
     return np.asarray(up(1.0) * found)
+
+
+def _mean(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """√(ab), 0 where a body has no mass even if b has no bound."""
+    none = (a == 0.0) | (b == 0.0)
+    return np.asarray(np.sqrt(np.where(none, 0.0, a) * np.where(none, 0.0, b)))
 
 
 def _behind(tree: RigidTree) -> Bool[np.ndarray, "n n"]:

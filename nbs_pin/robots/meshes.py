@@ -4,6 +4,7 @@ The dynamics never need meshes; a file that cannot be drawn raises `MeshError`, 
 """
 
 import hashlib
+import io
 import logging
 import re
 from collections.abc import Mapping
@@ -30,6 +31,7 @@ SUFFIXES = (".stl", ".obj", ".dae")
 MAX_BYTES = 50_000_000
 MAX_FACES = 1_000_000
 MAX_COLORS = 32
+_MAX_MATERIAL = 1_000_000
 MAX_GROUPS = 2000
 """Largest number of named parts in a file; each costs milliseconds, however small it is."""
 _GROUPS = {
@@ -106,21 +108,32 @@ def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
     """
     try:
         content = _content(path)
-        arrays = cached(_digest(path, content, scale), lambda: _arrays(_read(path, content, scale)))
-        return _parts(arrays)
+        materials = _materials(path)
+        key = _digest(path, content, materials, scale)
+        return cached(key, lambda: _read(path, content, materials, scale), _arrays, _parts)
     except MeshError:
         raise
     except Exception as error:  # mesh parsers may raise any exception, at once or when the mesh is used
         raise MeshError(f"mesh {path} cannot be read ({type(error).__name__}: {error}): export it again.") from error
 
 
-def _digest(path: Path, content: bytes, scale: Float[np.ndarray, "3"]) -> str:
-    """What the parts of a mesh file depend on: its content, the materials it may read, scale, and what reads it."""
-    beside = sorted(path.parent.glob("*.[mM][tT][lL]")) if path.suffix.lower() == ".obj" else ()
-    states = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in beside if file.is_file()]
-    reader = repr((trimesh.__version__, path.suffix.lower(), scale.tolist(), states)).encode()
+def _materials(path: Path) -> dict[str, bytes]:
+    """The material files that an OBJ file may read, those in its own folder, by name; larger ones are left out."""
+    if path.suffix.lower() != ".obj":
+        return {}
+    found: dict[str, bytes] = {}
+    for file in sorted(path.parent.glob("*.[mM][tT][lL]")):
+        if is_file(file) and file.resolve().parent == path.parent.resolve() and file.stat().st_size <= _MAX_MATERIAL:
+            found[file.name] = file.read_bytes()
+    return found
+
+
+def _digest(path: Path, content: bytes, materials: Mapping[str, bytes], scale: Float[np.ndarray, "3"]) -> str:
+    """What the parts of a mesh file depend on: its content, materials and scale, and what reads it."""
+    reader = repr((trimesh.__version__, path.suffix.lower(), scale.tolist())).encode()
+    texts = [part for name, text in materials.items() for part in (name.encode(), text)]
     digest = hashlib.sha256()
-    for part in (Path(__file__).read_bytes(), reader, content):
+    for part in (Path(__file__).read_bytes(), reader, content, *texts):
         digest.update(len(part).to_bytes(8))
         digest.update(part)
     return digest.hexdigest()
@@ -134,17 +147,24 @@ def _arrays(parts: tuple[Part, ...]) -> dict[str, np.ndarray]:
 
 
 def _parts(arrays: Mapping[str, np.ndarray]) -> tuple[Part, ...]:
-    """The inverse of `_arrays`."""
-    colors = [
-        tuple(color) if colored else None
-        for color, colored in zip(arrays["colors"].tolist(), arrays["colored"], strict=True)
-    ]
-    return tuple(Part(arrays[f"vertices {k}"], arrays[f"faces {k}"], color) for k, color in enumerate(colors))
+    """The inverse of `_arrays`; raises KeyError or ValueError for arrays of anything else."""
+    parts = []
+    for k, (color, colored) in enumerate(zip(arrays["colors"].tolist(), arrays["colored"], strict=True)):
+        vertices, faces = arrays[f"vertices {k}"], arrays[f"faces {k}"]
+        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or not 0 <= faces.min() <= faces.max() < len(vertices):
+            raise ValueError("the arrays are of no mesh")
+        parts.append(Part(vertices, faces, tuple(color) if colored else None))
+    return tuple(parts)
 
 
-def _read(path: Path, content: bytes, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
+def _read(
+    path: Path, content: bytes, materials: Mapping[str, bytes], scale: Float[np.ndarray, "3"]
+) -> tuple[Part, ...]:
     _check_parts(path, content)
-    scene = trimesh.load_scene(path, resolver=_Beside(str(path)), process=False)  # `shaded` merges vertices
+    kind = path.suffix.lower().removeprefix(".")
+    # It reads no other file. `shaded` merges vertices.
+    beside = trimesh.resolvers.ZipResolver(dict(materials))
+    scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, resolver=beside, process=False)
     _check_scene(path, scene)
     meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
     if not any(len(mesh.faces) for mesh in meshes):
@@ -215,16 +235,6 @@ def shaded(mesh: Any, color: Color | None, scale: Float[np.ndarray, "3"] | None 
     mirrored = scale is not None and np.prod(scale) < 0.0
     faces = np.asarray(mesh.faces, dtype=np.int64)
     return Part(vertices, faces[:, ::-1] if mirrored else faces, color)
-
-
-class _Beside(trimesh.resolvers.FilePathResolver):
-    """Resolver that lets an OBJ file read only a material file in its own folder."""
-
-    def get(self, name: str) -> bytes:
-        path = (Path(self.parent) / name).resolve()
-        if path.parent != Path(self.parent).resolve() or path.suffix.lower() != ".mtl":
-            raise FileNotFoundError(f"{name} is not a material file beside the mesh.")
-        return path.read_bytes()
 
 
 def _by_color(mesh: Any) -> list[tuple[Color | None, Int[np.ndarray, "f 3"]]]:
