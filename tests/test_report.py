@@ -401,9 +401,11 @@ def test_a_run_that_is_not_drawn_keeps_its_picture(folders, tmp_path):
 def test_a_compiled_law_has_the_name_of_the_law(name):
     robot = nbs.load_robot("two_link")
     law = build_law(name, robot, period=0.001)
-    run = vars(nbs.simulate(nbs.MujocoPlant(robot), law, nbs.Sinusoid.for_robot(robot), 0.01, 0.001))
-    names = {law_in_words(nbs.Run(**run | {"info": {"controller": repr(x)}})) for x in (law, law.compile())}
-    assert len(names) == 1
+
+    def run(law):
+        return nbs.simulate(nbs.MujocoPlant(robot), law, nbs.Sinusoid.for_robot(robot), 0.01, 0.001)
+
+    assert law_in_words(run(law.compile())) == law_in_words(run(law)) != "controller"
 
 
 def test_settings_that_were_not_given_are_no_phrase():

@@ -16,6 +16,14 @@ from nbs_pin.kernels.laws import compile_laws, compile_tree_law, law_signals, la
 from nbs_pin.kernels.layout import LAW, LawCode, Packed
 from nbs_pin.kernels.threads import Scratch, over_cores
 
+_LAWS = {
+    LawCode.BACKSTEPPING: "NeuralBackstepping",
+    LawCode.SLOTINE_LI: "SlotineLi",
+    LawCode.COMPUTED_TORQUE: "ComputedTorque",
+    LawCode.PD_REFERENCE: "PD",
+    LawCode.PD_GRAVITY: "PD",
+}
+
 
 class CompiledController(MemorylessController):
     """τ = M(q) a_r + C(q, v) v_r + G(q) + feedback as machine code, for numpy arrays.
@@ -56,6 +64,11 @@ class CompiledController(MemorylessController):
     def nv(self) -> int:
         """Number of joints."""
         return self.dynamics.nv
+
+    @property
+    def law_name(self) -> str:
+        """Class of the law."""
+        return _LAWS[LawCode(int(self.law.layout[LAW]))]
 
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """The constants and weights that it was made of, as arrays."""

@@ -78,6 +78,11 @@ class CompiledAdaptiveLaw(Controller):
         """Number of joints."""
         return len(self._limit)
 
+    @property
+    def law_name(self) -> str:
+        """AdaptiveLaw."""
+        return "AdaptiveLaw"
+
     def _facts(self) -> Iterable[str]:
         return joints_told(self.nv), f"{len(self._start)} estimates"
 

@@ -37,6 +37,11 @@ class Controller(Shown, ABC):
     def nv(self) -> int:
         """Number of joints."""
 
+    @property
+    def law_name(self) -> str:
+        """Class of the law, as runs record it: that of the original for a law as machine code."""
+        return type(self).__name__
+
     def _facts(self) -> Iterable[str]:
         return (joints_told(self.nv),)
 

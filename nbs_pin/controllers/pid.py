@@ -197,6 +197,11 @@ class CompiledPID(Controller):
         """Number of joints."""
         return len(self.weights) // 6
 
+    @property
+    def law_name(self) -> str:
+        """PID."""
+        return PID.__name__
+
     def packed_law(self, *, numpy: bool = True) -> Packed:
         """The gains and limits that it was made of, as arrays."""
         return self.law

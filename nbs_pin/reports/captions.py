@@ -15,15 +15,6 @@ _NAMES = {
     "DynamicsPlant": "Pinocchio",
 }
 """Classes whose names are not words run together."""
-_COMPILED = {
-    "backstepping": "NeuralBackstepping",
-    "slotine li": "SlotineLi",
-    "computed torque": "ComputedTorque",
-    "pd reference": "PD",
-    "pd gravity": "PD",
-    "pid": "PID",
-}
-"""The class of each law that has a kernel: a compiled law is shown under its name."""
 _ENGINES = {
     "rk4": "RK4",
     "euler": "Euler",
@@ -114,10 +105,7 @@ def friction_of(run: Run) -> str:
 
 def _words(name: str) -> str:
     """A class name, or the repr of an object, as words: NeuralBackstepping(…) is "neural backstepping"."""
-    compiled = re.match(r"CompiledController\((.+?),", name)
-    if compiled:
-        name = _COMPILED.get(compiled[1], name)
-    name = name.partition("(")[0].removeprefix("Compiled")
+    name = name.partition("(")[0]
     if not re.fullmatch(r"\w+", name):
         return name
     return _NAMES.get(name) or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()

@@ -166,7 +166,7 @@ def drive(
             loop.run(here)
         finally:
             arm.stop()
-    return loop.driven(robot, type(law).__name__, granted)
+    return loop.driven(robot, law.law_name, granted)
 
 
 def _tells(sample: Sample) -> bool:

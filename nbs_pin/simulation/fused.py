@@ -32,7 +32,7 @@ class Fused:
         self._loop, self._scene, self._law = loop, scene, controller.packed_law()
         # One period more than the motion has, as its last row states the torque that was not applied.
         self._course = Course(np.stack([desired.a, target.q, target.v, target.a], axis=1), leads, tau_d)
-        self._run = loop.blank_run(times, desired, *start, controller=type(controller).__name__)
+        self._run = loop.blank_run(times, desired, *start, controller=controller.law_name)
         self._run.info.update(getattr(reference, "notes", {}))
 
     @classmethod

@@ -228,7 +228,7 @@ def _closed(
 ) -> _Closed:
     settings = {"plant_step": plant_step, "effort_limit": effort_limit, "lookahead": lookahead}
     loop = Loop.of(plant, controller.nv, duration, period, **settings, most=most)
-    return _Closed(**vars(loop), law=_compiled(controller), name=type(controller).__name__, disturbance=disturbance)
+    return _Closed(**vars(loop), law=_compiled(controller), name=controller.law_name, disturbance=disturbance)
 
 
 def recorded_numbers(law: Controller) -> int:
