@@ -149,7 +149,7 @@ def test_wrong_attachments_are_refused(options, error, said):
 
 
 def test_the_last_link_must_be_the_only_one():
-    with pytest.raises(nbs.RobotError, match=r"last links .*name the link"):
+    with pytest.raises(nbs.RobotError, match=r"last links .*payload=\{'panda_hand_tcp': 2.0\}"):
         nbs.load_robot("panda", payload=1.0)
 
 

@@ -335,6 +335,20 @@ def test_one_law_and_several_leave_nothing_of_each_other(tmp_path):
     assert nbs.Run.load(tmp_path / "run.npz").info["settings"]["controller"] == "nbs"
 
 
+def test_a_joint_above_its_velocity_limit_is_told():
+    robot = nbs.load_robot("panda")
+    law, reference = nbs.NeuralBackstepping.for_robot(robot), nbs.Sinusoid.for_robot(robot)
+    plant, far = nbs.MujocoPlant(robot), reference(0.0).q + 0.3
+    for start, is_fast in ((far, True), (reference(0.0).q, False)):
+        found = tracking_figures(nbs.simulate(plant, law, reference, 3.0, 0.001, q0=start), robot)
+        said = [line for line in verdict_of(found).more if "velocity limit" in line]
+        assert any(found["above_velocity_limit_fraction"]) == bool(said) == is_fast
+        assert not any(found["above_velocity_limit_fraction_late"])
+    shares = {"above_velocity_limit_fraction": [0.0] * 6 + [0.5], "above_velocity_limit_fraction_late": [0.4] * 7}
+    assert (verdict_of(found).level, verdict_of(found | shares).level) == (GOOD, WARNING)
+    assert "panda_joint7 was above its velocity limit 50" in " ".join(verdict_of(found | shares).more)
+
+
 def test_another_command_leaves_nothing_of_the_one_before(tmp_path):
     folder, mine = tmp_path / "results", tmp_path / "mine.txt"
     printed_by("track", "two_link", "--duration", "0.05", "--out", folder)
@@ -351,7 +365,7 @@ def test_another_command_leaves_nothing_of_the_one_before(tmp_path):
     assert {"certificate.png", "run.npz"} <= set(summary(folder)["files"])
 
 
-def test_no_command_removes_what_it_reads(tmp_path):
+def test_no_command_removes_what_it_reads(tmp_path, capsys):
     folder = tmp_path / "results"
     printed_by("collect", "two_link", "--samples", "60", "--out", folder)
     learning = ("--model", "identified", "--robot", "two_link")
@@ -362,6 +376,10 @@ def test_no_command_removes_what_it_reads(tmp_path):
     printed_by("certify", folder / "controller.nbs", "--disturbance", "1", "--out", folder, "--force")
     assert {"controller.nbs", "certificate.png"} <= contents(folder).keys()
     assert "model.nbs" not in contents(folder)
+    recorded = (folder / "run.npz").read_bytes()
+    watching = ["certify", "two_link", "--disturbance", "1", "--monitor", str(folder / "run.npz")]
+    assert "is read here" in refusal(cli.main([*watching, "--out", str(folder), "--force"]), capsys)
+    assert (folder / "run.npz").read_bytes() == recorded
     tracked = ("--controller", folder / "controller.nbs", "--duration", "0.05")
     printed_by("track", "two_link", *tracked, "--out", folder, "--force")
     assert {"controller.nbs", "replay.html"} <= contents(folder).keys()

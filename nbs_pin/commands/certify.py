@@ -60,7 +60,7 @@ def run(options: Certify, console: Console, notes: Console) -> int:
         watched = None if options.monitor is None else Run.load(options.monitor)
     results = Results.of(options, robot.name, robot, against=robot.source)
     results = results.check(
-        (*FILES, MONITOR, WATCHED, DESIGNED, CERTIFICATE, ARM),
+        (*FILES, MONITOR, WATCHED, *([] if options.wanted is None else [DESIGNED]), CERTIFICATE, ARM),
         options.force,
         whole={"interrupted": False},
         whose="another certificate",

@@ -85,13 +85,19 @@ class Results:
             unfinished: File of work that could be continued; no other folder is taken in its place.
 
         Raises:
-            OptionError: If the folder that was given is a file or holds results of another run.
+            OptionError: If the folder that was given is a file, holds results of another run or, even with --force, a
+                result of the same name that the command reads.
         """
         same = self.facts | dict(whole or {})
         for k in range(1, _MOST_FOLDERS):
             folder = self.folder if k == 1 else self.folder.with_name(f"{self.folder.name}-{k}")
             if folder.exists() and not folder.is_dir():
                 raise OptionError(f"--out '{folder}' is a file; give a folder.")
+            read = [folder / name for name in names if (folder / name).resolve() in self.inputs]
+            if read and self.is_default:
+                continue
+            if read:
+                raise OptionError(f"'{read[0]}' is read here and would be replaced; give another --out.")
             present = [name for name in names if (folder / name).exists()]
             summary = summary_in(folder)
             if not present or force or {key: summary.get(key) for key in same} == same:

@@ -115,12 +115,19 @@ def _tracking(figures: Mapping[str, Any]) -> Verdict:
     more.append(
         f"some joint was at its effort limit {percent(cut, 2)} of the time, {late}" if cut else "no torque was cut"
     )
+    names = ("above_velocity_limit_fraction", "above_velocity_limit_fraction_late")
+    fast, late_fast = ([_number(share) for share in figures.get(name, [0.0])] for name in names)
+    if any(fast):
+        joint = joints[int(np.argmax(fast))]
+        late = f"{percent(max(late_fast), 2)} after {figures['late_after_s']:g} s"
+        more.append(f"{joint} was above its velocity limit {percent(max(fast), 2)} of the time, {late}")
     excesses = map(_number, figures.get("outside_position_range_rad", [0.0] * len(joints)))
     beyond = zip(joints, excesses, units, strict=True)
     left = [
         f"joint {joint} left its range by {measured(excess, unit)}" for joint, excess, unit in beyond if excess > 0.0
     ]
-    return Verdict(WARNING if level == GOOD and (left or late_cut) else level, said, (*more, *left))
+    is_warned = left or late_cut or any(late_fast)
+    return Verdict(WARNING if level == GOOD and is_warned else level, said, (*more, *left))
 
 
 def _convergence(figures: Mapping[str, Any]) -> tuple[str, str]:
@@ -192,7 +199,7 @@ def _certificate(figures: Mapping[str, Any]) -> Verdict:
         level = WARNING if found["label"] != "PROVED" or found["unproved_hold"] else GOOD
         said = f"{found['label']}: {told}"
         error = measured(_number(found["error_rad"]), several(found["units"]))
-        more.append(f"in the long run ‖z1‖ stays below {error}")
+        more.append(f"in the long run ‖q − q_d‖ stays below {error}")
         if figures.get("tip_error_m") is not None:
             more[-1] += f", and the tip within {measured(figures['tip_error_m'], 'm')} of its path"
     if attack is not None:

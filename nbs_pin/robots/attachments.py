@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from nbs_pin.base.doors import BLANK, option
+from nbs_pin.base.doors import BLANK, option, where_printed
 from nbs_pin.robots.description import read_description
 from nbs_pin.robots.packages import Packages
 from nbs_pin.robots.urdf_checks import MOVING, nearest_to_zero
@@ -48,7 +48,10 @@ def tip(robot: Node) -> str:
     """The only link that has no child; raises RobotError if there are several."""
     ends = _ends(robot, parents=False)
     if len(ends) != 1:
-        raise robot.refuse(f"it has {len(ends)} last links ({', '.join(ends[:8])})", "name the link to attach to")
+        how = where_printed(python=f"payload={{'{ends[0]}': 2.0}}", shell=f"--payload 2@{ends[0]}")
+        raise robot.refuse(
+            f"it has {len(ends)} last links ({', '.join(ends[:8])})", f"name the link to attach to, as in {how}"
+        )
     return ends[0]
 
 

@@ -20,7 +20,8 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     """`metrics.summary` of the run and the RMS error over its last 30 %, as JSON can store them.
 
     They are None where a row is not finite. With a robot, also how far each joint left its position range, as the
-    plants have no joint stops, and how far the tool was from its path, if it followed one. `loads` are those that
+    plants have no joint stops, for which share of the time it was above its velocity limit, and how far the tool was
+    from its path, if it followed one. `loads` are those that
     appeared in the plant meanwhile, which the law did not know; `estimates` what a law that adapts believed in the end.
     `units` says in what the numbers of each joint are: those of one that slides are in m and N, whatever the key says.
     """
@@ -30,6 +31,10 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
     if robot is not None:
         beyond = np.maximum(robot.lower - run.q, run.q - robot.upper).reshape(-1, run.nv)
         values["outside_position_range_rad"] = plain(np.maximum(beyond.max(axis=0), 0.0))
+        fast = np.abs(run.v) > robot.velocity_limit
+        late = fast[run.t >= values["late_after_s"]]
+        for name, rows in (("", fast), ("_late", late)):
+            values[f"above_velocity_limit_fraction{name}"] = plain(rows.reshape(-1, run.nv).mean(axis=0))
         tool = tool_of(run)
         if tool is not None:
             values["tool"] = tool | plain(tool_errors(run, robot).figures())
