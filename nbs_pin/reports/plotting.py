@@ -106,6 +106,10 @@ def picture(
 
 def _lay_out(figure: Figure) -> None:
     """Arrange the axes once; with a layout engine, "none" included, savefig would draw the figure once in vain."""
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.get_label_text():
+                axis.set_label_coords(0.5, 0.5)  # else a place is looked for, which takes half of the time
     engine = figure.get_layout_engine()
     assert engine is not None
     engine.execute(figure)
@@ -175,7 +179,7 @@ def plot_tracking(
     rows = run.nv + (tool is not None)
     with picture(path, 13.0, 1.15 + 1.5 * rows + (1.5 if tool else 0.0), heading=heading_of(one, robot)) as figure:
         heights = [1.0] * run.nv + [2.0] * (tool is not None)
-        grid = figure.subplots(rows, 3, sharex=True, squeeze=False, height_ratios=heights)
+        grid = figure.subplots(rows, 3, squeeze=False, height_ratios=heights)
         for joint, (position_axes, error_axes, torque_axes) in enumerate(grid[: run.nv]):
             _draw_position(position_axes, run.t, q[:, joint], q_ref[:, joint])
             if robot is not None:
@@ -317,9 +321,11 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float, observed: boo
         grid[0], map("".join, zip(("position", "|error|", "torque"), beside, strict=True)), strict=True
     ):
         axes.set_title(title, loc="left", fontsize=9.5, color=INK, pad=9)
+    for axes in grid.flat:  # sharing the axis takes as long as drawing it
+        axes.set_xlim(*time_span(run))
+        axes.tick_params(axis="x", labelbottom=axes in grid[-1])
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
-        axes.set_xlim(*time_span(run))
     handles = [
         figure.axes[0].plot([], [], color=ACTUAL, label="actual")[0],
         figure.axes[0].plot([], [], **_WIDE, label="reference")[0],
