@@ -1,7 +1,8 @@
 """What made a run, in words: the titles and settings of pictures and pages."""
 
+import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from nbs_pin.base.records import Run
@@ -58,6 +59,17 @@ def settings_in_words(run: Run) -> list[str]:
         f"seed {given['seed']}" if given.get("seed") is not None else "",
     ]
     return [phrase for phrase in phrases if phrase]
+
+
+def failing(void: Iterable[str], conditions: Iterable[Mapping[str, Any]]) -> str:
+    """The conditions of those names with the numbers on both sides, as a certificate's summary has them."""
+    told = {}
+    for condition in conditions:
+        if not condition["holds"]:
+            left, right = (math.inf if condition[side] is None else condition[side] for side in ("left", "right"))
+            sides = f"{left:.3g} against {right:.3g} {condition['unit']}".rstrip()
+            told[condition["name"]] = f"{condition['name']} ({sides})"
+    return "; ".join(told.get(name, name) for name in void)
 
 
 def chosen(settings: Mapping[str, Any], *names: str) -> list[str]:

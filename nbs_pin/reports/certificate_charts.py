@@ -17,6 +17,7 @@ from nbs_pin.certificates.claims import Assumption
 from nbs_pin.certificates.monitor import Monitored
 from nbs_pin.certificates.transient_attack import TransientAttack
 from nbs_pin.certificates.transient_check import TransientCheck
+from nbs_pin.reports.captions import failing
 from nbs_pin.reports.plotting import (
     ACTUAL,
     ERROR,
@@ -92,7 +93,8 @@ def plot_certificate(
     settings and a verdict may stand below it.
     """
     if certificate.void:
-        verdict = Verdict(BAD, f"the bounds are void, as these conditions fail: {'; '.join(certificate.void)}")
+        failed = failing(certificate.void, [condition.plain() for condition in certificate.conditions])
+        verdict = Verdict(BAD, f"the bounds are void, as these conditions fail: {failed}")
     arm = "" if certificate.robot is None else f"{certificate.robot.name}, "
     heading = Heading(f"{arm}{certificate.disturbance}: {certificate.label}, in {certificate.clock}", settings, verdict)
     size = (6.4, 4.6) if attack is None else (11.0, 5.0)

@@ -8,6 +8,7 @@ import numpy as np
 
 from nbs_pin.base.doors import option
 from nbs_pin.base.units import counted, measured, percent, several
+from nbs_pin.reports.captions import failing
 from nbs_pin.reports.challenge_told import challenge_told
 from nbs_pin.reports.loads_told import load_learned, loads_told
 
@@ -213,7 +214,8 @@ def _certificate(figures: Mapping[str, Any]) -> Verdict:
         level = max(level, monitor_level(is_kept=seen["is_kept"], broken=seen["broken"]), key=_SEVERITY.index)
     useless = figures.get("useless") or []
     more += [f"of no use: {text}" for text in useless]
-    known = f": the bounds are void, as these conditions fail: {'; '.join(found['void'])}" if found["void"] else ""
+    failed = failing(found["void"], found.get("conditions", ()))
+    known = f": the bounds are void, as these conditions fail: {failed}" if failed else ""
     more.append(f"{found['label']}{known or ', under the listed assumptions'}")
     return Verdict(WARNING if level == GOOD and useless else level, said, tuple(more))
 
