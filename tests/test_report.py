@@ -433,6 +433,9 @@ def test_settings_that_were_not_given_are_no_phrase():
     told = settings_in_words(nbs.Run(**{**vars(run), "info": info}))
     assert told[:2] == ["control every 4 ms", "sinusoid"]
     assert not any("None" in phrase for phrase in told)
+    arm = {"payload": {"tip": {"mass": 2.5, "com": [0.0, 0.0, 0.0]}, "": 1.0}, "lock": ["a", "b"]}
+    told = settings_in_words(nbs.Run(**{**vars(run), "info": info | {"settings": none | {"arm": arm}}}))
+    assert told[-2:] == ["payload 2.5 kg at tip, 1 kg at the last link", "lock a, b"]
 
 
 @pytest.mark.parametrize(

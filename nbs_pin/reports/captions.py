@@ -124,4 +124,11 @@ def _words(name: str) -> str:
 
 
 def _told(value: Any) -> str:
+    """A setting in words: a payload as its mass at its link, without the rest."""
+    if isinstance(value, Mapping):
+        masses = {at: of.get("mass") if isinstance(of, Mapping) else of for at, of in value.items()}
+        return ", ".join(
+            f"{mass:g} kg at {at or 'the last link'}" if isinstance(mass, int | float) else f"{at} {value[at]}"
+            for at, mass in masses.items()
+        )
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
