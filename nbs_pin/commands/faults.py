@@ -72,7 +72,7 @@ def run(options: Faults, console: Console, notes: Console) -> int:
     )
     console.print(str(options.out / SUMMARY), highlight=False, markup=False, soft_wrap=True)
     if interrupted:
-        old = ", and the summary of whole rows before is kept" if kept else ""
+        old = "; summary.json keeps the complete rows of before" if kept else ""
         console.print(f"interrupted after {len(chosen)} of {counted(asked, 'fault')}{old}", style="yellow")
         raise KeyboardInterrupt
     return STOPPED if failed else 0

@@ -43,7 +43,7 @@ class Results:
     report: bool = False
     """Whether `show` is to write the page of `nbs_pin.reports.report` too."""
     inputs: frozenset[Path] = frozenset()
-    """The files that the command reads, which no result but one of the same name replaces."""
+    """The files that the command reads; none of them is removed, and `check` refuses to replace one."""
     forced: bool = False
     """Whether results of other commands may be replaced."""
 
@@ -146,7 +146,7 @@ class Results:
             typed = {"command": typed_command()} if typed_command() else {}
             summary = summary_text(self.facts | typed | more | {"files": files, "figures": figures})
             (draft / SUMMARY).write_text(summary, encoding="utf-8")
-            old += [name for name in files if name not in old and (draft / name).exists()]
+            old += [name for name in files if name not in old and (draft / name).exists()]  # `check` allowed it
 
     def _files_before(self, files: Sequence[str]) -> list[str]:
         """What else the summary.json in the folder names as results, of another command perhaps."""

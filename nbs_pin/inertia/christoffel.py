@@ -5,6 +5,8 @@ j between the base and k, ∂_j∂_kp is ∂_kp turned by joint j: at most as lo
 bodies behind all of the joints count, and over each body ∫|∂_ip|² dm is its share of M_ii.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -18,26 +20,18 @@ def christoffel_bounds(arm: Arm, shares: Float[np.ndarray, "n n"]) -> Float[np.n
     shares: `body_shares` of the arm.
     """
     tree = RigidTree.of(arm)
-    behind = _behind(tree)
-    found = np.zeros((tree.nv,) * 3)
-    for j, k in np.ndindex(tree.nv, tree.nv):
-        turned = _turned(tree, j, k)
-        if turned is not None:
-            bodies = behind & behind[j] & behind[k]
-            found[:, j, k] = np.where(bodies, _mean(shares, shares[turned]), 0.0).sum(axis=1)
+    behind, found = _behind(tree), np.zeros((tree.nv,) * 3)
+    for j, k, turned, bodies in _bends(tree):
+        found[:, j, k] = np.where(behind & bodies, _mean(shares, shares[turned]), 0.0).sum(axis=1)
     return np.asarray(up(1.0) * found)
 
 
 def gravity_bounds(arm: Arm, shares: Float[np.ndarray, "n n"], gravity: float) -> Float[np.ndarray, "n n"]:
     """Upper bounds of |∂G_i/∂q_j| in every pose, for the acceleration of gravity [m/s²]; shares as above."""
     tree = RigidTree.of(arm)
-    behind = _behind(tree)
     found = np.zeros((tree.nv,) * 2)
-    for i, j in np.ndindex(tree.nv, tree.nv):
-        turned = _turned(tree, i, j)
-        if turned is not None:
-            bodies = behind[i] & behind[j]
-            found[i, j] = _mean(gravity * tree.mass[bodies], gravity * shares[turned, bodies]).sum()
+    for i, j, turned, bodies in _bends(tree):
+        found[i, j] = _mean(gravity * tree.mass[bodies], gravity * shares[turned, bodies]).sum()
     return np.asarray(up(1.0) * found)
 
 
@@ -52,7 +46,10 @@ def _behind(tree: RigidTree) -> Bool[np.ndarray, "n n"]:
     return np.array([[i in tree.path(k) for k in range(tree.nv)] for i in range(tree.nv)])
 
 
-def _turned(tree: RigidTree, j: int, k: int) -> int | None:
-    """The joint whose ∂p the other one turns; None where ∂_j∂_kp is 0."""
-    near, far = (j, k) if j in tree.path(k) else (k, j)
-    return None if near not in tree.path(far) or tree.prismatic[near] else far
+def _bends(tree: RigidTree) -> Iterator[tuple[int, int, int, Bool[np.ndarray, " n"]]]:
+    """Joints j and k for which ∂_j∂_kp is not 0, the one whose ∂p the other turns, and the bodies behind both."""
+    behind = _behind(tree)
+    for j, k in np.ndindex(tree.nv, tree.nv):
+        near, far = (j, k) if behind[j, k] else (k, j)
+        if behind[near, far] and not tree.prismatic[near]:
+            yield j, k, far, behind[j] & behind[k]

@@ -109,7 +109,7 @@ def _lay_out(figure: Figure) -> None:
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             if not axis.get_label_text():
-                axis.set_label_coords(0.5, 0.5)  # else a place is looked for, which takes half of the time
+                axis.set_label_coords(0.5, 0.5)  # else places for nothing are looked for
     engine = figure.get_layout_engine()
     assert engine is not None
     engine.execute(figure)
@@ -321,7 +321,7 @@ def _dress(figure: Figure, grid: np.ndarray, run: Run, cut: float, observed: boo
         grid[0], map("".join, zip(("position", "|error|", "torque"), beside, strict=True)), strict=True
     ):
         axes.set_title(title, loc="left", fontsize=9.5, color=INK, pad=9)
-    for axes in grid.flat:  # sharing the axis takes as long as drawing it
+    for axes in grid.flat:  # a shared axis would be slower
         axes.set_xlim(*time_span(run))
         axes.tick_params(axis="x", labelbottom=axes in grid[-1])
     for axes in grid[-1]:

@@ -6,6 +6,7 @@ The dynamics never need meshes; a file that cannot be drawn raises `MeshError`, 
 import hashlib
 import io
 import logging
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -108,7 +109,7 @@ def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
     """
     try:
         content = _content(path)
-        materials = _materials(path)
+        materials = _materials(path, content)
         key = _digest(path, content, materials, scale)
         return cached(key, lambda: _read(path, content, materials, scale), _arrays, _parts)
     except MeshError:
@@ -117,15 +118,14 @@ def read_mesh(path: Path, scale: Float[np.ndarray, "3"]) -> tuple[Part, ...]:
         raise MeshError(f"mesh {path} cannot be read ({type(error).__name__}: {error}): export it again.") from error
 
 
-def _materials(path: Path) -> dict[str, bytes]:
-    """The material files that an OBJ file may read, those in its own folder, by name; larger ones are left out."""
+def _materials(path: Path, content: bytes) -> dict[str, bytes]:
+    """The material files in its own folder that an OBJ file names; those of more than 1 MB are left out."""
     if path.suffix.lower() != ".obj":
         return {}
-    found: dict[str, bytes] = {}
-    for file in sorted(path.parent.glob("*.[mM][tT][lL]")):
-        if is_file(file) and file.resolve().parent == path.parent.resolve() and file.stat().st_size <= _MAX_MATERIAL:
-            found[file.name] = file.read_bytes()
-    return found
+    own = path.parent.resolve()
+    named = (file for file in sorted(own.glob("*.[mM][tT][lL]")) if os.fsencode(file.name) in content)
+    read = (file for file in named if is_file(file) and file.resolve().parent == own)
+    return {file.name: file.read_bytes() for file in read if file.stat().st_size <= _MAX_MATERIAL}
 
 
 def _digest(path: Path, content: bytes, materials: Mapping[str, bytes], scale: Float[np.ndarray, "3"]) -> str:
@@ -151,7 +151,8 @@ def _parts(arrays: Mapping[str, np.ndarray]) -> tuple[Part, ...]:
     parts = []
     for k, (color, colored) in enumerate(zip(arrays["colors"].tolist(), arrays["colored"], strict=True)):
         vertices, faces = arrays[f"vertices {k}"], arrays[f"faces {k}"]
-        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or not 0 <= faces.min() <= faces.max() < len(vertices):
+        is_inside = not faces.size or 0 <= faces.min() <= faces.max() < len(vertices)
+        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or not is_inside:
             raise ValueError("the arrays are of no mesh")
         parts.append(Part(vertices, faces, tuple(color) if colored else None))
     return tuple(parts)

@@ -11,7 +11,7 @@ from nbs_pin.kernels.threads import cores
 def in_processes(
     function: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], workers: int, *, ordered: bool = True
 ) -> Generator[Any]:
-    """function(*task) of every task, each in one of several processes on one thread; else in the order they end."""
+    """function(*task) of every task in processes of one thread each, in the order of the tasks or as they end."""
     import joblib  # takes a while, and one process does without
 
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):

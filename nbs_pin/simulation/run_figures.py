@@ -21,9 +21,9 @@ def figures(run: Run, robot: Robot | None = None) -> dict[str, Any]:
 
     They are None where a row is not finite. With a robot, also how far each joint left its position range, as the
     plants have no joint stops, for which share of the time it was above its velocity limit, and how far the tool was
-    from its path, if it followed one. `loads` are those that
-    appeared in the plant meanwhile, which the law did not know; `estimates` what a law that adapts believed in the end.
-    `units` says in what the numbers of each joint are: those of one that slides are in m and N, whatever the key says.
+    from its path, if it followed one. `loads` are those that appeared in the plant meanwhile, which the law did not
+    know; `estimates` what a law that adapts believed in the end. `units` says in what the numbers of each joint are:
+    those of one that slides are in m and N, whatever the key says.
     """
     values = metrics.summary(run)
     values["units"] = by_quantity(run.slides)
