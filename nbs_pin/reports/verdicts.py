@@ -121,7 +121,7 @@ def _tracking(figures: Mapping[str, Any]) -> Verdict:
     if any(fast):
         joint = joints[int(np.argmax(fast))]
         late = f"{percent(max(late_fast), 2)} after {figures['late_after_s']:g} s"
-        more.append(f"{joint} was above its velocity limit {percent(max(fast), 2)} of the time, {late}")
+        more.append(f"joint {joint} was above its velocity limit {percent(max(fast), 2)} of the time, {late}")
     excesses = map(_number, figures.get("outside_position_range_rad", [0.0] * len(joints)))
     beyond = zip(joints, excesses, units, strict=True)
     left = [
